@@ -82,8 +82,8 @@ class Outcome:
 
 
 class Row(NamedTuple):
-    """A line of the table: `what` in words, its SI `unit`; values `before` and `after`, of the exact motion `exact` and by time
-    integration `time`, NaN where there is none."""
+    """Row of the table: `what` in words, its SI `unit`; values `before` and `after`, of the exact motion `exact` and by time
+    integration `time`, NaN for an absent one."""
 
     what: str
     unit: str
@@ -94,13 +94,17 @@ class Row(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """A demand, a held quantity, or a bound.
+    """Demand, held quantity, or bound.
 
-    **Attributes**: `what` in words; its `value` and `limit` in SI `unit`; by how much it is `broken`, in parts of the limit (0:
-    kept; infinite: the machine has no such value); whether it is `active`; the `multiplier`, the slope of the objective over
-    the limit, times the limit, toward where it hinders less (what is held: upward); `gain`, the change of the objective in per
-    cent that this slope gives for a limit moved by 1 %: negative is an improvement. A gain of more than some per cent is beyond
-    what a slope can tell.
+    **Attributes**
+
+    - `what` in words; its `value` and `limit` in SI `unit`
+    - `broken`: its violation, in parts of the limit (0: met; infinite: the machine has no such value)
+    - `active`: True if it limits the design
+    - `multiplier`: the slope of the objective over the limit, times the limit, toward the side on which it limits less (held
+      quantities: upward)
+    - `gain`: the change of the objective in per cent that this slope gives for a limit moved by 1 %: negative is an
+      improvement. A gain of more than some per cent is beyond the range of a slope
     """
 
     what: str
@@ -121,8 +125,8 @@ class Limit(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """Influence of a free number: `what` in words; the objective's change in per cent where it is 1 % `less` and `more`,
-    nothing else changed."""
+    """Influence of a free number: `what` in words; the objective's change in per cent if the number alone is 1 % `less`, and 1
+    % `more`."""
 
     what: str
     less: float
@@ -130,7 +134,7 @@ class Influence(NamedTuple):
 
 
 class Machine(NamedTuple):
-    """One of the different machines that were found: how `often`, the objective's `value`, the free `numbers`, SI."""
+    """One of the different machines of a search: how `often` it was found, the objective's `value`, the free `numbers`, SI."""
 
     often: int
     value: float

@@ -119,9 +119,9 @@ class Dynamics(eqx.Module):
 def vector_field(scene: Scene) -> Dynamics:
     """Return the right-hand side of a scene's equations of motion.
 
-        M q'' + (C + speed G) q' + K q + sum_j m_j B_j^T (B_j q'' + d^2 p_j/dt^2) = what the effects add
+        M q'' + (C + speed G) q' + K q + sum_j m_j B_j^T (B_j q'' + d^2 p_j/dt^2) = forces of the effects
         kappa m J^T J u'' + kappa m J^T (dJ/dt) u' + m J^T B_j q'' = Q_u        (J = dp/du, for each load)
-        J_r theta'' = T(theta') - what loads and imbalance take off              (under a motor)
+        J_r theta'' = T(theta') - torque of loads and imbalance                  (under a motor)
 
     **Arguments**: `scene`, on any machine, with any drive and effects.
 
@@ -136,7 +136,7 @@ def vector_field(scene: Scene) -> Dynamics:
     143.8746
 
     Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,
-    equation (1). A gyroscopic matrix acts with the rotor's speed alone: what its change would add, C theta'' psi / 2, is left
+    equation (1). A gyroscopic matrix acts with the rotor's speed alone: the effect of its change, C theta'' psi / 2, is left
     out as in the paper.
     """
     return dynamics_of(assemble(scene))

@@ -178,10 +178,16 @@ class CircularLoads(Loads):
 
     kappa is 7/5 for a ball and 3/2 for a roller that roll on the track, 1 + J_C/(m R^2) for a pendulum.
 
-    **Attributes** (scalar: shared by all loads; or (count,)): `mass` m kg; `radius` R m of the circle of the mass centres;
-    `drag` b_W N s/m at that radius; `inertia` J_C kg m^2 about the mass centre (pendulums; None for the others);
-    `count` N; `kind` "ball", "roller" or "pendulum"; `ball_radius` r m of a ball or roller (scalar), None for loads that can
-    all be at one point. With it, gathered loads lie side by side on an arc, 2 arcsin(r/R) apart.
+    **Attributes** (scalar: shared by all loads; or (count,)); typical values: see `balls` and `pendulums`
+
+    - `mass` m, kg
+    - `radius` R of the circle of the mass centres, m
+    - `drag` b_W at that radius, N s/m
+    - `inertia` J_C about the mass centre, kg m^2 (pendulums; None for the others)
+    - `count` N of loads
+    - `kind`: "ball", "roller" or "pendulum"
+    - `ball_radius` r of a ball or roller, m (scalar); None for loads that can all be at one point. With it, gathered loads lie
+      side by side on an arc, 2 arcsin(r/R) apart
 
     Source: the antiphase paper, equations (1), (2), (6).
     """

@@ -26,11 +26,11 @@ class Platforms(Machine):
 
     y_i is the upward displacement from static equilibrium, m. Constructors: `one_mass`, `two_mass`, `three_mass`, `network`.
 
-    **Attributes** (n platforms, L links)
+    **Attributes** (n platforms, L links); typical values: see `two_mass`
 
-    - `mass` (n,) kg: of the platforms; the exciter's platform includes the auto-balancer's body, not its loads
-    - `stiffness` (n,) N/m, `damping` (n,) N s/m: of the supports
-    - `link_stiffness` (L,) N/m, `link_damping` (L,) N s/m
+    - `mass` (n,), kg, of the platforms; the exciter's platform includes the auto-balancer's body, not its loads
+    - `stiffness` (n,), N/m, and `damping` (n,), N s/m, of the supports
+    - `link_stiffness` (L,), N/m, and `link_damping` (L,), N s/m
     - `links`: the pair of platforms that each link joins, numbered from 1
     - `exciter`: the platform that carries the auto-balancer
 

@@ -219,7 +219,11 @@ def _require_body(across: float, along: float) -> None:
 class PlanarRotor(Machine):
     """Rotor on one isotropic support, which moves across and up without tilt: M y'' + b y' + k y = f_y, and the same for z.
 
-    **Attributes**: `mass` M kg without loads, `stiffness` k N/m, `damping` b N s/m.
+    **Attributes**; typical values: see `planar_rotor`
+
+    - `mass` M, kg, loads not included
+    - `stiffness` k, N/m
+    - `damping` b, N s/m
 
     Source: the special case of `Rotor` with both supports and all loads in the plane of its mass centre.
     """

@@ -35,14 +35,21 @@ class TorusBalls(Loads):
         kappa m (rho a'' - B f'^2 cos a)    = - (2/5) m w B cos a f' + F_a
         N = m (B f'^2 sin a + rho a'^2 - n . (port's acceleration + gravity upward))
 
-    w is the rotor speed. A ball rolls without slip and without drilling spin. Its rotation adds the inertia kappa - 1 and the
-    terms with w, which do no work: with them the rolling enters by B f' (f' - w) and not by B f'^2, and a ball that turns with
-    the tube feels the centrifugal force of its mass alone. The acceleration of the wall when w changes is neglected, as in the
-    gyroscopic matrix of a rotor. On the equator the ball is that of a plane track of radius R + rho.
+    - w is the rotor speed. A ball rolls without slip and without drilling spin
+    - Its rotation adds the inertia kappa - 1 and the terms with w, which do no work: with them the rolling enters by B f' (f' -
+      w) and not by B f'^2, and a ball that turns with the tube feels the centrifugal force of its mass alone
+    - The acceleration of the wall when w changes is neglected, as in the gyroscopic matrix of a rotor
+    - On the equator the ball is that of a plane track of radius R + rho
 
-    **Attributes** (scalar, or (count,) for `mass` and `drag`): `mass` m kg; `radius` R m of the tube's middle line; `tube` R_1
-    m, the radius of its cross-section; `ball_radius` r m of a ball; `drag` b_W N s/m, viscous resistance of a ball against the
-    wall it rolls on; `count` N; `kind` "torus_ball".
+    **Attributes** (scalar, or (count,) for `mass` and `drag`); typical values: see `torus_balls`
+
+    - `mass` m, kg
+    - `radius` R of the tube's middle line, m
+    - `tube` R_1: radius of its cross-section, m
+    - `ball_radius` r of a ball, m
+    - `drag` b_W: viscous resistance of a ball against the wall on which it rolls, N s/m
+    - `count` N of balls
+    - `kind`: "torus_ball"
 
     Source: Strautmanis et al. 2018; the ball's own rotation is derived here from Newton's and Euler's equations.
     """

@@ -55,7 +55,7 @@ class Result(eqx.Module):
     @property
     @final
     def status_name(self) -> str:
-        """The name of a single status, such as "found"."""
+        """Name of a single status, such as "found"."""
         return status_name(self.status)
 
     @abc.abstractmethod

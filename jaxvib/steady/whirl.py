@@ -49,9 +49,12 @@ class WhirlStatus(eqx.Enumeration):
 class CriticalSpeeds(Result):
     """Rotor speeds at which a whirl turns as fast as the rotor, no damping.
 
-    **Attributes**: `speed` (nd,) rad/s, ascending, inf where there is none (a thin disc has no second forward one); `forward`
-    (nd,) True if the whirl goes round with the rotor; only then does an imbalance excite it where supports are alike both ways;
-    `status` a `WhirlStatus`.
+    **Attributes**
+
+    - `speed` (nd,), rad/s, ascending, inf for an absent one (a thin disc has no second forward one)
+    - `forward` (nd,): True if the whirl goes round with the rotor; only then does an imbalance excite it if supports are alike
+      both ways
+    - `status`: a `WhirlStatus`
     """
 
     status: WhirlStatus

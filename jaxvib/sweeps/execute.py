@@ -14,8 +14,14 @@ __all__ = ["Progress", "Report", "in_this_process", "timed"]
 
 
 class Progress(NamedTuple):
-    """Progress of a sweep: `done` cases of `cases`, those of former calls included; `rate` cases a second and `left` seconds to
-    go, as this call went so far."""
+    """Progress of a sweep.
+
+    **Attributes**
+
+    - `done` cases of `cases`, those of former calls included
+    - `rate`: cases per second in this call
+    - `left`: estimated seconds until the end
+    """
 
     done: int
     cases: int

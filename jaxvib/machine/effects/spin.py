@@ -25,7 +25,7 @@ class FreeSpin(Effect):
 
     - s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.drilling`, default:
       0 at the start); typical: up to the rotor speed, 140 rad/s
-    - The forces Q act on the ball's two coordinates beside those of `TorusBalls`, where the contact keeps s = 0
+    - The forces Q act on the ball's two coordinates in addition to those of `TorusBalls`, whose contact keeps s = 0
     - A point contact exerts no moment about its normal, so the ball's angular velocity about it changes with the direction of
       the normal only, s' = Omega . n' + (w cos a)'
     - While f' is constant, s grows by (w B - R f')/r per radian up the wall: a ball that left the equator with s = 0 returns to
@@ -68,16 +68,18 @@ class FreeSpin(Effect):
 class Sliding(Effect):
     """Sliding of rolling loads beyond Coulomb's limit of their contact.
 
-        |F_t| <= mu max(N, 0);    while it slides F_t = - mu N c/|c|,    (kappa - 1) m (c')_t = F_t - what rolling would need
+        |F_t| <= mu max(N, 0);    while it slides F_t = - mu N c/|c|,    (kappa - 1) m (c')_t = F_t - F_r
 
+    - F_r is the force that rolling would need
     - c is the velocity of the point of contact relative to the track along each coordinate of a load (`State.spin.slip`,
       default: 0 at the start; `with_spin(scene, state, "still")` for loads that do not rotate yet)
     - A sliding load moves like a mass alone, and friction accelerates its rotation until it rolls, a ball from rest at 2/7 of
       the track's speed
-    - Rolling is exact: below the limit there is no creep. If |c| is below `width`, the force is the one within the limit that
-      is nearest to
+    - Rolling is exact: below the limit there is no creep
 
-        F_t = (what rolling needs) - mu N c/width
+    If |c| is below `width`, the force is the one within the limit that is nearest to
+
+        F_t = F_r - mu N c/width
 
     The rest of a slip then decays as exp(- kappa/(kappa-1) mu N t/(m width)), which steps must resolve: about kappa/(kappa-1)
     mu R w^2/width of them per second. `RollingFriction` still acts against the motion of the centre of a sliding load.

@@ -47,9 +47,12 @@ Field = Callable[[Array, State], State]
 class Trajectory(eqx.Module):
     """States at some times.
 
-    **Attributes** (nt times): `time` (nt,) s; `state` a `State` whose arrays have a leading axis over the times;
-    `foundation_force` (nt, nb) N, what the supports exert on the bed in its nb directions; `rotor_angle` (nt,) rad, but
-    for whole turns, and `rotor_speed` (nt,) rad/s.
+    **Attributes** (nt times)
+
+    - `time` (nt,), s
+    - `state`: a `State` whose arrays have a leading axis over the times
+    - `foundation_force` (nt, nb), N: force of the supports on the foundation in its nb directions
+    - `rotor_angle` (nt,), rad, without whole turns, and `rotor_speed` (nt,), rad/s
     """
 
     time: Array = eqx.field(metadata=in_unit("s", "time"))
@@ -60,17 +63,22 @@ class Trajectory(eqx.Module):
 
 
 class AbstractMeasured(eqx.Module):
-    """A motion in numbers, over the last turns of a run.
+    """Quantities of a motion, measured over the last turns of a run.
 
-    **Attributes**: `omega` mean speed of the loads over whole turns, rad/s; `load_speed` (count,) the same for each load;
-    `amplitude` (nd,) m, of tilts rad, and `foundation_force` N, zero to peak, that is half of peak to peak, where it has two
-    directions the root of the sum of both squares; `drift` the largest of three relative changes from the first to the second
-    half of those turns; `settled`: True if it is below 1e-3. The changes are
+    **Attributes**
 
-    - of an amplitude, relative to the largest amplitude or to 1e-4 of the unbalance radius S/M where that is more (a balanced
-      rotor has no amplitude of its own);
-    - of the foundation force, relative to the largest one or to 1e-4 of S n^2, n the rotor's speed, where that is more;
-    - of the loads' speeds, relative to `omega`.
+    - `omega`, rad/s: mean speed of the loads over whole turns, and `load_speed` (count,), rad/s: the same for each load
+    - `amplitude` (nd,), m, of tilts rad, and `foundation_force`, N: zero to peak, that is half of peak to peak; for a force
+      with two directions the root of the sum of both squares; typical: 0.5 to 10 mm, 10 N to 10 kN
+    - `drift`: the largest of three relative changes from the first to the second half of those turns
+    - `settled`: True if the drift is below 1e-3
+
+    The changes are
+
+    - of an amplitude, relative to the largest amplitude or to 1e-4 of the unbalance radius S/M if that is more (a balanced
+      rotor has no amplitude of its own)
+    - of the foundation force, relative to the largest one or to 1e-4 of S n^2, n the rotor's speed, if that is more
+    - of the loads' speeds, relative to `omega`
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -85,7 +93,7 @@ class AbstractMeasured(eqx.Module):
         return self.drift < 1e-3
 
     def extent(self, scene: Scene) -> str:
-        """Amplitudes and foundation force of the `scene` they belong to, a line for a person to read."""
+        """Return the amplitudes and the foundation force of a `scene` as a line of text."""
         structure = scene.machine.structure()
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
         amplitude = ", ".join(f"{name} {float(a):.4g} {unit}" for name, a, unit in named)

@@ -97,7 +97,7 @@ class Regime(Result):
 
     @property
     def status(self) -> RegimeName:
-        """The `name`: the status of a regime is the kind of motion."""
+        """Status of the result, which is its `name`: the kind of motion."""
         return self.name
 
     @property

@@ -39,10 +39,15 @@ class EnvelopeStatus(eqx.Enumeration):
 class Envelopes(eqx.Module):
     """Averaged motion at some times.
 
-    **Attributes** (nt times): `time` (nt,) s; `displacement` (nt, nd) m and `velocity` (nt, nd) m/s, complex amplitudes at the
-    loads' mean angle; `amplitude` (nt, nd) m and `foundation_force` (nt, nb) N, zero to peak; `omega` (nt,) mean speed of the
-    loads and `load_speed` (nt, count), rad/s; `phase` (nt, count) of each load relative to the mean angle, rad;
-    `rotor_speed` (nt,) rad/s; `ripple` (nt, count) rad, see `Envelope`.
+    **Attributes** (nt times)
+
+    - `time` (nt,), s
+    - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes at the loads' mean angle
+    - `amplitude` (nt, nd), m, and `foundation_force` (nt, nb), N, zero to peak
+    - `omega` (nt,): mean speed of the loads, and `load_speed` (nt, count), rad/s
+    - `phase` (nt, count) of each load relative to the mean angle, rad
+    - `rotor_speed` (nt,), rad/s
+    - `ripple` (nt, count), rad, see `Envelope`
     """
 
     time: Array = eqx.field(metadata=in_unit("s", "time"))

@@ -42,17 +42,17 @@ class CriterionStatus(eqx.Enumeration):
 
 
 class CharacteristicSpeeds(Result):
-    """Speeds at which the real part of the port's receptance changes sign, ascending, rad/s; NaN where there is none.
+    """Speeds at which the real part of the port's receptance changes sign, ascending, rad/s; NaN for an absent one.
 
     **Attributes** (nd coordinates)
 
-    - `resonances` (nd,): poles of the receptance without damping, where a load's pull turns from gathering to balancing
-    - `additional` (nd - 1,): its zeros, where it turns back; they are the resonances of the machine with its port held
+    - `resonances` (nd,): poles of the receptance without damping, at which loads change from gathering to balancing
+    - `additional` (nd - 1,): its zeros, at which they change back; these are the resonances of the machine with its port held
     - `shapes` (nd, nd): the resonances' mode shapes, a column each, of unit modal mass, the sign free
-    - `damped_resonances` (nd,), `damped_additional` (nd - 1,): the same changes of sign with the machine's damping
+    - `damped_resonances` (nd,) and `damped_additional` (nd - 1,): the same changes of sign with the machine's damping
     - `coordinates`: the names of the rows of `shapes`
 
-    A mode that does not move the port has its resonance among the additional speeds too: nothing changes sign there.
+    A mode that does not move the port has its resonance among the additional speeds too: no sign changes there.
     """
 
     resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))

@@ -29,10 +29,14 @@ class StabilityStatus(eqx.Enumeration):
 class BalancedStability(Result):
     """Stability of a balanced motion by the Floquet multipliers of the full equations over one turn of the rotor.
 
-    **Attributes**: `stable`; `is_decided`, true if the growth over a turn is larger than its error; `growth` 1/s, the largest
-    rate at which an error grows (negative: the slowest decay), neutral directions left out; `multipliers` (2 (nd + N),)
-    complex, the largest first; `neutral` the number of those that are 1 because the arrangements form a family (the common
-    turn at least); `error` of the multipliers, estimated from half the number of steps.
+    **Attributes**
+
+    - `stable`: True if errors decay
+    - `is_decided`: True if the growth over a turn is larger than its error
+    - `growth`, 1/s: the largest rate at which an error grows (negative: the slowest decay), neutral directions left out
+    - `multipliers` (2 (nd + N),), complex, the largest first
+    - `neutral`: the number of those that are 1 because the arrangements form a family (the common turn at least)
+    - `error` of the multipliers, estimated from half the number of steps
     """
 
     stable: bool = eqx.field(metadata=in_unit(""))

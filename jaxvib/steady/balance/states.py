@@ -264,18 +264,24 @@ def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np
 
 
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int | None = None) -> BalancedStability:
-    """Exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
+    """Return the exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
 
-    The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made
-    for heavy loads or weak drag, as the criterion does.
+    The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made for
+    heavy loads or weak drag, unlike the criterion.
 
-    **Arguments**: `angles` (N,) rad in the rotor's frame, at which the loads cancel each other and the scene's
-    `StaticImbalance`; left out, the first of `balanced_states`. `steps` of Radau's method of order 11 over one turn; the
-    default resolves the carrier's natural frequencies. The method holds for loads with any drag and carriers with any damping.
+    **Arguments**
 
-    **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, for a machine
-    that can drift, for effects that disturb the balanced motion (gravity), for a rotor that turns too slowly beside an
-    undamped carrier, and as `balanced_states`; `ComputationError` with its status if nothing cancels.
+    - `scene`; its effects must not disturb the balanced motion
+    - `angles` (N,), rad, in the rotor's frame, at which the loads cancel each other and the scene's `StaticImbalance`; default:
+      the first of `balanced_states`
+    - `steps` of Radau's method of order 11 over one turn; the default resolves the carrier's natural frequencies; typical: 24
+      to 200. The time grows in proportion. The method holds for loads with any drag and carriers with any damping
+
+    **Returns** `BalancedStability`.
+
+    **Raises** `InputError` for angles at which the loads do not cancel, for a machine that can drift, for effects that disturb
+    the balanced motion (gravity), for a rotor that turns too slowly beside an undamped carrier, and as `balanced_states`;
+    `ComputationError` with its status if nothing cancels.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -302,10 +308,13 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 def balanced_growth(
     scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int | None = None
 ) -> np.ndarray:
-    """Growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable where it is negative.
+    """Return the growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable if it is negative.
 
-    **Arguments**: `speeds` rad/s, any shape; `angles`, `steps` as `balanced_stability`. The scene's own
-    speed is not used.
+    **Arguments**
+
+    - `scene`; its own speed is not used
+    - `speeds`, rad/s, any shape
+    - `angles` and `steps` as `balanced_stability`
 
     **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
 
@@ -326,12 +335,14 @@ def balanced_growth(
 def balanced_intervals(
     scene: Scene, low: float, high: float, angles: ArrayLike | None = None, *, points: int = 200, steps: int | None = None
 ) -> list[list[float]]:
-    """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
+    """Return the intervals [from, to] of rotor speed between `low` and `high` (rad/s) in which the balanced motion is exactly
+    stable.
 
-    Looked for on `points` speeds and refined by halving to 1e-7 of the speed; an interval narrower than the spacing
-    of the points can be missed. What the criterion says of the same range is `criterion(scene).balancing`.
+    They are searched on `points` speeds (typical: 200, the default) and refined by halving to 1e-7 of the speed. An interval
+    narrower than the spacing of the points can be missed. The criterion's intervals of the same range are
+    `criterion(scene).balancing`. `angles` and `steps` as `balanced_stability`.
 
-    **Raises** as `balanced_stability`, and `InputError` for a range that is none.
+    **Returns** a list of pairs, rad/s. **Raises** as `balanced_stability`, and `InputError` for an empty range.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

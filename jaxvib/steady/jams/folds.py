@@ -31,8 +31,11 @@ _GRID_POINTS = 64
 class Folds(eqx.Module):
     """Points with dn/dOmega = 0, where two jam modes appear or merge.
 
-    **Attributes**, all (2 nd,), ascending in `omega`, padded at the end where `exists` is False: `omega` load speed rad/s;
-    `rotor_speed` rad/s; `exists`.
+    **Attributes**, all (2 nd,), ascending in `omega`, padded at the end if `exists` is False
+
+    - `omega`: load speed, rad/s
+    - `rotor_speed`, rad/s
+    - `exists`: True for a fold
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s", "fold"))

@@ -49,11 +49,18 @@ class JamStatus(eqx.Enumeration):
 class AbstractJam(Result):
     """Jam modes of a scene, one or several.
 
-    **Attributes**: `mode` number; `status` a `JamStatus`; `omega` speed of the loads, rad/s; `rotor_speed` rad/s; `stable` by
-    the slope dn/dOmega > 0, for light loads that stay together (whether they do, `phase_jams` tells); `slope` dn/dOmega;
-    `displacement` (nd,) complex amplitudes, m, of tilts rad, at load angle Omega t; `amplitude` (nd,) m, of tilts rad, and
-    `foundation_force` N, zero to peak; of two directions of the force it is the root of the summed squares of their peaks
-    (sqrt 2 times the force of a circular whirl); `coordinates` the names of the nd coordinates.
+    **Attributes**
+
+    - `mode`: number of the mode
+    - `status`: a `JamStatus`
+    - `omega`: speed of the loads, rad/s; `rotor_speed`, rad/s
+    - `stable`: True if the slope dn/dOmega > 0, for light loads that stay together (`phase_jams` shows if they do)
+    - `slope`: dn/dOmega
+    - `displacement` (nd,): complex amplitudes at load angle Omega t, m, of tilts rad
+    - `amplitude` (nd,), m, of tilts rad, zero to peak; typical: 0.5 to 10 mm
+    - `foundation_force`, N, zero to peak; for two directions of the force it is the root of the summed squares of their peaks
+      (sqrt 2 times the force of a circular whirl)
+    - `coordinates` (nd,): their names
     """
 
     mode: Array = eqx.field(metadata=in_unit("", "*"))

@@ -61,14 +61,21 @@ def degrees(angle: float) -> float:
 
 
 class AbstractPhaseJam(Result):
-    """Jams whose loads need not stand at one angle, phi_j = Omega t + phase_j, one or several.
+    """Jams whose loads may be at different angles, phi_j = Omega t + phase_j, one or several; NaN if there is no jam.
 
-    **Attributes**: `status` a `PhaseStatus`; `omega`, `rotor_speed` rad/s; `phase` (count,) rad, of the first load 0;
-    `pattern` a `PhasePattern`; `growth` 1/s, of the fastest growing small disturbance, and `stable` where it is negative;
-    `displacement` (nd,) complex amplitudes at Omega t, m, of tilts rad; `amplitude` (nd,) m, of tilts rad, and
-    `foundation_force` N, zero to peak (of two directions the root of the summed squares of their peaks: sqrt 2 times the force
-    of a circular whirl); `torque` (count,) N m, the mean torque of the vibration on each load; `residual` of the balance,
-    relative to the drag's torque. NaN where there is no jam.
+    **Attributes**
+
+    - `status`: a `PhaseStatus`
+    - `omega` and `rotor_speed`, rad/s
+    - `phase` (count,), rad; 0 for the first load
+    - `pattern`: a `PhasePattern`
+    - `growth`, 1/s, of the fastest growing small disturbance, and `stable`: True if it is negative
+    - `displacement` (nd,): complex amplitudes at Omega t, m, of tilts rad
+    - `amplitude` (nd,), m, of tilts rad, zero to peak
+    - `foundation_force`, N, zero to peak (for two directions the root of the summed squares of their peaks: sqrt 2 times the
+      force of a circular whirl)
+    - `torque` (count,), N m: the mean torque of the vibration on each load
+    - `residual` of the balance, relative to the drag's torque
     """
 
     status: PhaseStatus

@@ -45,8 +45,14 @@ _STABILITY_CRITERION = "by the multipliers of the full equations"
 
 
 class SpecialPoint(NamedTuple):
-    """Point at which the stability of exact jams changes: `kind` "fold" (dn/dOmega = 0), "torus" (Neimark-Sacker),
-    "period_doubling" or "symmetry" (a symmetry of the motion is lost at a multiplier +1); `omega`, `rotor_speed` in rad/s."""
+    """Point at which the stability of exact jams changes.
+
+    **Attributes**
+
+    - `kind`: "fold" (dn/dOmega = 0), "torus" (Neimark-Sacker), "period_doubling" or "symmetry" (a symmetry of the motion is
+      lost at a multiplier +1)
+    - `omega` and `rotor_speed`, rad/s
+    """
 
     kind: str
     omega: float

@@ -36,9 +36,15 @@ __all__ = ["HarmonicConvergence", "harmonic_convergence"]
 
 
 class HarmonicConvergence(Result):
-    """Errors of jams with a limited number of harmonics: `harmonics` (n,) highest one of the carrier; of the jams at `omega`
-    (w,) rad/s the relative `error` (n, w) of the rotor speed against twice as many points as the last, and the estimate of it
-    that each jam comes with, `known` (n, w)."""
+    """Errors of jams with a limited number of harmonics.
+
+    **Attributes**
+
+    - `harmonics` (n,): the highest one of the carrier
+    - `omega` (w,), rad/s, of the jams
+    - `error` (n, w), relative, of the rotor speed, by comparison with twice as many points as the last
+    - `known` (n, w): the estimate of it that each jam has
+    """
 
     status = Computed.done
 

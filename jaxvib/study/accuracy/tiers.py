@@ -40,7 +40,7 @@ class TierValues(eqx.Module):
 
 
 class Tiers(Result):
-    """Two tiers over the mass of one load: `mass` (n,) kg (its mean, where loads differ), `leading` and `exact` the answers."""
+    """Two tiers over the mass of one load: `mass` (n,), kg (its mean if loads differ), `leading` and `exact`: the jams."""
 
     status = Computed.done
 

@@ -35,15 +35,20 @@ _TURNS, _TOLERANCE, _MOST_STEPS = 100, 1e-8, 2**24
 
 
 class EffectRow(NamedTuple):
-    """One effect: its name; `present`, whether the scene has it (it was taken out) or not (it was put in); by which `tier`.
+    """One effect of an audit.
 
-    Changes by it, relative, of the scene's own value: `amplitude` (of the coordinate that changes most, in units of the largest
-    of its kind, and in a machine that hardly moves of a hundredth of the loads' unbalance radius), `foundation_force`, `omega`
-    of the loads, `fold` (the rotor speed at which the jam ends); NaN where nothing is known. `uncertainty` of them. What it
-    costs: `operations` of the equations of motion; `seconds` of a run of 100 turns, with it less without; `compile`, seconds of
-    processor to trace and compile that run, with it less without; NaN where no time was taken. Small differences of times are
-    the clock's noise.
-    `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `says` why, and with which numbers.
+    **Attributes**
+
+    - `name` of the effect, `present`: True if the scene has it (it was taken out), False if not (it was put in), `tier` of the
+      computation
+    - changes by the effect, relative to the scene's own value: `amplitude` (of the coordinate that changes most, in units of
+      the largest of its kind, and in a machine that hardly moves of a hundredth of the loads' unbalance radius),
+      `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN if unknown
+    - `uncertainty` of these changes
+    - cost of the effect, with it less without: `operations` of the equations of motion; `seconds` of a run of 100 turns;
+      `compile`, seconds of processor to trace and compile that run. NaN if no time was taken. Small differences of times are
+      the clock's noise
+    - `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `says`: the reason, with its numbers
     """
 
     effect: str

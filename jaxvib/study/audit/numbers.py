@@ -23,8 +23,11 @@ _ROLLING, _BEARING, _BEARING_WIDTH = 3e-5, 0.0015, 0.2
 
 
 class NumberRow(NamedTuple):
-    """A dimensionless number of a scene: its `name`, `value`, the `limit` above which it asks for something, the `advice`
-    ("perhaps needed" above the limit, else "negligible"), and what the number `says`."""
+    """Dimensionless number of a scene.
+
+    **Attributes**: its `name` and `value`; the `limit` above which an effect may be needed; the `advice` ("perhaps needed"
+    above the limit, otherwise "negligible"); `says`: a sentence about the number.
+    """
 
     name: str
     value: float

@@ -21,10 +21,16 @@ __all__ = ["TierRow", "tier_rows"]
 
 
 class TierRow(NamedTuple):
-    """One tier: its name; `answers`, whether it answers the audit's question for the scene; by how much it is off, relative to
-    the best one that answers, in `amplitude` (of the coordinate that is off most, in units of the largest), `foundation_force`
-    and `omega`, NaN where it does not answer; `seconds` of an answer and of the first one besides, `compile`, NaN where no time
-    was taken; `says` what it is for, or why it does not answer."""
+    """One tier of an audit.
+
+    **Attributes**
+
+    - `name` of the tier, `answers`: True if it can compute the audit's quantities for the scene
+    - error relative to the best tier that answers, in `amplitude` (of the coordinate with the largest error, in units of the
+      largest), `foundation_force` and `omega`, NaN if it does not answer
+    - `seconds` of an answer, and additional seconds of the first one, `compile`, NaN if no time was taken
+    - `says`: its purpose, or the reason why it does not answer
+    """
 
     tier: str
     answers: bool

@@ -33,8 +33,11 @@ friction it moved mu1 by 0.4 to 0.9 percent, up to three times the interval of t
 
 
 class Estimate(NamedTuple):
-    """A number from measurements: its `value`, its standard `error` from the record's noise, and the interval from
-    `low` to `high` that holds it with a probability of 95 %, the instruments' share counted."""
+    """Number from measurements.
+
+    **Attributes**: its `value`; its standard `error` from the record's noise; `low` and `high`, the interval that contains it
+    with a probability of 95 %, the instruments' share included.
+    """
 
     value: float
     error: float
@@ -57,11 +60,17 @@ class TurningPoints(NamedTuple):
 
 
 class Decrement(Result):
-    """The formula of ten periods, on every pair of swings that a record has.
+    """Result of the formula of ten periods, on every pair of swings of a record.
 
-    **Attributes**: `viscous` mu1, N m s, an `Estimate`; `estimates` (n,) N m s, one a pair, first to last; `amplitude` (n,) rad
-    at the start of each; `scatter`: largest deviation of one from their mean, relative; `drift`: by how many standard errors
-    the last pair's mu1 is above the first's; `period` s; `periods` between the two of a pair.
+    **Attributes**
+
+    - `viscous` mu1, N m s, an `Estimate`; typical: 3e-4 to 2e-3
+    - `estimates` (n,), N m s, one for each pair, first to last
+    - `amplitude` (n,), rad, at the start of each
+    - `scatter`: largest deviation of one from their mean, relative
+    - `drift`: difference of the last pair's mu1 from the first's, in standard errors
+    - `period`, s
+    - `periods` between the two swings of a pair
     """
 
     status = Computed.done

@@ -28,17 +28,17 @@ __all__ = ["CriterionMap", "criterion_map"]
 
 
 class CriterionMap(Result):
-    """The criterion against exact stability for a machine with lighter or heavier loads and weaker or stronger drag.
+    """Comparison of the criterion with exact stability for a machine with lighter or heavier loads and weaker or stronger drag.
 
     **Attributes** (D drags, M masses, S speeds, B boundaries 2 nd - 1)
 
-    - `speeds` (S,) rad/s; `mass_factor` (M,), `drag_factor` (D,): times the scene's own
-    - `predicted` (M, S): the criterion calls auto-balancing stable (it knows nothing of the drag)
-    - `growth` (D, M, S) 1/s: exact growth rate, stable where negative
-    - `right` (D, M): share of the speeds where both say the same
-    - `boundary` (M, B) rad/s: the criterion's boundaries, ascending, NaN where there is none
-    - `shift` (D, M, B): (exact - predicted)/predicted, exact being the end of the exact interval that shares most with
-      the criterion's; NaN where there is none in the range of speeds
+    - `speeds` (S,), rad/s; `mass_factor` (M,), `drag_factor` (D,): times the scene's own
+    - `predicted` (M, S): True if the criterion predicts stable auto-balancing (it does not depend on the drag)
+    - `growth` (D, M, S), 1/s: exact growth rate, stable if negative
+    - `right` (D, M): share of the speeds at which both agree
+    - `boundary` (M, B), rad/s: the criterion's boundaries, ascending, NaN for an absent one
+    - `shift` (D, M, B): (exact - predicted)/predicted, exact being the end of the exact interval that shares most with the
+      criterion's; NaN if there is none in the range of speeds
     """
 
     status = Computed.done

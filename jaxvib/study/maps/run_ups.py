@@ -49,9 +49,14 @@ _MIN_ALLOWED_STEPS = 2**20
 class RunUps(Result):
     """Outcomes of run-ups over nd drags and ns starts.
 
-    **Attributes**: `drag` (nd,) b_W N s/m; `angle` (ns, count) rad, where the loads started; `regime` a `Regime` whose arrays
-    have the leading axes (nd, ns); `kind` (nd, ns) the regime's word, or "failed" where the run did not reach its end; `omega`
-    (nd, ns) mean speed of the loads, rad/s, NaN where it failed; `finished` (nd, ns) whether it reached its end.
+    **Attributes**
+
+    - `drag` (nd,): b_W, N s/m
+    - `angle` (ns, count), rad, at which the loads started
+    - `regime`: a `Regime` whose arrays have the leading axes (nd, ns)
+    - `kind` (nd, ns): short name of the regime, or "failed" if the run did not reach its end
+    - `omega` (nd, ns): mean speed of the loads, rad/s, NaN if it failed
+    - `finished` (nd, ns): True if the run reached its end
     """
 
     status = Computed.done

@@ -29,8 +29,15 @@ __all__ = ["StabilityMap", "stability_map", "stability_onset"]
 
 
 class StabilityMap(Result):
-    """Exact jams over a design number x: `value` (n,) x; `omega` (n, P) load speeds rad/s, `stable` (n, P) whether every load
-    keeps to the jam there; `special` (n,) the special points of each diagram."""
+    """Exact jams over a design number x.
+
+    **Attributes**
+
+    - `value` (n,) of x
+    - `omega` (n, P): load speeds, rad/s
+    - `stable` (n, P): True if every load keeps to the jam there
+    - `special` (n,): the special points of each diagram
+    """
 
     status = Computed.done
 
