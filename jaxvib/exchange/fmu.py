@@ -80,26 +80,35 @@ def export_fmu(
 ) -> Fmu:
     """Write a scene as a functional mock-up unit (FMU), for model exchange and co-simulation.
 
-    The file holds the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary of this platform.
-    It needs neither Python nor jaxvib. The same scene gives the same bytes.
+    The file holds the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary of this platform. It
+    needs neither Python nor jaxvib. The same scene gives the same bytes.
 
     - Parameters are all numbers of the scene under their names (`machine.stiffness[0]`), with units and bounds; they may change
       during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which is the classical Runge-Kutta
       method of order 4
     - States are outputs: `displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`; so are `acceleration.y1`,
       `foundation_force.up`, `rotor.angle` and `rotor.speed`
-    - Inputs are `force.y1` on each coordinate (N, of angles N m) and, with a motor, `rotor.torque` (N m), which is added to
-      its torque
+    - Inputs are `force.y1` on each coordinate (N, of angles N m) and, with a motor, `rotor.torque` (N m), which is added to its
+      torque
     - Event indicators are comparisons in forces that are not smooth (stops, contacts, dry friction) and in a drive whose
       acceleration jumps: a solver ends its steps where one of them changes its sign
     - Directional derivatives of rates and outputs by states and inputs are exact
 
-    **Arguments**: `fmi` "2.0" or "3.0"; `start` as in `simulate` except "spin_up", or a `State`; `mode` of the jam to start in;
-    `drive` "scene", or "input" for inputs in place of the drive: `rotor.speed` and its derivative `rotor.acceleration` for an
-    ideal drive, `rotor.torque` alone for a motor; `binary`: compile.
+    **Arguments**
 
-    **Returns** `Fmu`. **Raises** `InputError` for a part of the scene whose equations have no form in C, naming the operation,
-    and for a path that cannot be written to.
+    - `scene` to export
+    - `path` of the file, ".fmu"
+    - `fmi`: version of the standard, "2.0" (the default) or "3.0"
+    - `start`: as in `simulate` except "spin_up", or a `State`
+    - `mode`: number of the jam to start in; typical: 1, 3, 5
+    - `drive`: "scene" (the default), or "input" for inputs in place of the drive: `rotor.speed` and its derivative
+      `rotor.acceleration` for an ideal drive, `rotor.torque` alone for a motor
+    - `binary`: True to compile a binary
+
+    **Returns** `Fmu`.
+
+    **Raises** `InputError` for a part of the scene whose equations have no form in C, naming the operation, and for a path that
+    cannot be written to.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
