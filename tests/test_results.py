@@ -255,6 +255,8 @@ def test_labelled_data_has_units_and_names(result):
     assert not [axis for axis in data.dims if str(axis).startswith("batch")]
     for field in type(result).__dataclass_fields__.values():
         value = getattr(result, field.name)
+        if isinstance(value, (jax.Array, np.ndarray)) and value.ndim:
+            assert (field.metadata.get("name") or field.name) in data
         if field.metadata.get("unit") and isinstance(value, (jax.Array, np.ndarray)):
             name = field.metadata["name"] or field.name
             assert data[name].attrs["units"] in (field.metadata["unit"], *field.metadata["unit"].split(" or "))

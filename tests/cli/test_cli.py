@@ -199,6 +199,14 @@ def test_criterion_json_has_the_promised_keys(typed, tmp_path, monkeypatch):
             assert np.min(np.abs(speed - w * (1.0 + share))) < 0.07 * abs(share) * w
 
 
+def test_exact_balance_is_searched_from_below_all_resonances(typed, monkeypatch):
+    asked = []
+    monkeypatch.setattr("jaxvib.steady.balance.states.balanced_intervals", lambda scene, *ends: asked.append(ends) or [])
+    document = json.loads(typed("criterion", "machine.toml", "--check", "--json")[1])
+    ((begin, end),) = asked
+    assert begin < 0.1 * min(document["resonances"]) and max(document["resonances"]) < end == document["exact_up_to"]
+
+
 WRONG = [
     (("mass = [", "masses = ["), "machine.masses is no field here; did you mean 'mass'"),
     (("drag = 1.5\n", ""), "loads.drag is missing"),

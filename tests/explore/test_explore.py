@@ -14,6 +14,7 @@ from scenes import TWO_MASS
 import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.explore import pictures, serve
+from jaxvib.explore.panel import TALL, WIDE, Panel
 from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
 from jaxvib.machine.files import TEMPLATES
@@ -176,6 +177,12 @@ def _lines(drawn, color, filled=False):
     """The lines of a colour, in dots, with the figures of their dashes, or the outlines of what is filled."""
     paths = [p for p in drawn.iter(f"{SVG}path") if p.get("stroke") == color and (p.get("fill") != "none") == filled]
     return [(np.array(re.findall(r"[ML]([-.0-9]+) ([-.0-9]+)", p.get("d")), float), p.get("stroke-dasharray")) for p in paths]
+
+
+def test_the_middle_of_the_limits_is_that_of_a_panel():
+    middle = (1.0 + 0.5 * WIDE, 0.5 * TALL)
+    assert Panel(1.0, "", (0.0, 10.0), (2.0, 6.0)).at(5.0, 4.0) == pytest.approx(middle)
+    assert Panel(1.0, "", (0.0, 10.0), (1.0, 100.0), log=True).at(5.0, 10.0) == pytest.approx(middle)
 
 
 @pytest.mark.parametrize("kind", ["two_mass", "network"])

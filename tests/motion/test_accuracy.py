@@ -60,6 +60,15 @@ def test_the_estimate_is_above_the_error_and_near_it():
         assert 13 * int(run.steps) // 3 < before and before % 13 == 0
 
 
+def test_an_accuracy_missed_at_first_is_not_overshot():
+    """Behind a stop the error is 50 times the accuracy at first: the tolerance falls by a little more than that."""
+    loads = jv.pendulums(count=1, mass=1.0, radius=0.125, drag=1.0)
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
+    s = jv.Scene(machine, loads, jv.ConstantSpeed(40.0), (jv.Stop(5e5, gap=1e-3),))
+    run = jv.simulate(s, 2.0, save="window", max_steps=2**17, stepsize_controller=jv.Accuracy(1e-5))
+    assert 13 * int(run.steps) < int(run.evaluations) / 1.8 and 1e-6 < float(run.error) <= 1e-5
+
+
 def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
     s = published(speed=5.0, eps=0.05).scene()
     monkeypatch.setattr("jaxvib.motion.simulate._ATTEMPTS", 2)

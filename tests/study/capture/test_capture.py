@@ -14,6 +14,7 @@ from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
+from jaxvib.draw.capture import torus_paths
 from jaxvib.study.capture.capture import capture_time, thrown_state
 from jaxvib.study.capture.refinement import refine, steps_per_second
 
@@ -201,7 +202,14 @@ def test_what_cannot_be_asked_is_said(ask, says):
         ask(published_torus(2.5))
 
 
-def test_the_command_prints_shares_and_writes_pictures(tmp_path, capsys):
+def test_the_command_prints_shares_and_writes_pictures(tmp_path, capsys, monkeypatch):
+    drawn = []
+
+    def paths(*arrays):
+        drawn[:] = arrays
+        return torus_paths(*arrays)
+
+    monkeypatch.setattr("jaxvib.draw.capture.torus_paths", paths)
     jv.save_scene(published_torus(3.5), tmp_path / "torus.toml")
     words = ["--from", "-1", "--to", "-0.1", "--speeds", "4", "--turns", "150", "--json", "--out", str(tmp_path / "o")]
     assert command(["capture", str(tmp_path / "torus.toml"), *words]) == 0
@@ -209,4 +217,8 @@ def test_the_command_prints_shares_and_writes_pictures(tmp_path, capsys):
     assert document["status"] == "found" and len(document["fraction"]) == 4
     assert -1.0 < document["threshold"] < -0.1
     assert all((tmp_path / "o" / name).stat().st_size > 10_000 for name in ("capture.png", "paths.png"))
+    around, in_the_tube, speed, _ = drawn  # of the run just above the threshold
+    np.testing.assert_allclose(around[0], thrown_state(published_torus(3.5), 0.0).angle[0], atol=1e-12)
+    np.testing.assert_allclose(in_the_tube[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(speed[0], document["threshold"] + 2.0 * document["uncertainty"], rtol=1e-9)
     assert command(["capture", str(tmp_path / "torus.toml"), "--from", "0", "--to", "-1"]) == 2
