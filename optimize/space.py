@@ -32,7 +32,10 @@ Source = str | tuple[str, float | Literal["keep"]]
 
 
 class Held(eqx.Module):
-    """Quantity that keeps its value during the search; made by `hold`."""
+    """Quantity that keeps its value during the search; made by `hold`.
+
+    **Attributes**: `quantity`; `value` in its unit, None for the value in the scene from which the search begins.
+    """
 
     quantity: Quantity = eqx.field(static=True)
     value: float | np.ndarray | None
@@ -101,6 +104,9 @@ class DesignSpace(eqx.Module):
       10 or more, otherwise evenly
 
     Inside, a design is a vector z in [0, 1]^d.
+
+    **Attributes**, of the d free numbers: bounds `low` and `high` (d,), SI; `logs`: True for a range that is divided by ratio;
+    `held`: the held quantities; `counts`: the allowed numbers of loads.
 
     **Raises** `InputError` for
 

@@ -78,7 +78,7 @@ class Carrier(eqx.Module):
 class Machine(Part):
     """Machine in the designer's own numbers. A new kind of machine is a subclass with its matrices and its exciter's mount.
 
-    `places` states how places on the machine are named, for effects and drawings:
+    `kind` is its name in scene files. `places` states how places on the machine are named, for effects and drawings:
 
     - "platform": by the number of the platform
     - "shaft": by the distance along a rotor's axis from its mass centre, m

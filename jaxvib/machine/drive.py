@@ -23,7 +23,12 @@ Rotor = tuple[Array, Array] | None
 
 
 class Drive(Part):
-    """Drive of the rotor; `speed` is its working speed without a load, rad/s; typical: 60 to 320 (600 to 3000 rpm).
+    """Drive of the rotor.
+
+    **Attributes**
+
+    - `speed`: working speed without a load, rad/s; typical: 60 to 320 (600 to 3000 rpm)
+    - `kind`: its name in scene files
 
     An `IdealDrive` prescribes the rotor speed. With a `Motor` the rotor's angle and speed are states.
     """
@@ -105,8 +110,8 @@ class Motor(Drive):
 
         J theta'' = T(theta') - torque of the loads on the rotor
 
-    J is the moment of inertia of the whole rotor about its axis. It includes the rotor's imbalance, not the loads; typical:
-    0.005 to 1 kg m^2.
+    J (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the rotor's imbalance, not the loads;
+    typical: 0.005 to 1 kg m^2.
     """
 
     ideal = False

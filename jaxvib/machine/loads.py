@@ -76,8 +76,11 @@ class Loads(Part):
     A load has one or several coordinates u. The first is its angle about the rotor's axis, rad; its generalised force is the
     torque that the load takes off the rotor.
 
-    **Attributes**: `mass` of a load, kg; typical: 0.05 to 1; `count`: number of loads; typical: 1 to 4; `kind`: its name in
-    scene files.
+    **Attributes**
+
+    - `mass` of a load, kg; typical: 0.05 to 1
+    - `count`: number of loads; typical: 1 to 4
+    - `kind`: its name in scene files
     """
 
     mass: eqx.AbstractVar[Array]

@@ -112,14 +112,16 @@ def growth(
         exponent = mean of ln(d_k / d_0) / T over the later stretches of length T
 
     A second motion starts at the distance d_0. After each stretch it is put back to this distance, in its current direction
-    (Benettin's method). Derivatives of a run grow at the same rate. If it is positive, no derivative of a run that is longer
-    than the horizon says anything, however exactly it is computed. Use derivatives of shorter runs, of averages over many
-    starts, or of exact motions (`jam_orbit`) then.
+    (Benettin's method).
+
+    Derivatives of a run grow at the same rate. If it is positive, a derivative of a run that is longer than the horizon has no
+    meaning, however exactly it is computed. Use derivatives of shorter runs, of averages over many starts, or of exact motions
+    (`jam_orbit`) then.
 
     The later half of the run decides, with G the logarithm of the growth over it and s its standard error:
 
     - "chaotic" or "unstable": G > 3 s and G > ln 1000, at rates that agree in both quarters. The motion is unstable if it
-      returns to where it was within three turns of its rotor and loads, an unstable jam for example, whose exponent is
+      returns to its former state within three turns of its rotor and loads, an unstable jam for example, whose exponent is
       ln|multiplier| over the period of `jam_orbit`; a motion of several periods that is unstable counts as chaotic
     - "regular": G + 3 s < ln 1000 and G < 2 s, or, if G < ln 2.1, the rates fade as those of a growth in proportion to time do
     - "undecided": everything else, for example a rate that is certain in a run in which it does not reach ln 1000

@@ -61,8 +61,10 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
     - `within`: the largest relative deviation from the final amplitude; typical: 0.02 to 0.1 (default 0.05)
     - `of`: the platform (default: 1)
 
-    **Returns** `Quantity`; its derivatives are in forward mode; typical: 2 to 20 s after the end of the spin-up. It is `until`
-    if the motion is still changing then. **Raises** `InputError` for a `within` that is not between 0 and 1.
+    **Returns** `Quantity`, whose derivatives are in forward mode; typical: 2 to 20 s after the end of the spin-up. It is
+    `until` if the motion is still changing then.
+
+    **Raises** `InputError` for a `within` that is not between 0 and 1.
 
     >>> from optimize import settling_time
     >>> settling_time(until="20 s", spin_up="5 s").unit

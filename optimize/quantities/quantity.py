@@ -59,6 +59,7 @@ class Quantity:
 
     Operands of a sum or a comparison must have the same unit. A text such as "50 N" counts as a quantity: `force < "50 N"`,
     `0.3 * a / "1 mm" + force / "10 N"`. `+ - * / **` of quantities and numbers are quantities; `<` and `>` make a `Demand`.
+    `parts` are the quantities from which one is computed.
 
     **Raises** `InputError` for an argument that is no function of one or two arguments, and for units that do not match.
 
@@ -75,7 +76,7 @@ class Quantity:
     mode: int | None = None
     of: Pair = None
     parts: tuple[Quantity, ...] = field(default=(), kw_only=True)
-    """Quantities from which this one is computed."""
+    """Quantities from which this one, a sum for example, is computed."""
 
     def __post_init__(self) -> None:
         if self.mode is not None:
@@ -275,7 +276,11 @@ class Combined(Quantity):
 class Demand:
     """Quantity that must be at most, or at least, another one or a value; made by `<` and `>`.
 
-    **Attributes**: `quantity` and `limit`, quantities of the same unit; `sense`: "at most" or "at least".
+    **Attributes**
+
+    - `quantity` and `limit`: quantities of the same unit
+    - `sense`: "at most" or "at least"
+    - `shown`: the limit as it was written, such as "2 mm"
     """
 
     quantity: Quantity

@@ -1,9 +1,10 @@
-"""Docstrings of the public surface: an example, each argument and typical values, for each function and constructor.
+"""Docstrings of the public surface: an example, each argument and typical values of functions, each field of classes.
 
 Methods of public classes explain their arguments too: in their own docstring, in that of the method that they override, or in
 that of their class.
 """
 
+import dataclasses
 import inspect
 import re
 
@@ -98,3 +99,10 @@ def test_docstring_states_what_is_returned(name):
 @pytest.mark.parametrize("name", METHODS)
 def test_method_explains_each_argument(name):
     assert missing_arguments(*METHODS[name]) == []
+
+
+@pytest.mark.parametrize("name", [name for name, kind in SURFACE.items() if dataclasses.is_dataclass(kind)])
+def test_class_explains_each_field(name):
+    kind = SURFACE[name]
+    text = "\n".join(base.__doc__ or "" for base in kind.__mro__)
+    assert [each.name for each in dataclasses.fields(kind) if not re.search(rf"`{each.name}\b", text)] == []

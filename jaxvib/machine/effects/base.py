@@ -81,7 +81,10 @@ def has_half_turn(effects: Iterable[Effect]) -> bool:
 
 
 class Effect(Part):
-    """Physical effect that a scene includes. A new effect is a subclass with its numbers and its `terms`."""
+    """Physical effect that a scene includes. A new effect is a subclass with its numbers and its `terms`.
+
+    `kind` is its name in scene files.
+    """
 
     kind: eqx.AbstractVar[str]
 
