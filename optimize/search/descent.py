@@ -37,7 +37,7 @@ class _Lane(NamedTuple):
     values: Array
     slopes: Array
     known: tuple[Array, ...]
-    reach: tuple[Array, ...]
+    known_slopes: tuple[Array, ...]
     adam: optax.OptState
     length: Array
     multipliers: Array
@@ -81,8 +81,8 @@ def _begun(point: Any, multipliers: Array) -> _Lane:
     one = jnp.ones(n)
     size = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
     worst = jnp.full(n, jnp.inf)
-    z, values, slopes, known, reach, *_ = point
-    return _Lane(z, values, slopes, known, reach, lane, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int))
+    z, values, slopes, known, known_slopes, *_ = point
+    return _Lane(z, values, slopes, known, known_slopes, lane, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int))
 
 
 def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
@@ -102,16 +102,18 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
         stopped = ((lane.z <= 0.0) & (correction < 0.0)) | ((lane.z >= 1.0) & (correction > 0.0))
         step = step - _least(held * jnp.where(stopped, 0.0, 1.0)[None, :], off)
     z = jnp.clip(lane.z + lane.length * step, 0.0, 1.0)
-    near = tuple(_ahead(w, r, z - lane.z) for w, r in zip(lane.known, lane.reach, strict=True))
-    values, slopes, known, reach = derive(problem, z, near)
+    near = tuple(_ahead(w, r, z - lane.z) for w, r in zip(lane.known, lane.known_slopes, strict=True))
+    values, slopes, known, known_slopes = derive(problem, z, near)
     finite = jnp.all(jnp.isfinite(values)) & jnp.all(jnp.isfinite(slopes))
     good = finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _ON_THE_WAY) & (rate > 0.0)
 
     def chosen(new: Array, old: Array) -> Array:
         return jnp.where(good, new, old)
 
-    new = (z, values, slopes, known, reach)
-    z, values, slopes, known, reach = jax.tree.map(chosen, new, (lane.z, lane.values, lane.slopes, lane.known, lane.reach))
+    new = (z, values, slopes, known, known_slopes)
+    z, values, slopes, known, known_slopes = jax.tree.map(
+        chosen, new, (lane.z, lane.values, lane.slopes, lane.known, lane.known_slopes)
+    )
     length = jnp.where(good, jnp.minimum(1.0, 1.2 * lane.length), 0.5 * lane.length)
 
     update = (lane.taken % _UPDATE == _UPDATE - 1) & (rate > 0.0)
@@ -121,14 +123,14 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
     slow = update & (worst > 0.5 * lane.worst) & (worst > 1e-6)
     weight = jnp.where(slow, jnp.minimum(3.0 * lane.weight, 1e4), lane.weight)
     lane = _Lane(
-        z, values, slopes, known, reach, adam, length, multipliers, weight,
+        z, values, slopes, known, known_slopes, adam, length, multipliers, weight,
         jnp.where(update, worst, lane.worst), lane.size, lane.taken + 1,
     )  # fmt: skip
     return lane, values[0]
 
 
-def _ahead(known: Array, reach: Array, step: Array) -> Array:
-    moved = known + reach @ step
+def _ahead(known: Array, known_slopes: Array, step: Array) -> Array:
+    moved = known + known_slopes @ step
     return jnp.where(jnp.isfinite(moved) & (jnp.abs(moved / known - 1.0) < 0.2), moved, known)
 
 
@@ -168,4 +170,4 @@ def _point(lanes: _Lane) -> Point:
     """Point at which the lanes are, without pieces of the objective."""
     z, values, slopes = (np.asarray(each) for each in lanes[:3])
     nothing = np.zeros((len(z), 0))
-    return Point(z, values, slopes, lanes.known, lanes.reach, nothing, np.zeros((*nothing.shape, z.shape[1])))
+    return Point(z, values, slopes, lanes.known, lanes.known_slopes, nothing, np.zeros((*nothing.shape, z.shape[1])))

@@ -65,15 +65,15 @@ class Followed:
 
     def __init__(self, problem: Problem):
         self.problem = replace(problem, lanes=_LANES)
-        self.seen: tuple[np.ndarray, ...] | None = None
+        self.remembered: tuple[np.ndarray, ...] | None = None
         """The last designs, and the speeds that were followed there."""
 
     def of(self, z: np.ndarray) -> np.ndarray:
         """Values of the designs z (s, d), NaN if a quantity does not exist."""
-        if self.seen is None:
+        if self.remembered is None:
             values, known = self._at(z, looked_up(self.problem, z))
         else:
-            designs, *there = self.seen
+            designs, *there = self.remembered
             nearest = np.argmin(np.sum((z[:, None] - designs[None]) ** 2, axis=2), axis=1)
             values, known = self._at(z, tuple(each[nearest] for each in there))
             lost = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
@@ -84,8 +84,8 @@ class Followed:
         good = np.all(np.isfinite(values), axis=1)
         if np.any(good):
             new = (z[good], *(each[good] for each in known))
-            old = (each[:0] for each in new) if self.seen is None else self.seen
-            self.seen = tuple(np.concatenate(pair)[-_REMEMBERED:] for pair in zip(old, new, strict=True))
+            old = (each[:0] for each in new) if self.remembered is None else self.remembered
+            self.remembered = tuple(np.concatenate(pair)[-_REMEMBERED:] for pair in zip(old, new, strict=True))
         return values
 
     def _at(self, z: np.ndarray, near: Known) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:

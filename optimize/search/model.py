@@ -1,4 +1,4 @@
-"""The quadratic model of a search about a design: second derivatives of its Lagrangian, the step to the model's least value."""
+"""Quadratic model of the Lagrangian at a design: second derivatives and the step to the minimum."""
 
 from __future__ import annotations
 
@@ -9,21 +9,34 @@ import numpy as np
 from optimize.search.problem import Point, Problem, evaluate
 from optimize.search.quadratic import Solved, elastic
 
-__all__ = ["Step", "at_kink", "curvatures", "fall", "least_norm", "modelled", "seconds", "transposed", "unlike"]
+__all__ = [
+    "Step",
+    "at_kink",
+    "curvatures",
+    "kink_residuals",
+    "least_norm",
+    "predicted_decrease",
+    "second_derivatives",
+    "solve_model",
+    "transposed",
+]
 
-_WIDTH = 1e-5
-"""Step of the central differences of derivatives, in parts of a free number's range."""
+_DIFFERENCE_STEP = 1e-5
+"""Step of central differences, as a fraction of the range of a free number."""
 
-_COUNTS = 1e-4
-"""The least share of a piece of the objective that counts as being at the kink."""
+_MIN_SHARE_AT_KINK = 1e-4
+"""Smallest share of a piece of the objective that takes part in a kink."""
 
-_NOTHING = 1e-4
-"""An objective below this share of what it changes by over the bounds, as its slope has it, is measured by that share."""
+_SMALL_OBJECTIVE_SHARE = 1e-4
+"""Smallest scale of the objective, as a fraction of its change over the bounds by its slope."""
 
 
 class Step(NamedTuple):
-    """The steps `p` (s, d) to the least value of the model, and the multipliers there: of what is `held` (s, me), of `demands`
-    (s, mi); the `shares` (s, parts) of the objective's pieces, together 1."""
+    """Steps to the minimum of the model.
+
+    **Attributes**: `p` (s, d); multipliers of `held` quantities (s, me) and of `demands` (s, mi); `shares` (s, parts) of the
+    pieces of the objective, with the sum 1.
+    """
 
     p: np.ndarray
     held: np.ndarray
@@ -32,12 +45,12 @@ class Step(NamedTuple):
 
 
 def transposed(a: np.ndarray) -> np.ndarray:
-    """Each matrix of (s, ...) the other way round."""
+    """Transpose of each matrix of (s, ...)."""
     return np.swapaxes(a, 1, 2)
 
 
 def least_norm(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The shortest x (s, d) with rows (s, m, d) x = right (s, m)."""
+    """Solution x (s, d) of least norm of rows (s, m, d) x = right (s, m)."""
     gram = rows @ transposed(rows)
     ridge = np.finfo(float).eps * (1.0 + np.trace(gram, axis1=1, axis2=2))
     solved = np.linalg.solve(gram + ridge[:, None, None] * np.eye(gram.shape[1]), right[..., None])
@@ -45,39 +58,42 @@ def least_norm(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _pieces(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray]:
-    """Values (s, p) and derivatives (s, p, d) of what the objective is the largest of: itself where it is one piece."""
+    """Values (s, p) and derivatives (s, p, d) of the pieces whose maximum is the objective."""
     if problem.parts == 1:
         return point.values[:, :1], point.slopes[:, :1]
-    return point.pieces, point.tilts
+    return point.pieces, point.piece_gradients
 
 
-def unlike(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Differences, in parts of `size` (s,), of the objective's pieces that have `shares` (s, parts) from the one with the
-    largest share, (s, k), and their derivatives (s, k, d); 0 for pieces without a share."""
+def kink_residuals(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Differences (s, k) between pieces of the objective with `shares` (s, parts) and the piece with the largest share, in
+    units of `size` (s,), and their derivatives (s, k, d); 0 for pieces without a share."""
     most = np.argsort(-shares, axis=1)[:, : point.z.shape[1] + 1]
-    values, met = (np.take_along_axis(a, most, axis=1) for a in (point.pieces, shares > _COUNTS))
-    tilts = np.take_along_axis(point.tilts, most[:, :, None], axis=1)
-    met, size = met[:, 1:] & np.all(np.isfinite(tilts), axis=(1, 2))[:, None], size[:, None]
-    apart, tilts = values[:, 1:] - values[:, :1], tilts[:, 1:] - tilts[:, :1]
-    return np.where(met, apart / size, 0.0), np.where(met[:, :, None], tilts / size[:, :, None], 0.0)
+    values, met = (np.take_along_axis(a, most, axis=1) for a in (point.pieces, shares > _MIN_SHARE_AT_KINK))
+    piece_gradients = np.take_along_axis(point.piece_gradients, most[:, :, None], axis=1)
+    met, size = met[:, 1:] & np.all(np.isfinite(piece_gradients), axis=(1, 2))[:, None], size[:, None]
+    gap, piece_gradients = values[:, 1:] - values[:, :1], piece_gradients[:, 1:] - piece_gradients[:, :1]
+    return np.where(met, gap / size, 0.0), np.where(met[:, :, None], piece_gradients / size[:, :, None], 0.0)
 
 
 def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The derivatives (s, d) of the largest piece of the objective; by how much those (s, k, d) of the next ones differ, and
-    which of these, (s, k), are about as large: within `near` of the objective, or of what it changes by over the bounds."""
+    """Derivatives at a kink of the objective.
+
+    **Returns** the derivatives (s, d) of the largest piece; the differences (s, k, d) of the next ones from these; and True
+    (s, k) for pieces about as large: within `near`, relative to the objective or to its change over the bounds.
+    """
     order = np.argsort(-point.pieces, axis=1)[:, : point.z.shape[1] + 1]
     values = np.take_along_axis(point.pieces, order, axis=1)
-    tilts = np.nan_to_num(np.take_along_axis(point.tilts, order[:, :, None], axis=1))
-    size = np.maximum(np.abs(values[:, :1]), _NOTHING * np.max(np.abs(tilts), axis=(1, 2))[:, None])
-    return tilts[:, 0], tilts[:, 1:] - tilts[:, :1], values[:, :1] - values[:, 1:] < near * size
+    piece_gradients = np.nan_to_num(np.take_along_axis(point.piece_gradients, order[:, :, None], axis=1))
+    size = np.maximum(np.abs(values[:, :1]), _SMALL_OBJECTIVE_SHARE * np.max(np.abs(piece_gradients), axis=(1, 2))[:, None])
+    return piece_gradients[:, 0], piece_gradients[:, 1:] - piece_gradients[:, :1], values[:, :1] - values[:, 1:] < near * size
 
 
-def seconds(problem: Problem, point: Point) -> np.ndarray:
-    """Second derivatives (s, d, me + mi + parts + 1, d) of what is held, of demands, of the objective's pieces, and of half
-    the objective's square, by central differences of the first ones."""
+def second_derivatives(problem: Problem, point: Point) -> np.ndarray:
+    """Second derivatives (s, d, me + mi + parts + 1, d) of held quantities, demands, pieces of the objective, and half the
+    square of the objective, by central differences of the first ones."""
     s, d = point.z.shape
-    moves = _WIDTH * np.concatenate([np.eye(d), -np.eye(d)])
-    # All in one, so that chunks are full and every core has some.
+    moves = _DIFFERENCE_STEP * np.concatenate([np.eye(d), -np.eye(d)])
+    # All points in one call, so that chunks are full and every core has work.
     around = point.take(np.tile(np.arange(s), 2 * d))
     z = around.z + np.repeat(moves, s, axis=0)
     there = evaluate(problem, z, around.ahead(z))
@@ -85,66 +101,71 @@ def seconds(problem: Problem, point: Point) -> np.ndarray:
         [there.slopes[:, 1:], _pieces(problem, there)[1], (there.values[:, :1] * there.slopes[:, 0])[:, None]], axis=1
     )
     high, low = rows.reshape(2, d, s, -1, d)
-    return np.moveaxis((high - low) / (2.0 * _WIDTH), 0, 1)
+    return np.moveaxis((high - low) / (2.0 * _DIFFERENCE_STEP), 0, 1)
 
 
 def curvatures(
     problem: Problem, point: Point, second: np.ndarray, weights: np.ndarray, shares: np.ndarray, size: np.ndarray
 ) -> list[np.ndarray]:
-    """Second derivatives (s, d, d) of the Lagrangian over the objective's size, not indefinite; only along what constraints
-    and pieces that count leave free: across them the linear model decides. Second ones, where the objective f is positive,
-    take (f^2/2)''/f in place of f'': where f is the modulus of what is linear nearby, a force that is to vanish, their step
-    leads there at once, and that of f'' only from near.
+    """Second derivatives (s, d, d) of the Lagrangian, in units of the objective, made positive semidefinite.
 
-    **Arguments**: `second` see `seconds`; multipliers `weights` (s, me + mi) in units of the objective's `size` (s,); `shares`
-    (s, parts) of its pieces.
+    They are projected onto the directions that active constraints and pieces leave free; the linear model decides across these.
+    If the objective f is positive, a second set has (f^2/2)''/f in place of f''. For the modulus of an almost linear quantity,
+    such as a force that is to vanish, its step reaches the zero at once, the step of f'' only from nearby.
+
+    **Arguments**: `second`: see `second_derivatives`; multipliers `weights` (s, me + mi) in units of the objective's `size`
+    (s,); `shares` (s, parts) of its pieces.
     """
     s, d = point.z.shape
     m = problem.equalities
     constraints = np.einsum("sm,simd->sid", weights, second[:, :, : weights.shape[1]])
-    bend = constraints + np.einsum("sp,sipd->sid", shares / size[:, None], second[:, :, weights.shape[1] : -1])
-    usable = np.all(np.isfinite(bend), axis=(1, 2), keepdims=True)
-    bend = np.where(usable, bend, np.eye(d))
+    hessian = constraints + np.einsum("sp,sipd->sid", shares / size[:, None], second[:, :, weights.shape[1] : -1])
+    usable = np.all(np.isfinite(hessian), axis=(1, 2), keepdims=True)
+    hessian = np.where(usable, hessian, np.eye(d))
     counts = np.ones(weights.shape, bool)
     counts[:, m:] = weights[:, m:] > 1e-12
     free = 1.0 - (((point.z <= 0.0) | (point.z >= 1.0)) * 1.0)
     rows = np.where(np.isfinite(point.slopes), point.slopes, 0.0)[:, 1:] * counts[:, :, None]
-    if problem.parts > 1:  # along a kink the pieces that meet there stay alike
-        rows = np.concatenate([rows, unlike(point, shares, size)[1]], axis=1)
+    if problem.parts > 1:  # the pieces that meet at a kink stay equal along it
+        rows = np.concatenate([rows, kink_residuals(point, shares, size)[1]], axis=1)
     rows = rows * free[:, None, :]
     projector = np.eye(d) * np.ones((s, 1, 1))
     if rows.shape[1]:
         projector = projector - np.stack([least_norm(rows, rows[:, :, i]) for i in range(d)], axis=2)
     value = point.values[:, 0]
     if problem.parts > 1 or not np.any(value > 0.0):
-        return [_positive(projector, bend)]
-    with np.errstate(all="ignore"):  # an objective that is nothing has no such ones
+        return [_positive(projector, hessian)]
+    with np.errstate(all="ignore"):  # not defined for an objective of 0
         other = constraints + second[:, :, -1] / (size * value)[:, None, None]
     apt = usable & (value > 0.0)[:, None, None] & np.all(np.isfinite(other), axis=(1, 2), keepdims=True)
-    return [_positive(projector, bend), _positive(projector, np.where(apt, other, bend))]
+    return [_positive(projector, hessian), _positive(projector, np.where(apt, other, hessian))]
 
 
-def _positive(projector: np.ndarray, bend: np.ndarray) -> np.ndarray:
-    inner = projector @ (bend + transposed(bend)) / 2.0 @ transposed(projector)
+def _positive(projector: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+    inner = projector @ (hessian + transposed(hessian)) / 2.0 @ transposed(projector)
     values, vectors = np.linalg.eigh((inner + transposed(inner)) / 2.0)
     top = np.maximum(np.max(np.abs(values), axis=1, keepdims=True), 1e-12)
     values = np.maximum(np.abs(values), 1e-10 * top)
     return np.einsum("sij,sj,skj->sik", vectors, values, vectors)
 
 
-def modelled(problem: Problem, point: Point, bend: np.ndarray, size: np.ndarray, price: np.ndarray, reach: np.ndarray) -> Step:
-    """The step to the least value of the model within the bounds and within `reach` (s,). Where the objective is the largest
-    of several pieces, this is the epigraph's: the least t that none of them exceeds."""
+def solve_model(
+    problem: Problem, point: Point, hessian: np.ndarray, size: np.ndarray, penalty: np.ndarray, trust_radius: np.ndarray
+) -> Step:
+    """Solve for the step to the minimum of the model within the bounds and the trust region of radius `trust_radius` (s,).
+
+    If the objective is the maximum of several pieces, the problem is that of the epigraph: the least t that none exceeds.
+    """
     m, mi, d = problem.equalities, len(problem.demands), point.z.shape[1]
-    box = np.maximum(-point.z, -reach[:, None]), np.minimum(1.0 - point.z, reach[:, None])
+    box = np.maximum(-point.z, -trust_radius[:, None]), np.minimum(1.0 - point.z, trust_radius[:, None])
     held = point.slopes[:, 1 : 1 + m], point.values[:, 1 : 1 + m]
     demands = point.slopes[:, 1 + m :], point.values[:, 1 + m :]
     if problem.parts == 1:
-        found = elastic(bend, point.slopes[:, 0] / size[:, None], held, demands, box, price)
-        return Step(found.p, found.held, found.demands * _active(found, demands), np.ones((len(bend), 1)))
+        found = elastic(hessian, point.slopes[:, 0] / size[:, None], held, demands, box, penalty)
+        return Step(found.p, found.held, found.demands * _active(found, demands), np.ones((len(hessian), 1)))
     values = (point.pieces - point.values[:, :1]) / size[:, None]
-    slopes = point.tilts / size[:, None, None]
-    # Those that could be the largest within reach, and not more than may be at one kink and some to spare.
+    slopes = point.piece_gradients / size[:, None, None]
+    # Only pieces that could be the largest in the trust region, and not many more than can meet at one kink.
     could = values + np.einsum("spd,sd->sp", np.abs(slopes), np.maximum(-box[0], box[1]))
     few = np.argsort(-could, axis=1)[:, : 3 * d + 8]
     values = np.take_along_axis(values, few, axis=1)
@@ -155,12 +176,12 @@ def modelled(problem: Problem, point: Point, bend: np.ndarray, size: np.ndarray,
 
     wide = 1.0 + 2.0 * np.max(np.abs(could), axis=1, keepdims=True)
     found = elastic(
-        np.pad(bend, ((0, 0), (0, 1), (0, 1))),
-        np.concatenate([np.zeros((len(bend), d)), np.ones((len(bend), 1))], axis=1),
+        np.pad(hessian, ((0, 0), (0, 1), (0, 1))),
+        np.concatenate([np.zeros((len(hessian), d)), np.ones((len(hessian), 1))], axis=1),
         (beside(held[0], 0.0), held[1]),
         (np.concatenate([beside(demands[0], 0.0), beside(slopes, -1.0)], axis=1), np.concatenate([demands[1], values], axis=1)),
         (np.concatenate([box[0], -wide], axis=1), np.concatenate([box[1], wide], axis=1)),
-        price,
+        penalty,
     )
     shares = np.zeros_like(point.pieces)
     np.put_along_axis(shares, few, found.demands[:, mi:], axis=1)
@@ -169,22 +190,24 @@ def modelled(problem: Problem, point: Point, bend: np.ndarray, size: np.ndarray,
 
 
 def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """True (s, mi) for demands (slopes, excess) that the step has no room left for. An interior point leaves every other one a
-    small multiplier: its curvature would be left out, and beside an objective of almost nothing it would be large."""
+    """True (s, mi) for demands (slopes, excess) that are active after the step.
+
+    An interior-point method leaves small multipliers for inactive demands, which would be large beside an objective near 0.
+    """
     slopes, excess = demands
     room = -excess - np.einsum("smd,sd->sm", slopes, found.p[:, : slopes.shape[2]])
     return found.demands[:, : excess.shape[1]] > room
 
 
-def fall(problem: Problem, point: Point, bend: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
+def predicted_decrease(problem: Problem, point: Point, hessian: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
     """Decrease of the objective that the model predicts, relative to its value; for an objective of about 0, relative to its
     change over the bounds."""
     values, slopes = _pieces(problem, point)
     along = np.max(values - point.values[:, :1] + np.einsum("spd,sd->sp", slopes, model.p), axis=1)
     dual = np.concatenate([model.held, model.demands], axis=1) * size[:, None]
-    paid = np.einsum("sm,smd,sd->s", dual, point.slopes[:, 1:], model.p)
-    curved = np.einsum("si,sij,sj->s", model.p, bend, model.p) * size
-    # At the tip of a modulus that vanishes slopes say nothing, and how they change does.
-    change = np.max(np.abs(slopes), axis=(1, 2)) + _WIDTH * np.trace(bend, axis1=1, axis2=2) * size
-    least = np.maximum(np.abs(point.values[:, 0]), _NOTHING * change)
-    return np.abs(along + paid + 0.5 * curved) / np.maximum(least, 1e-300)
+    constraint_change = np.einsum("sm,smd,sd->s", dual, point.slopes[:, 1:], model.p)
+    curved = np.einsum("si,sij,sj->s", model.p, hessian, model.p) * size
+    # At the tip of a modulus that vanishes, slopes give no scale, but their change does.
+    change = np.max(np.abs(slopes), axis=(1, 2)) + _DIFFERENCE_STEP * np.trace(hessian, axis1=1, axis2=2) * size
+    least = np.maximum(np.abs(point.values[:, 0]), _SMALL_OBJECTIVE_SHARE * change)
+    return np.abs(along + constraint_change + 0.5 * curved) / np.maximum(least, 1e-300)

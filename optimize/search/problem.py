@@ -114,16 +114,16 @@ def _hard(quantity: Quantity) -> bool:
 
 class Point(NamedTuple):
     """Designs z (s, d), their values (s, 1 + me + mi) and derivatives (s, 1 + me + mi, d), the speeds `known` of what is
-    followed and `reach`, by how much these change with z (s, ..., d); the objective's `pieces` (s, p) and their derivatives
-    `tilts` (s, p, d), none where it is one piece alone."""
+    followed and `known_slopes`, by how much these change with z (s, ..., d); the objective's `pieces` (s, p) and their
+    derivatives `piece_gradients` (s, p, d), none where it is one piece alone."""
 
     z: np.ndarray
     values: np.ndarray
     slopes: np.ndarray
     known: Known
-    reach: Known
+    known_slopes: Known
     pieces: np.ndarray
-    tilts: np.ndarray
+    piece_gradients: np.ndarray
 
     def exists(self) -> np.ndarray:
         """True if everything has a value and derivatives there (s,)."""
@@ -151,7 +151,7 @@ class Point(NamedTuple):
         """Approximate followed speeds at other designs."""
         step = z - self.z
         guess = []
-        for k, r in zip(self.known, self.reach, strict=True):
+        for k, r in zip(self.known, self.known_slopes, strict=True):
             moved = k + np.einsum("s...d,sd->s...", r, step)
             guess.append(np.where(np.isfinite(moved) & (np.abs(moved / k - 1.0) < 0.2), moved, k))
         return tuple(guess)
@@ -191,11 +191,11 @@ def derive(
 
     rows = 1 + problem.equalities + len(problem.demands) + (problem.parts if pieces else 0)
     if z.shape[0] <= 4 * rows or problem.forward_only:
-        (slopes, reach), (values, found) = jax.jacfwd(twice, has_aux=True)(z)
+        (slopes, known_slopes), (values, found) = jax.jacfwd(twice, has_aux=True)(z)
     else:
         slopes, (values, found) = jax.jacrev(lambda x: (twice(x)[0][0], twice(x)[1]), has_aux=True)(z)
-        reach = tuple(jnp.zeros((*w.shape, z.shape[0])) for w in found)
-    return values, slopes, found, reach
+        known_slopes = tuple(jnp.zeros((*w.shape, z.shape[0])) for w in found)
+    return values, slopes, found, known_slopes
 
 
 @cached
@@ -239,9 +239,9 @@ def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
     """Values and derivatives of many designs whose jams are near these speeds."""
     if len(z) == 0:
         raise ValueError("no designs")
-    values, slopes, found, reach = in_chunks(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
+    values, slopes, found, known_slopes = in_chunks(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
     rows = 1 + problem.equalities + len(problem.demands)
-    return Point(z, values[:, :rows], slopes[:, :rows], found, reach, values[:, rows:], slopes[:, rows:])
+    return Point(z, values[:, :rows], slopes[:, :rows], found, known_slopes, values[:, rows:], slopes[:, rows:])
 
 
 def looked_up(problem: Problem, z: np.ndarray) -> Known:

@@ -1,4 +1,4 @@
-"""Many small quadratic programs at once, by a primal-dual interior point."""
+"""Many small quadratic programs at once, by a primal-dual interior-point method."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ __all__ = ["Solved", "elastic"]
 
 _MAX_NEWTON_STEPS = 60
 
-_STILL, _NEAR = 8, 1e-6
-"""A point this near to optimal that has not come to half as much in so many steps comes no nearer: that is rounding."""
+_STEPS_WITHOUT_PROGRESS, _NEAR_OPTIMUM = 8, 1e-6
+"""Number of steps without halving the residual, and residual, at which a program ends: only rounding errors are left."""
 
 
 class Solved(NamedTuple):
-    """The steps `p` (s, d) and the multipliers of the equalities (s, me), of the demands (s, mi), not negative, and of the
-    bounds (s, d), positive at the upper one."""
+    """Solutions `p` (s, d) and multipliers: of `held` equalities (s, me), of `demands` (s, mi), not negative, and of `bounds`
+    (s, d), positive at the upper one."""
 
     p: np.ndarray
     held: np.ndarray
@@ -30,22 +30,22 @@ def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def elastic(
-    bend: np.ndarray,
+    hessian: np.ndarray,
     slope: np.ndarray,
     held: tuple[np.ndarray, np.ndarray],
     demands: tuple[np.ndarray, np.ndarray],
     box: tuple[np.ndarray, np.ndarray],
-    price: np.ndarray,
+    penalty: np.ndarray,
 ) -> Solved:
-    """Solves, for each s, what is never contradictory because every constraint may be broken at a price:
+    """Solve quadratic programs with penalized constraints, which are never infeasible:
 
-        min p.B p/2 + g.p + price (sum |A p + a| + sum max(0, C p + c)),     low <= p <= high
+        min p.B p/2 + g.p + penalty (sum |A p + a| + sum max(0, C p + c)),     low <= p <= high
 
-    Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers are known to
-    about a millionth of the price at worst.
+    Method: Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers have an
+    error of at most about a millionth of the penalty.
 
-    **Arguments** (s problems): `bend` B (s, d, d), not indefinite; `slope` g (s, d); `held` A (s, me, d) and a (s, me);
-    `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `price` (s,).
+    **Arguments** (s problems): `hessian` B (s, d, d), not indefinite; `slope` g (s, d); `held` A (s, me, d) and a (s, me);
+    `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `penalty` (s,).
 
     >>> import numpy as np
     >>> no = np.zeros((1, 0, 1)), np.zeros((1, 0))
@@ -59,8 +59,8 @@ def elastic(
     me, mi = a.shape[1], c.shape[1]
     n = d + me + mi
     quadratic = np.zeros((s, n, n))
-    quadratic[:, :d, :d] = bend
-    linear = np.concatenate([slope, np.repeat(price[:, None], me + mi, axis=1)], axis=1)
+    quadratic[:, :d, :d] = hessian
+    linear = np.concatenate([slope, np.repeat(penalty[:, None], me + mi, axis=1)], axis=1)
     identity = np.broadcast_to(np.eye(d), (s, d, d))
 
     def row(of_p: np.ndarray, k: int, count: int) -> np.ndarray:
@@ -83,14 +83,14 @@ def elastic(
     )
     right = np.concatenate([-a, a, -c, np.zeros((s, me + mi)), high, -low], axis=1)
     m = rows.shape[1]
-    # Begin in the middle of the box, where all products of slacks and duals are alike and the prices are about paid.
+    # Start in the middle of the box with equal products of slacks and duals.
     x = np.zeros((s, n))
     x[:, :d] = (low + high) / 2.0
     broken = np.concatenate([_times(a_rows, x[:, :d]) + a, _times(c_rows, x[:, :d]) + c], axis=1)
     wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
     x[:, d:] = wide[:, None]
     slack = np.maximum(right - _times(rows, x), 1e-12)
-    dual = (price * wide / 3.0)[:, None] / slack
+    dual = (penalty * wide / 3.0)[:, None] / slack
     turned = np.swapaxes(rows, 1, 2)
     scale = 1.0 + np.abs(linear).max(axis=1)
     ridge = 1e-13 * np.eye(n)
@@ -100,13 +100,13 @@ def elastic(
         stationary = _times(quadratic, x) + linear + _times(turned, dual)
         primal = _times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
-        # Rounding may spoil a point that was good already: the best one counts.
+        # Keep the best point, since rounding may spoil a good one.
         off = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
         better = off < least
         improved, mark = np.where(off < 0.5 * mark, k, improved), np.where(off < 0.5 * mark, off, mark)
         least = np.where(better, off, least)
         best = tuple(np.where(better[:, None], new, old) for new, old in zip((x, dual), best, strict=True))
-        done = (least < 1e-11) | ((least < _NEAR) & (k - improved >= _STILL))
+        done = (least < 1e-11) | ((least < _NEAR_OPTIMUM) & (k - improved >= _STEPS_WITHOUT_PROGRESS))
         if np.all(done):
             break
         weight = dual / slack
@@ -121,7 +121,7 @@ def elastic(
             primal: np.ndarray = primal,
             slack: np.ndarray = slack,
         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """The step that brings the products of slacks and duals to `target` more."""
+            """Step that increases the products of slacks and duals by `target`."""
             rest = -stationary - _times(turned, weight * primal + target / slack)
             dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
             ds = -primal - _times(rows, dx)
@@ -137,7 +137,7 @@ def elastic(
         centre = (after / np.maximum(gap, 1e-300)) ** 3 * gap
         dx, ds, dl = solved(centre[:, None] - slack * dual - ds * dl)
         keep = np.where(done, 0.0, 0.995)
-        # One length for both: the duals' equation holds the quadratic term.
+        # One step length for both, since the equation of the duals contains the quadratic term.
         by = keep * np.minimum(longest(slack, ds), longest(dual, dl))
         x = x + by[:, None] * dx
         slack = np.maximum(slack + by[:, None] * ds, 1e-300)

@@ -6,7 +6,7 @@ import pytest
 from two_springs import FREE, SCENE, plain, point_of
 
 from optimize import DesignSpace, hold, largest
-from optimize.search.polish import _merit, draw_starts, optimality, polish, restored, violation
+from optimize.search.polish import _merit, draw_starts, optimality, polish, restore, violation
 from optimize.search.problem import evaluate, looked_up, problem_of
 
 SUM = plain("sum", lambda x, y: x + y)
@@ -33,8 +33,8 @@ def test_violation_is_the_largest_residual(held):
     point = point_of(np.full((4, 2), 0.5), values, np.ones((4, 3, 2)))
     np.testing.assert_array_equal(violation(held, point), [0.3, 0.2, 0.1, np.inf])
     # What a step is judged by: the objective in parts of its size, and the price of all that is off together.
-    size, price = np.full(4, 3.0), np.full(4, 10.0)
-    np.testing.assert_allclose(_merit(held, point, size, price), [3.0 + 5.0, 3.0 + 3.0, 3.0 + 1.0, np.inf], rtol=1e-14)
+    size, penalty = np.full(4, 3.0), np.full(4, 10.0)
+    np.testing.assert_allclose(_merit(held, point, size, penalty), [3.0 + 5.0, 3.0 + 3.0, 3.0 + 1.0, np.inf], rtol=1e-14)
     one = point_of(np.full((1, 2), 0.5), np.array([[9.0, 1e-13, 0.0]]), np.ones((1, 3, 2)))
     np.testing.assert_array_equal(_merit(held, one, np.ones(1), np.array([1e9])), [9.0])  # rounding costs nothing
 
@@ -42,21 +42,21 @@ def test_violation_is_the_largest_residual(held):
 def test_designs_are_moved_to_the_nearest_that_keep_what_is_held(held):
     start = at(held, (3.0, 2.0), (6.0, 4.0), (1.0, 7.0), (8.0, 1.0))
     # Across the line; to the corner; what is at its bound stays there; no step is longer than 0.3 of a range.
-    np.testing.assert_allclose(xy(restored(held, start, 2)), [[4.0, 3.0], [4.0, 3.0], [1.0, 6.0], [4.0, 3.0]], atol=1e-9)
-    np.testing.assert_allclose(xy(restored(held, start, 1)), [[4.0, 3.0], [4.0, 3.0], [1.0, 6.0], [5.6, 3.0]], atol=1e-9)
+    np.testing.assert_allclose(xy(restore(held, start, 2)), [[4.0, 3.0], [4.0, 3.0], [1.0, 6.0], [4.0, 3.0]], atol=1e-9)
+    np.testing.assert_allclose(xy(restore(held, start, 1)), [[4.0, 3.0], [4.0, 3.0], [1.0, 6.0], [5.6, 3.0]], atol=1e-9)
     room = at(held, (2.0, 4.0), (2.0, 4.0))
     wanted = np.array([[False], [True]])
-    np.testing.assert_allclose(xy(restored(held, room, 1, wanted)), [[2.5, 4.5], [4.0, 3.0]], atol=1e-9)
+    np.testing.assert_allclose(xy(restore(held, room, 1, wanted)), [[2.5, 4.5], [4.0, 3.0]], atol=1e-9)
     free = problem_of(DesignSpace(SCENE, FREE), NEAR, [], starts=2)
-    assert restored(free, start, 2) is start
+    assert restore(free, start, 2) is start
 
 
 def test_designs_are_moved_onto_the_kink_that_they_are_at():
     pieces = [plain(str(k), lambda x, y, k=k: (x - k) ** 2 + (y - 4.0) ** 2 + 1.0) for k in (3.0, 6.0)]
     problem = problem_of(DesignSpace(SCENE, FREE), largest(*pieces), [], starts=2)
     both = np.full((2, 2), 0.5)
-    np.testing.assert_allclose(xy(restored(problem, at(problem, (3.5, 2.0), (5.5, 7.0)), 4, None, both))[:, 0], 4.5, atol=1e-9)
-    np.testing.assert_allclose(xy(restored(problem, at(problem, (3.5, 2.0)), 2, None, np.array([[0.0, 1.0]]))), [[3.5, 2.0]])
+    np.testing.assert_allclose(xy(restore(problem, at(problem, (3.5, 2.0), (5.5, 7.0)), 4, None, both))[:, 0], 4.5, atol=1e-9)
+    np.testing.assert_allclose(xy(restore(problem, at(problem, (3.5, 2.0)), 2, None, np.array([[0.0, 1.0]]))), [[3.5, 2.0]])
 
 
 SPACE = DesignSpace(SCENE, {**FREE, "machine.link_stiffness": (1e5, 4e5), "loads.drag": (1.0, 2.0)}, [hold(SUM, 7.0)])
@@ -156,7 +156,7 @@ def test_polishing_reports_its_residual_and_ends_early(held):
     start = at(held, (2.0, 2.0), (6.0, 8.0), (1.5, 6.0), (9.0, 1.0))
     shares = []
     none = polish(held, start, 0, lambda share, point: shares.append(share))
-    on = restored(held, start, 2)
+    on = restore(held, start, 2)
     np.testing.assert_array_equal(none.point.z, on.z)
     np.testing.assert_array_equal(none.history, on.values[None, :, 0])
     assert shares == []

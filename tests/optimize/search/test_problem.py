@@ -32,7 +32,7 @@ def test_values_are_the_objective_what_is_held_and_the_demands():
     )
     slopes = [[[-y, -x], [1 / 7, 1 / 7], [0.25, 0.0], [-0.2, 0.2]] for x, y in ((3.0, 5.0), (7.0, 2.0))]
     np.testing.assert_allclose(point.slopes, 8.0 * np.array(slopes), atol=1e-12)
-    assert point.pieces.shape == (2, 0) and point.tilts.shape == (2, 0, 2)
+    assert point.pieces.shape == (2, 0) and point.piece_gradients.shape == (2, 0, 2)
     with pytest.raises(ValueError, match="no designs"):
         evaluate(problem, np.zeros((0, 2)), ())
 
@@ -42,7 +42,7 @@ def test_pieces_stand_beside_the_values():
     point = evaluate(problem, np.array([[0.25, 0.5]]), ())
     np.testing.assert_allclose(point.values, [[7.0, -0.25]])
     np.testing.assert_allclose(point.pieces, [[3.0, 7.0]])
-    np.testing.assert_allclose(point.tilts, 8.0 * np.array([[[1.0, 0.0], [2.0, 2.0]]]))
+    np.testing.assert_allclose(point.piece_gradients, 8.0 * np.array([[[1.0, 0.0], [2.0, 2.0]]]))
 
 
 def test_scale_of_a_demand_is_its_limit_or_first_value():
@@ -75,11 +75,11 @@ def test_all_derivative_modes_agree_with_derivatives_by_hand():
         space = DesignSpace(machine, free, hold_)
         problem = problem_of(space, wish, [], 1)
         z = jnp.linspace(0.2, 0.7, 6)
-        values, slopes, found, reach = derive(problem, z, ())
+        values, slopes, found, known_slopes = derive(problem, z, ())
         k = springs(space.at(z))
         np.testing.assert_allclose(values[0], jnp.sum(weights * k**2), rtol=1e-12)
         np.testing.assert_allclose(slopes[0], 2.0 * weights * k**2 * np.log(90.0), rtol=1e-10)  # k = low 90^z
-        assert found == reach == ()
+        assert found == known_slopes == ()
 
 
 def test_followed_speeds_and_how_they_change():
@@ -93,9 +93,9 @@ def test_followed_speeds_and_how_they_change():
     point = evaluate(problem, z, near)
     np.testing.assert_allclose(point.known[0], omega, rtol=1e-10)
     np.testing.assert_allclose(point.values[:, 0], omega, rtol=1e-10)
-    np.testing.assert_allclose(point.reach[0], point.slopes[:, 0], rtol=1e-10)
+    np.testing.assert_allclose(point.known_slopes[0], point.slopes[:, 0], rtol=1e-10)
     moved = [evaluate(problem, z + step * np.array([0.0, 1.0]), near).values[:, 0] for step in (1e-5, -1e-5)]
-    np.testing.assert_allclose(point.reach[0][:, 1], (moved[0] - moved[1]) / 2e-5, rtol=1e-5)
+    np.testing.assert_allclose(point.known_slopes[0][:, 1], (moved[0] - moved[1]) / 2e-5, rtol=1e-5)
     ahead = point.ahead(z + 1e-3)
     np.testing.assert_allclose(ahead[0], omega + 1e-3 * point.slopes[:, 0].sum(axis=1), rtol=1e-12)
 
@@ -103,8 +103,16 @@ def test_followed_speeds_and_how_they_change():
 def test_guesses_further_off_than_a_fifth_are_not_taken():
     z = np.zeros((4, 2))
     known = np.array([10.0, 10.0, 10.0, np.nan])
-    reach = np.array([[1.0, 0.5], [30.0, 0.0], [-30.0, np.inf], [1.0, 1.0]])
-    point = Point(z, z, z, (known, np.stack([known, 2.0 * known], axis=1)), (reach, np.stack([reach, -reach], axis=1)), z, z)
+    known_slopes = np.array([[1.0, 0.5], [30.0, 0.0], [-30.0, np.inf], [1.0, 1.0]])
+    point = Point(
+        z,
+        z,
+        z,
+        (known, np.stack([known, 2.0 * known], axis=1)),
+        (known_slopes, np.stack([known_slopes, -known_slopes], axis=1)),
+        z,
+        z,
+    )
     one, two = point.ahead(np.full((4, 2), 0.1))
     np.testing.assert_allclose(one, [10.15, 10.0, 10.0, np.nan])
     np.testing.assert_allclose(two, [[10.15, 19.85], [10.0, 17.0], [10.0, 20.0], [np.nan, np.nan]])

@@ -14,28 +14,28 @@ def some_programs():
     random = np.random.default_rng(0)
     s, d, me, mi = 40, 4, 1, 3
     root = random.normal(size=(s, d, d))
-    bend = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(d)
+    hessian = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(d)
     slope = 3.0 * random.normal(size=(s, d))
     held, demands = (random.normal(size=(s, m, d)) for m in (me, mi))
     off, excess = 0.1 * random.normal(size=(s, me)), random.normal(size=(s, mi)) - 0.5
-    return bend, slope, (held, off), (demands, excess), (-np.ones((s, d)), np.ones((s, d))), np.full(s, 1e4)
+    return hessian, slope, (held, off), (demands, excess), (-np.ones((s, d)), np.ones((s, d))), np.full(s, 1e4)
 
 
 def test_quadratic_programs_meet_their_conditions():
-    bend, slope, (held, off), (demands, excess), (low, high), price = some_programs()
-    one = elastic(bend, slope, (held, off), (demands, excess), (low, high), price)
+    hessian, slope, (held, off), (demands, excess), (low, high), penalty = some_programs()
+    one = elastic(hessian, slope, (held, off), (demands, excess), (low, high), penalty)
     p = one.p
-    gradient = np.einsum("sij,sj->si", bend, p) + slope + one.bounds
+    gradient = np.einsum("sij,sj->si", hessian, p) + slope + one.bounds
     gradient += np.einsum("sm,smd->sd", one.held, held) + np.einsum("sm,smd->sd", one.demands, demands)
-    np.testing.assert_allclose(gradient, 0.0, atol=1e-7 * price[0])
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-7 * penalty[0])
     left = np.einsum("smd,sd->sm", demands, p) + excess
     possible = np.max(np.abs(one.held), axis=1) < 5e3
     assert possible.sum() > 30
     np.testing.assert_allclose(np.einsum("smd,sd->sm", held, p)[possible], -off[possible], atol=1e-7)
-    # Demands that nearly contradict each other have multipliers near the price, known to fewer digits.
+    # Demands that nearly contradict each other have multipliers near the penalty, known to fewer digits.
     kept = possible & (np.max(one.demands, axis=1) < 1e2)
     assert kept.sum() > 20 and np.all(left[kept] < 1e-7)
-    np.testing.assert_allclose((one.demands * left)[kept], 0.0, atol=1e-6 * price[0])
+    np.testing.assert_allclose((one.demands * left)[kept], 0.0, atol=1e-6 * penalty[0])
     assert np.all(one.demands >= 0.0) and np.all(p >= low) and np.all(p <= high)
 
 
@@ -56,7 +56,7 @@ def test_quadratic_program_is_independent_of_its_batch(monkeypatch):
 
 
 def test_boxes_and_amounts_may_be_far_from_nothing():
-    """min p^2/2 between 100 and 101 with p to be -1000: at 100, the constraint broken at its price, the bound pays the rest."""
+    """min p^2/2 between 100 and 101 with p = -1000 required: p is 100, the constraint is penalized, the bound has the rest."""
     box = np.full((1, 1), 100.0), np.full((1, 1), 101.0)
     one = np.ones((1, 1, 1))
     held = elastic(one, np.zeros((1, 1)), (one, np.array([[1e3]])), NOTHING, box, np.array([10.0]))
@@ -68,30 +68,30 @@ def test_boxes_and_amounts_may_be_far_from_nothing():
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
 def test_separable_program_ends_at_minima_or_bounds(size):
     """min sum b p^2/2 + g p between -1 and 2: p = -g/b within the bounds, and the bounds push with -(b p + g)."""
-    bend, slope = np.array([2.0, 1.0, 4.0, 0.5]), np.array([-2.0, 3.0, -20.0, 0.1])
+    hessian, slope = np.array([2.0, 1.0, 4.0, 0.5]), np.array([-2.0, 3.0, -20.0, 0.1])
     box = -np.ones((1, 4)), 2.0 * np.ones((1, 4))
     nothing = np.zeros((1, 0, 4)), np.zeros((1, 0))
-    one = elastic(size * np.diag(bend)[None], size * slope[None], nothing, nothing, box, np.array([10.0]))
+    one = elastic(size * np.diag(hessian)[None], size * slope[None], nothing, nothing, box, np.array([10.0]))
     np.testing.assert_allclose(one.p[0], [1.0, -1.0, 2.0, -0.2], atol=1e-8)
     np.testing.assert_allclose(one.bounds[0] / size, [0.0, -2.0, 12.0, 0.0], atol=1e-7)
 
 
 @pytest.mark.parametrize(
-    ("price", "p", "paid"),
+    ("penalty", "p", "multiplier"),
     [
-        (100.0, 1.0, 2.0),  # the constraint is kept, at the price of the slope there
-        (1.0, 2.0, 1.0),  # it is broken: no multiplier is above the price
+        (100.0, 1.0, 2.0),  # the constraint is kept, at the penalty of the slope there
+        (1.0, 2.0, 1.0),  # it is broken: no multiplier is above the penalty
     ],
 )
-def test_what_is_dearer_than_its_price_is_broken(price, p, paid):
+def test_constraints_beyond_their_penalty_are_violated(penalty, p, multiplier):
     """min p^2/2 - 3 p with p to be 1, or at most 1; and the same on the other side of 0."""
     one, box = np.ones((1, 1, 1)), (np.full((1, 1), -9.0), np.full((1, 1), 7.0))
     for sign in (1.0, -1.0):
-        slope, price_of = np.array([[-3.0 * sign]]), np.array([price])
-        held = elastic(one, slope, (one, np.array([[-sign]])), NOTHING, box, price_of)
-        np.testing.assert_allclose([held.p[0, 0], held.held[0, 0]], [sign * p, sign * paid], atol=1e-7)
-        demanded = elastic(one, slope, NOTHING, (sign * one, np.array([[-1.0]])), box, price_of)
-        np.testing.assert_allclose([demanded.p[0, 0], demanded.demands[0, 0]], [sign * p, paid], atol=1e-7)
+        slope, penalties = np.array([[-3.0 * sign]]), np.array([penalty])
+        held = elastic(one, slope, (one, np.array([[-sign]])), NOTHING, box, penalties)
+        np.testing.assert_allclose([held.p[0, 0], held.held[0, 0]], [sign * p, sign * multiplier], atol=1e-7)
+        demanded = elastic(one, slope, NOTHING, (sign * one, np.array([[-1.0]])), box, penalties)
+        np.testing.assert_allclose([demanded.p[0, 0], demanded.demands[0, 0]], [sign * p, multiplier], atol=1e-7)
 
 
 def test_each_multiplier_is_that_of_its_own_constraint():

@@ -21,8 +21,8 @@ def plain(name, function):
     return Quantity(name, "", lambda s: function(*(s.machine.stiffness / 1e4)))
 
 
-def point_of(z, values, slopes, pieces=None, tilts=None):
+def point_of(z, values, slopes, pieces=None, piece_gradients=None):
     """Designs with these values and derivatives, which follow no jams."""
     if pieces is None:
-        pieces, tilts = np.zeros((len(z), 0)), np.zeros((len(z), 0, z.shape[1]))
-    return Point(z, values, slopes, (), (), pieces, tilts)
+        pieces, piece_gradients = np.zeros((len(z), 0)), np.zeros((len(z), 0, z.shape[1]))
+    return Point(z, values, slopes, (), (), pieces, piece_gradients)
