@@ -108,6 +108,7 @@ from jaxvib.results.result import Result
 # Exchange with other tools
 from jaxvib.exchange.fmu import Fmu, export_fmu
 from jaxvib.exchange.state_space import StateSpace, state_space
+from jaxvib.exchange.uff import UffFile, UffFunction, export_uff, read_uff
 
 __version__: str
 
@@ -273,4 +274,8 @@ __all__ = [
     "Fmu",
     "state_space",
     "StateSpace",
+    "export_uff",
+    "read_uff",
+    "UffFile",
+    "UffFunction",
 ]

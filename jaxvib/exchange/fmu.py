@@ -22,10 +22,11 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.state import State
-from jaxvib.errors import InputError, quoted, require_one_of, written
+from jaxvib.errors import InputError, require_one_of, written
 from jaxvib.exchange.c_code import Written, number_text, write_program
 from jaxvib.exchange.description import Fmi, Variable, describe_model
 from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, named_entries
+from jaxvib.exchange.optional import require_writable
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units
@@ -127,7 +128,7 @@ def export_fmu(
     state = validate_state(scene, start, mode) if isinstance(start, State) else initial_state(scene, start, mode=mode)
     path = Path(path)
     path = path if path.suffix == ".fmu" else path.with_name(path.name + ".fmu")
-    _require_writable(path)
+    require_writable(path)
     files, statements, identifier = _sources(scene, state, path.stem, fmi, drive)
     message = "source only: no binary was asked for"
     library = None
@@ -138,15 +139,6 @@ def export_fmu(
     with written(path) as part, part.open("wb") as file:
         file.write(_archive(files))
     return Fmu(path, library is not None, message, statements)
-
-
-def _require_writable(path: Path) -> None:
-    """**Raises** `InputError` for a missing folder and for a file that is read-only, before anything is computed."""
-    if not path.parent.is_dir():
-        raise InputError("path", f"is {quoted(str(path))}, and its folder does not exist; create it or name another one")
-    if path.is_dir() or (path.exists() and not path.stat().st_mode & 0o222):
-        kind = "a folder" if path.is_dir() else "read-only"
-        raise InputError("path", f"is {quoted(str(path))}, which is {kind}; name another file")
 
 
 def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) -> tuple[dict[str, bytes], int, str]:

@@ -15,6 +15,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, averaged_field
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted, written
+from jaxvib.exchange.optional import optional_module, require_writable
 from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces, signals_of
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.effects.base import terms_of
@@ -82,7 +83,7 @@ class StateSpace(NamedTuple):
 
     def scipy(self) -> scipy.signal.StateSpace:
         """Return the model as `scipy.signal.StateSpace`, without names. **Raises** `InputError` if SciPy is not installed."""
-        return _module("scipy.signal", "mat").StateSpace(self.A, self.B, self.C, self.D)
+        return optional_module("scipy.signal", "mat").StateSpace(self.A, self.B, self.C, self.D)
 
     def control(self) -> control.StateSpace:
         """Return the model for python-control, with the names of its signals; a point in a name becomes "_".
@@ -92,7 +93,7 @@ class StateSpace(NamedTuple):
         names = {
             name: [each.name.replace(".", "_") for each in getattr(self, name)] for name in ("states", "inputs", "outputs")
         }
-        return _module("control", "control").ss(self.A, self.B, self.C, self.D, **names)
+        return optional_module("control", "control").ss(self.A, self.B, self.C, self.D, **names)
 
     @validated
     def save(self, path: str | Path) -> Path:
@@ -107,26 +108,16 @@ class StateSpace(NamedTuple):
         """
         path = Path(path)
         path = path if path.suffix == ".mat" else path.with_name(path.name + ".mat")
+        require_writable(path)
         content: dict[str, Any] = {name: getattr(self, name) for name in ("A", "B", "C", "D", "x0", "u0", "y0", "about")}
         for kind in ("state", "input", "output"):
             signals = getattr(self, f"{kind}s")
             content[f"{kind}_names"] = np.asarray([each.name for each in signals], dtype=object)
             content[f"{kind}_units"] = np.asarray([each.unit for each in signals], dtype=object)
-        io = _module("scipy.io", "mat")
+        io = optional_module("scipy.io", "mat")
         with written(path) as part, part.open("wb") as file:
             io.savemat(file, content, oned_as="column")
         return path
-
-
-def _module(name: str, extra: str) -> Any:
-    """A module of an optional package. **Raises** `InputError` with the command that installs it."""
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        package = name.partition(".")[0]
-        raise InputError(package, f"is not installed; install it with: pip install 'jaxvib[{extra}]'") from error
 
 
 @validated

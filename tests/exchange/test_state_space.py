@@ -116,7 +116,7 @@ def test_other_packages_have_the_same_response():
         (lambda s: jv.state_space(s, jv.jam_modes(scene("one_mass")).select(1, throw=False)), "at is "),
         (lambda s: jv.state_space(s, jv.jam_modes(scene(load="rollers")).select(3)), "at is no equilibrium of the averaged"),
         (lambda s: jv.state_space(s, jv.jam_modes(s).select(3), rotor_speed=3.0), "rotor_speed is 3.0, but a jam has its own"),
-        (lambda s: jv.state_space(s).save("/none/x.mat"), "path is '/none/x.mat', which cannot be written"),
+        (lambda s: jv.state_space(s).save("/none/x.mat"), "path is '/none/x.mat', and its folder does not exist"),
     ],
 )
 def test_wrong_arguments_end_in_one_sentence(call, says):

@@ -1,0 +1,29 @@
+"""Optional packages and files of exports."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+from jaxvib.errors import InputError, quoted
+
+__all__ = ["optional_module", "require_writable"]
+
+
+def optional_module(name: str, extra: str) -> Any:
+    """Return a module of an optional package. **Raises** `InputError` with the command that installs it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        raise InputError(package, f"is not installed; install it with: pip install 'jaxvib[{extra}]'") from error
+
+
+def require_writable(path: Path) -> None:
+    """**Raises** `InputError` for a missing folder and for a file that is read-only, before anything is computed."""
+    if not path.parent.is_dir():
+        raise InputError("path", f"is {quoted(str(path))}, and its folder does not exist; create it or name another one")
+    if path.is_dir() or (path.exists() and not path.stat().st_mode & 0o222):
+        kind = "a folder" if path.is_dir() else "read-only"
+        raise InputError("path", f"is {quoted(str(path))}, which is {kind}; name another file")

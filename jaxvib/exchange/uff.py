@@ -1,0 +1,355 @@
+"""Universal files (UFF, UNV) of modal analysis, written and read through pyuff.
+
+A machine is a row of nodes: its platforms, or points of a rotor's axis. Across is the direction +Y, up is +Z, the axis is +X.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.equations.linear import estimated_frequencies, linear_model
+from jaxvib.errors import InputError, open_regular, quoted, require_one_of, written
+from jaxvib.exchange.optional import optional_module, require_writable
+from jaxvib.exchange.state_space import state_space
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
+from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.motion.run import Run
+from jaxvib.units import Number, Numbers, numbers
+
+__all__ = ["UffFile", "UffFunction", "export_uff", "read_uff"]
+
+Quantity = Literal["displacement", "velocity", "acceleration"]
+
+_ORDERS: dict[str, tuple[int, str]] = {"displacement": (8, "m"), "velocity": (11, "m/s"), "acceleration": (12, "m/s^2")}
+"""Specific data types and units of motions."""
+
+_FORCE, _REACTION, _TIME, _FREQUENCY = 13, 9, 17, 18
+_HISTORY, _RESPONSE, _GENERAL = 1, 4, 0
+_KINDS = {_HISTORY: "history", _RESPONSE: "response"}
+_EXPONENTS = {8: (1, 0), 11: (1, 0), 12: (1, 0), 9: (0, 1), 13: (0, 1), 15: (-2, 1), 16: (-1, 1)}
+"""Exponents of length and force in quantities by their specific data type."""
+
+_LINES = 2048
+_HIGHEST = 1.5
+"""Default frequencies reach so many times the highest natural frequency."""
+
+_DIGITS = 5
+"""Digits of the abscissa in a file; a default spacing has no more."""
+
+_MAX_UNEVEN = 1e-6
+_MAX_BYTES = 2**28
+
+
+class _Node(NamedTuple):
+    """Node of a machine: `number`, `position` (x, y, z) m, `rows` (np, nd) by which it moves."""
+
+    number: int
+    position: tuple[float, float, float]
+    rows: np.ndarray
+
+
+class UffFunction(NamedTuple):
+    """Function of a universal file.
+
+    **Attributes**: `kind` "history", "response" (frequency response function) or "other"; `x` (n,), s or Hz, and `values` (n,)
+    real or complex, in SI; `quantity` such as "acceleration", "" if the file does not say; `response` and `reference`, the
+    node and the direction (1 to 6 for +X to a turn about +Z, negative for the opposite) of answer and force; `about`, the
+    first line of the file's description.
+    """
+
+    kind: Literal["history", "response", "other"]
+    x: np.ndarray
+    values: np.ndarray
+    quantity: str
+    response: tuple[int, int]
+    reference: tuple[int, int]
+    about: str
+
+
+class UffFile(NamedTuple):
+    """Contents of a universal file: `functions`; `nodes`, the position (x, y, z) in m of each node by its number."""
+
+    functions: tuple[UffFunction, ...]
+    nodes: dict[int, tuple[float, float, float]]
+
+
+@validated
+def export_uff(
+    source: Scene | Run,
+    path: str | Path,
+    *,
+    quantity: Quantity = "displacement",
+    frequencies: Numbers | None = None,
+    rotor_speed: Number | None = None,
+) -> Path:
+    """Write a universal file (58, 55, 15, 82, 151, 164) of a scene or of a run.
+
+    - Of a `Scene`: frequency response functions of every node to a force at the exciter in each of its directions, one function
+      for each node and direction, at even frequencies; natural motions, undamped (normal modes) for machines that move up
+      and down, with damping at the rotor speed (complex modes, the whirl) for machines that move across and up
+    - Of a `Run`: histories of every node and of the force on the foundation (node 0), and the amplitude spectra of its end
+
+    Header, units (SI), nodes and lines come first; programs for modal analysis refuse functions without them.
+
+    **Arguments**: `quantity` of responses and histories; `frequencies`, Hz, evenly spaced (default: 2048 lines up to 1.5
+    times the highest natural frequency); `rotor_speed`, rad/s, as in `state_space`.
+
+    **Returns** the path. **Raises** `InputError` for frequencies that are not even or are not positive, for accelerations of a
+    run, which keeps none, and for a path that cannot be written to.
+
+    Numbers have 12 digits, those of the abscissa and of shapes 6, as the format prescribes.
+    """
+    path = Path(path)
+    require_writable(path)
+    require_one_of(quantity, _ORDERS, "quantity")
+    if isinstance(source, Scene):
+        scene = validate_scene(source)
+        content = [*_modes(scene, rotor_speed), *_responses(scene, quantity, frequencies, rotor_speed)]
+    else:
+        given = {"frequencies": frequencies, "rotor_speed": rotor_speed}
+        for name, value in given.items():
+            if value is not None:
+                raise InputError(name, f"is {quoted(value)}, which goes with a scene, not with a run; leave it out")
+        if quantity == "acceleration":
+            raise InputError("quantity", "is 'acceleration', which a run does not keep; give 'displacement' or 'velocity'")
+        scene, content = source.scene, _histories(source, quantity)
+    pyuff = optional_module("pyuff", "uff")
+    with written(path) as part:
+        part.touch()  # raises what pyuff would hide
+        pyuff.UFF(str(part)).write_sets([*_head(scene, path), *content], mode="overwrite")
+    return path
+
+
+def _nodes(scene: Scene) -> list[_Node]:
+    """Return the nodes of a machine."""
+    machine, mount = scene.machine, scene.machine.mount()
+    if machine.places == "platform":
+        places = [(k + 1, float(k)) for k in range(machine.structure().mass.shape[0])]
+    elif machine.places == "shaft":
+        supports = [position for position, *_ in machine.supports() or []]
+        stations = np.asarray(mount.distances(scene.loads.count)).tolist()
+        places = [(jnp.asarray(s, scene.drive.speed.dtype), s) for s in sorted({0.0, *supports, *stations})]
+    else:
+        places = [(None, 0.0)]
+    return [_Node(k, (x, 0.0, 0.0), np.asarray(machine.rows_at(place))) for k, (place, x) in enumerate(places, 1)]
+
+
+def _directions(scene: Scene) -> list[int]:
+    """Return the directions of the rows of a node: +Y across, +Z up."""
+    return [2 + axis for axis in scene.machine.mounting().axes]
+
+
+def _head(scene: Scene, path: Path) -> list[dict[str, Any]]:
+    """Return header, units, nodes and the line through them."""
+    nodes = _nodes(scene)
+    name = "".join(letter if letter.isprintable() and letter.isascii() else "_" for letter in path.stem)[:80]
+    return [
+        {"type": 151, "model_name": name, "description": scene.machine.kind, "db_app": "jaxvib", "program": "jaxvib"},
+        {"type": 164, "units_code": 1, "units_description": "SI", "temp_mode": 1}
+        | {"length": 1.0, "force": 1.0, "temp": 1.0, "temp_offset": 273.15},
+        {"type": 15, "node_nums": [node.number for node in nodes]}
+        | {axis: [node.position[k] for node in nodes] for k, axis in enumerate("xyz")},
+        {"type": 82, "trace_num": 1, "id": "machine", "nodes": np.array([node.number for node in nodes])},
+    ]
+
+
+def _modes(scene: Scene, rotor_speed: Number | None) -> list[dict[str, Any]]:
+    """Return the natural motions at the nodes."""
+    nodes, directions = _nodes(scene), _directions(scene)
+    numbers_ = [node.number for node in nodes]
+
+    def at_nodes(shape: np.ndarray) -> dict[str, np.ndarray]:
+        moved = np.array([node.rows @ shape for node in nodes]).T
+        found = {f"r{k}": np.zeros(len(nodes), moved.dtype) for k in (1, 2, 3)}
+        return found | {f"r{direction}": moved[k] for k, direction in enumerate(directions)}
+
+    common = {"type": 55, "model_type": 1, "data_ch": 2, "spec_data_type": 8, "load_case": 1, "node_nums": numbers_}
+    if len(directions) == 1:
+        frequencies, shapes = (np.asarray(x) for x in linear_model(scene).modes())
+        return [
+            {**common, **at_nodes(shape), "analysis_type": 2, "mode_n": k, "freq": w / (2.0 * np.pi), "modal_m": 1.0}
+            for k, (w, shape) in enumerate(zip(frequencies, shapes.T, strict=True), 1)
+        ]
+    values, vectors = np.linalg.eig(state_space(scene, rotor_speed=rotor_speed).A.astype(complex))
+    order = [k for k in np.argsort(np.imag(values)) if np.imag(values[k]) > 0.0]
+    nd = len(values) // 2
+    return [
+        {
+            **common,
+            **at_nodes(vectors[:nd, k] / np.max(np.abs(vectors[:nd, k]))),
+            "analysis_type": 3,
+            "mode_n": n,
+            "eig": values[k],
+        }
+        for n, k in enumerate(order, 1)
+    ]
+
+
+def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_speed: Number | None) -> list[dict[str, Any]]:
+    """Return the frequency response functions of the nodes to forces at the exciter."""
+    nodes, directions = _nodes(scene), _directions(scene)
+    x = _even_frequencies(scene, frequencies)
+    model = state_space(scene, rotor_speed=rotor_speed)
+    nd, start = len(model.A) // 2, list(_ORDERS).index(quantity)
+    found = model.frequency_response(2.0 * np.pi * x)[:, start * nd : (start + 1) * nd, nd:]
+    mounted = np.asarray(scene.machine.mount().rows[0])
+    exciter = next((node.number for node in nodes if np.array_equal(node.rows, mounted)), 0)
+    return [
+        _function(
+            x, (node.rows @ found)[:, k, j], _RESPONSE, quantity, (node.number, direction), (exciter, reference), _FREQUENCY
+        )
+        for j, reference in enumerate(directions)
+        for node in nodes
+        for k, direction in enumerate(directions)
+    ]
+
+
+def _even_frequencies(scene: Scene, frequencies: Numbers | None) -> np.ndarray:
+    """Return frequencies in Hz. **Raises** `InputError` if their spacing is not even."""
+    if frequencies is None:
+        step = _HIGHEST * float(np.max(np.asarray(estimated_frequencies(scene)))) / (2.0 * np.pi * _LINES)
+        return float(f"{step:.{_DIGITS - 1}e}") * np.arange(1, _LINES + 1)
+    x = np.asarray(numbers(frequencies, "Hz", "frequencies", None, low=0.0), float)
+    if x.ndim != 1 or x.size < 2:
+        raise InputError("frequencies", f"are {quoted(frequencies)}; at least 2 evenly spaced frequencies are needed")
+    _require_even(x, "frequencies")
+    return x
+
+
+def _require_even(x: np.ndarray, name: str) -> None:
+    steps = np.diff(x)
+    if not (steps[0] > 0.0 and np.all(np.abs(steps - steps[0]) <= _MAX_UNEVEN * max(abs(x[-1]), steps[0]))):
+        raise InputError(name, f"are not evenly spaced (steps of {np.min(steps):.6g} to {np.max(steps):.6g}); give even ones")
+
+
+def _histories(run: Run, quantity: str) -> list[dict[str, Any]]:
+    """Return the histories of a run at the nodes, and the amplitude spectra of its end."""
+    kept: Trajectory = run.window if run.trajectory is None else run.trajectory
+    nodes, directions = _nodes(run.scene), _directions(run.scene)
+    time, spectrum = np.asarray(kept.time, float), run.spectrum()
+    _require_even(time, "times of the run")
+    moved = np.asarray(getattr(kept.state, quantity), float)
+    found = [
+        _function(time, moved @ node.rows[k], _HISTORY, quantity, (node.number, direction), (0, 0), _TIME)
+        for node in nodes
+        for k, direction in enumerate(directions)
+    ]
+    force, frequency = np.asarray(kept.foundation_force, float), np.asarray(spectrum.frequency) / (2.0 * np.pi)
+    found += [
+        _function(time, force[:, k], _HISTORY, "force", (0, direction), (0, 0), _TIME) for k, direction in enumerate(directions)
+    ]
+    found += [
+        _function(frequency, spectrum.force[-1, :, k], _GENERAL, "force", (0, direction), (0, 0), _FREQUENCY)
+        for k, direction in enumerate(directions)
+    ]
+    for name, unit, values in zip(spectrum.coordinates, spectrum.units, spectrum.amplitude[-1].T, strict=True):
+        if unit == "m":
+            about = f"amplitude spectrum of the coordinate {name}"
+            found.append(_function(frequency, values, _GENERAL, "displacement", (0, 0), (0, 0), _FREQUENCY) | {"id1": about})
+    return found
+
+
+def _function(
+    x: np.ndarray,
+    values: np.ndarray,
+    kind: int,
+    quantity: str,
+    response: tuple[int, int],
+    reference: tuple[int, int],
+    abscissa: int,
+) -> dict[str, Any]:
+    """Return dataset 58."""
+    ordinate, unit = _ORDERS.get(quantity, (_REACTION, "N"))
+    per_force = kind == _RESPONSE
+    about = f"{quantity} of node {response[0]}{f' per force on node {reference[0]}' * per_force}"
+    return {
+        "type": 58,
+        "id1": f"{'spectrum of ' * (kind == _GENERAL)}{about}",
+        "func_type": kind,
+        "rsp_node": response[0],
+        "rsp_dir": response[1],
+        "ref_node": reference[0],
+        "ref_dir": reference[1],
+        "data": np.asarray(values),
+        "x": x,
+        "abscissa_spacing": 1,
+        "abscissa_inc": float(x[1] - x[0]),
+        "abscissa_spec_data_type": abscissa,
+        "abscissa_axis_lab": "Time" if abscissa == _TIME else "Frequency",
+        "abscissa_axis_units_lab": "s" if abscissa == _TIME else "Hz",
+        "ordinate_spec_data_type": ordinate,
+        "ordinate_axis_lab": quantity.capitalize(),
+        "ordinate_axis_units_lab": unit,
+        "orddenom_spec_data_type": _FORCE if per_force else 0,
+        "orddenom_axis_lab": "Force" if per_force else "NONE",
+        "orddenom_axis_units_lab": "N" if per_force else "NONE",
+    }
+
+
+@validated
+def read_uff(path: str | Path) -> UffFile:
+    """Read histories and frequency response functions (dataset 58) and nodes (15, 2411) of a universal file, in SI units.
+
+    Spacing may be even or not, data text or binary, real or complex. Units other than SI are converted by dataset 164; without
+    one they are taken as SI.
+
+    **Returns** `UffFile`. **Raises** `InputError` for a file that cannot be read or has no function.
+    """
+    pyuff = optional_module("pyuff", "uff")
+    try:
+        with open_regular(path) as file:
+            size = file.seek(0, os.SEEK_END)
+    except OSError as error:
+        raise InputError("path", f"is {quoted(str(path))}, which cannot be read ({error.strerror}); give a UFF file") from error
+    if size > _MAX_BYTES:
+        raise InputError("path", f"is {quoted(str(path))}, which is larger than {_MAX_BYTES >> 20} MB; split it")
+    try:
+        sets = pyuff.UFF(str(path)).read_sets()
+    except Exception as error:  # pyuff raises bare exceptions
+        why = " ".join(str(error).split())
+        raise InputError("path", f"is {quoted(str(path))}, which cannot be read as a UFF file ({why})") from error
+    sets = sets if isinstance(sets, list) else [sets]
+    length, force = next(((each["length"], each["force"]) for each in sets if each.get("type") == 164), (1.0, 1.0))
+    functions = tuple(_read_function(each, length, force) for each in sets if each.get("type") == 58)
+    if not functions:
+        raise InputError(
+            "path", f"is {quoted(str(path))}, which has no function (dataset 58); give a file with histories or FRFs"
+        )
+    nodes = {}
+    for each in sets:
+        if each.get("type") in (15, 2411):
+            names = each["node_nums"] if each["type"] == 15 else each["grid_global"][:, 0]
+            columns = [each[axis] for axis in "xyz"] if each["type"] == 15 else each["grid_global"][:, 1:].T
+            nodes |= {int(n): tuple(float(v) / length for v in xyz) for n, *xyz in zip(names, *columns, strict=True)}
+    return UffFile(functions, nodes)
+
+
+def _read_function(dataset: dict[str, Any], length: float, force: float) -> UffFunction:
+    """Return a function in SI units."""
+    kind = _KINDS.get(int(dataset["func_type"]), "other")
+    scale = _scale(dataset, "ordinate", length, force) / _scale(dataset, "orddenom", length, force)
+    names = {code: name for name, (code, _) in _ORDERS.items()} | {_FORCE: "force", _REACTION: "force"}
+    return UffFunction(
+        kind,  # pyright: ignore[reportArgumentType]
+        np.asarray(dataset["x"], float),
+        np.asarray(dataset["data"]) * scale,
+        names.get(int(dataset["ordinate_spec_data_type"]), ""),
+        (int(dataset["rsp_node"]), int(dataset["rsp_dir"])),
+        (int(dataset["ref_node"]), int(dataset["ref_dir"])),
+        str(dataset["id1"]).strip(),
+    )
+
+
+def _scale(dataset: dict[str, Any], side: str, length: float, force: float) -> float:
+    """Return the factor of a side of a quotient to SI."""
+    kind = int(dataset[f"{side}_spec_data_type"])
+    own = int(dataset[f"{side}_len_unit_exp"]), int(dataset[f"{side}_force_unit_exp"])
+    lengths, forces = own if kind == 1 else _EXPONENTS.get(kind, (0, 0))
+    return length**-lengths * force**-forces

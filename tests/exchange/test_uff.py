@@ -1,0 +1,231 @@
+"""Universal files through pyuff, with the conditions of files that programs for modal analysis refused."""
+
+import numpy as np
+import pytest
+import pyuff
+from scenes import ROTOR, TWO_MASS, loads, scene
+
+import jaxvib as jv
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    return tmp_path_factory.mktemp("uff")
+
+
+def rotor_scene():
+    machine = jv.rotor(**ROTOR, stations=(0.28, 0.25, -0.25, -0.28))
+    return jv.Scene(machine, jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1), jv.ConstantSpeed(460.0))
+
+
+@pytest.fixture(scope="module")
+def responses(home):
+    return jv.export_uff(scene("three_mass"), home / "responses.unv", quantity="acceleration")
+
+
+@pytest.fixture(scope="module")
+def run():
+    return jv.simulate(scene(), 2.0, estimate=False)
+
+
+@pytest.fixture(scope="module")
+def histories(run, home):
+    return jv.export_uff(run, home / "histories.unv", quantity="velocity")
+
+
+def types(path):
+    return pyuff.UFF(str(path)).get_set_types().astype(int).tolist()
+
+
+def test_responses_go_through_pyuff_and_back(responses):
+    read, model = jv.read_uff(responses), jv.state_space(scene("three_mass"))
+    assert [each.response for each in read.functions] == [(1, 3), (2, 3), (3, 3)]
+    for k, each in enumerate(read.functions):
+        assert (each.kind, each.quantity, each.reference) == ("response", "acceleration", (3, 3))
+        expected = model.frequency_response(2.0 * np.pi * each.x)[:, 6 + k, 3]
+        np.testing.assert_allclose(each.values, expected, rtol=1e-9, atol=1e-11 * np.max(np.abs(expected)))
+    assert read.nodes == {1: (0.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0), 3: (2.0, 0.0, 0.0)}
+
+
+def test_histories_go_through_pyuff_and_back(run, histories):
+    read, kept = jv.read_uff(histories), run.trajectory
+    found = {each.response: each for each in read.functions if each.kind == "history"}
+    np.testing.assert_allclose(found[1, 3].values, kept.state.velocity[:, 0], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found[2, 3].values, kept.state.velocity[:, 1], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found[0, 3].values, kept.foundation_force[:, 0], rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(found[1, 3].x, kept.time, rtol=5e-6)  # 6 digits, as the format prescribes
+    assert found[1, 3].quantity == "velocity" and found[0, 3].quantity == "force"
+
+
+def test_spectra_of_a_run_are_written(run, histories):
+    spectra = [each for each in jv.read_uff(histories).functions if each.kind == "other"]
+    spectrum = run.spectrum()
+    np.testing.assert_allclose(spectra[0].values, spectrum.force[0, :, 0], rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(spectra[2].values, spectrum.amplitude[0, :, 1], rtol=1e-10, atol=1e-15)
+    assert spectra[2].about == "amplitude spectrum of the coordinate y2"
+
+
+def test_files_begin_with_header_units_and_geometry(responses, histories):
+    """OpenModal 33, 43, 54 and 55: functions without header, units or nodes are not shown."""
+    for path in (responses, histories):
+        found = types(path)
+        assert found[:4] == [151, 164, 15, 82] and set(found[4:]) <= {55, 58} and 58 in found
+        sets = pyuff.UFF(str(path)).read_sets()
+        assert sets[1]["units_code"] == 1 and sets[1]["length"] == sets[1]["force"] == 1.0
+        nodes = {int(node) for node in sets[2]["node_nums"]}
+        assert {each["rsp_node"] for each in sets if each["type"] == 58} - {0} <= nodes
+        assert {int(node) for node in sets[3]["nodes"]} == nodes
+
+
+def test_spacing_is_even_and_stored_without_abscissa(responses, histories):
+    """OpenModal 14: the increment is in the file, and the abscissa follows from it."""
+    for path in (responses, histories):
+        for each in (each for each in pyuff.UFF(str(path)).read_sets() if each["type"] == 58):
+            assert each["abscissa_spacing"] == 1 and each["abscissa_inc"] > 0.0
+            np.testing.assert_allclose(np.diff(each["x"]), each["abscissa_inc"], rtol=1e-6)
+            assert each["abscissa_axis_units_lab"].strip() in ("s", "Hz") and each["ordinate_spec_data_type"] in (8, 9, 11, 12)
+
+
+def test_each_node_has_one_response_per_reference(responses):
+    """OpenModal 16: several functions of one node and one reference stop the analysis."""
+    keys = [(each.response, each.reference) for each in jv.read_uff(responses).functions]
+    assert len(keys) == len(set(keys))
+
+
+def test_normal_modes_are_those_of_mode_shapes(responses):
+    modes = [each for each in pyuff.UFF(str(responses)).read_sets() if each["type"] == 55]
+    found = jv.mode_shapes(scene("three_mass"))
+    for each, w, shape in zip(modes, found.frequency, found.shape, strict=True):
+        assert each["freq"] == pytest.approx(float(w) / (2.0 * np.pi), rel=1e-5) and each["node_nums"].tolist() == [1, 2, 3]
+        largest = each["r3"][np.argmax(np.abs(each["r3"]))]
+        np.testing.assert_allclose(each["r3"] / largest, shape / shape[np.argmax(np.abs(shape))], atol=2e-5)
+
+
+def test_complex_modes_are_the_whirl_at_points_of_the_axis(home):
+    path = jv.export_uff(rotor_scene(), home / "rotor.unv", rotor_speed=300.0, frequencies=np.arange(1.0, 9.0))
+    sets = pyuff.UFF(str(path)).read_sets()
+    modes, whirl = [each for each in sets if each["type"] == 55], jv.whirl(rotor_scene(), [300.0])
+    assert [each["analysis_type"] for each in modes] == [3] * 4
+    eigenvalues = np.array([each["eig"] for each in modes])
+    np.testing.assert_allclose(eigenvalues.imag, whirl.speed[0], rtol=1e-5)
+    np.testing.assert_allclose(-eigenvalues.real, whirl.decay[0], rtol=1e-5)
+    position = np.array(sets[2]["x"])
+    assert position.tolist() == [-0.28, -0.25, -0.155, 0.0, 0.165, 0.25, 0.28]
+    for each, forward in zip(modes, whirl.forward[0], strict=True):
+        for row in (each["r2"], each["r3"]):  # a rigid rotor stays straight
+            line = np.polyfit(position, row, 1)
+            assert np.max(np.abs(np.polyval(line, position) - row)) < 1e-5
+        turn = -np.sum((each["r3"] * np.conj(each["r2"])).imag)
+        assert (turn > 0.0) == bool(forward)
+    assert {(each["ref_node"], each["ref_dir"]) for each in sets if each["type"] == 58} == {(4, 2), (4, 3)}
+
+
+def test_uneven_files_in_other_units_are_read_in_si(home):
+    x = np.array([0.0, 0.1, 0.25, 0.6])
+    path = home / "uneven.uff"
+    common = dict(
+        type=58, func_type=1, rsp_node=4, rsp_dir=-2, ref_node=0, ref_dir=0, x=x, abscissa_spacing=0, orddenom_spec_data_type=0
+    )
+    units = dict(type=164, units_code=5, units_description="mm", temp_mode=1, length=1e3, force=1e3, temp=1.0, temp_offset=0.0)
+    sets = [
+        units,
+        {**common, "data": np.array([1.0, 2.0, 3.0, 4.0]), "ordinate_spec_data_type": 8},
+        {**common, "func_type": 4, "data": 1j * x, "ordinate_spec_data_type": 12, "orddenom_spec_data_type": 13},
+    ]
+    pyuff.UFF(str(path)).write_sets(sets, mode="overwrite")
+    history, response = jv.read_uff(path).functions
+    np.testing.assert_allclose(history.x, x, rtol=1e-5)
+    np.testing.assert_allclose(history.values, [1e-3, 2e-3, 3e-3, 4e-3])
+    assert history.response == (4, -2) and history.kind == "history" and history.quantity == "displacement"
+    np.testing.assert_allclose(response.values, 1j * x, atol=1e-12)
+
+
+def test_binary_files_are_read(home):
+    data, text, path = np.sin(np.arange(64.0)), home / "text.uff", home / "binary.uff"
+    function = dict(type=58, func_type=1, rsp_node=1, rsp_dir=3, ref_node=0, ref_dir=0, data=data, x=0.01 * np.arange(64))
+    function |= dict(abscissa_spacing=1, ordinate_spec_data_type=12, orddenom_spec_data_type=0)
+    pyuff.UFF(str(text)).write_sets([function], mode="overwrite")
+    lines = text.read_bytes().splitlines(True)
+    lines[1] = b"    58b%6i%6i%12i%12i%6i%6i%12i%12i\n" % (1, 2, 11, 8 * 64, 0, 0, 0, 0)
+    path.write_bytes(b"".join([*lines[:13], data.astype("<f8").tobytes(), b"    -1\n"]))
+    np.testing.assert_array_equal(jv.read_uff(path).functions[0].values, data)
+
+
+def test_sdypy_finds_the_poles_of_an_exported_response(home):
+    ema = pytest.importorskip("sdypy.EMA")
+    damped = jv.Scene(jv.two_mass(**{**TWO_MASS, "damping": (250.0, 250.0)}), loads()["balls"], jv.ConstantSpeed(120.0))
+    step = 1e-2
+    path = jv.export_uff(damped, home / "ema.unv", quantity="acceleration", frequencies=step * np.arange(1, 2001))
+    read = jv.read_uff(path).functions
+    model = ema.Model(
+        np.array([each.values for each in read]), read[0].x, lower=1.0, upper=19.0, pol_order_high=20, frf_form="accelerance"
+    )
+    model.get_poles(show_progress=False)
+    poles = jv.state_space(damped).poles()
+    for pole in poles[poles.imag > 0.0]:
+        frequency, damping = np.abs(pole) / (2.0 * np.pi), -pole.real / np.abs(pole)
+        order = -1
+        found = model.pole_freq[order][np.argmin(np.abs(model.pole_freq[order] - frequency))]
+        assert found == pytest.approx(frequency, rel=1e-3)
+        share = model.pole_xi[order][np.argmin(np.abs(model.pole_freq[order] - frequency))]
+        assert share == pytest.approx(damping, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (dict(path="/none/m.unv"), "path is '/none/m.unv', and its folder does not exist"),
+        (dict(path="/proc/m.unv"), "path is '/proc/m.unv', which cannot be written"),
+        (dict(quantity="jerk"), "quantity is 'jerk'; "),
+        (dict(frequencies=[1.0, 2.0, 4.0]), "frequencies are not evenly spaced (steps of 1 to 2); give even ones"),
+        (dict(frequencies=[1.0]), "frequencies are [1.0]; at least 2"),
+        (dict(frequencies=[2.0, 1.0]), "frequencies are not evenly spaced"),
+        (dict(source=3), "source is 3; "),
+    ],
+)
+def test_wrong_arguments_of_files_end_in_one_sentence(change, says, tmp_path):
+    with pytest.raises(jv.InputError) as error:
+        jv.export_uff(**{"source": scene(), "path": tmp_path / "m.unv", **change})
+    assert str(error.value).startswith(says) and list(tmp_path.iterdir()) == []
+
+
+def test_a_run_has_no_acceleration_and_no_frequencies(run, tmp_path):
+    with pytest.raises(jv.InputError, match="quantity is 'acceleration', which a run does not keep"):
+        jv.export_uff(run, tmp_path / "m.unv", quantity="acceleration")
+    with pytest.raises(jv.InputError, match=r"frequencies is .* which goes with a scene"):
+        jv.export_uff(run, tmp_path / "m.unv", frequencies=[1.0, 2.0])
+
+
+@pytest.mark.parametrize("text", ["", "no file of this kind", "    -1\n    58\n", "    -1\n   151\n    -1\n", "\x00" * 99])
+def test_files_of_another_kind_are_refused(text, tmp_path):
+    path = tmp_path / "wrong.unv"
+    path.write_text(text)
+    with pytest.raises(jv.InputError, match=r"^path is "):
+        jv.read_uff(path)
+
+
+def test_missing_files_and_folders_are_refused(tmp_path):
+    for path in (tmp_path / "none.unv", tmp_path):
+        with pytest.raises(jv.InputError, match=r"^path is .*, which cannot be read"):
+            jv.read_uff(path)
+
+
+@pytest.mark.parametrize("package", ["pyuff", "control", "scipy.io"])
+def test_missing_packages_are_named(package, tmp_path, monkeypatch):
+    import importlib
+
+    real = importlib.import_module
+
+    def missing(name, *rest):
+        if name == package:
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    calls = {
+        "pyuff": lambda: jv.export_uff(scene(), tmp_path / "m.unv"),
+        "control": lambda: jv.state_space(scene()).control(),
+        "scipy.io": lambda: jv.state_space(scene()).save(tmp_path / "m"),
+    }
+    with pytest.raises(jv.InputError, match=r"is not installed; install it with: pip install 'jaxvib\["):
+        calls[package]()
