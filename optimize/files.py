@@ -33,7 +33,10 @@ _SECTIONS = ["scene", "free", "ties", "choices", "hold", "demand", "objective", 
 @dataclass(frozen=True)
 class Design:
     """Content of a design file: `space`, `objective`, the arguments of `synthesize` in `search`, and the demands
-    `subject_to`."""
+    `subject_to`.
+
+    Returned by `load_design`.
+    """
 
     space: DesignSpace
     objective: Quantity

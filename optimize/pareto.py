@@ -40,6 +40,8 @@ _NO_LIMIT = 1e100
 class Front(Result):
     """Machines of which none is better in one quantity without being worse in the other.
 
+    Returned by `pareto`.
+
     **Attributes** (P machines)
 
     - `values` (P, 2) of the two quantities

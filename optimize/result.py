@@ -59,6 +59,8 @@ class SynthesisStatus(eqx.Enumeration):
 class Outcome:
     """Numbers of a machine in one jam mode, NaN if the mode does not exist.
 
+    Returned by `Synthesis.before`, `after` and `verified`.
+
     **Attributes**
 
     - `parameters`: the free numbers by name, SI
@@ -143,6 +145,8 @@ class Machine(NamedTuple):
 
 class Synthesis(Result):
     """Result of a search.
+
+    Returned by `synthesize`.
 
     **Attributes**
 

@@ -34,6 +34,8 @@ Source = str | tuple[str, float | Literal["keep"]]
 class Held(eqx.Module):
     """Quantity that keeps its value during the search; made by `hold`.
 
+    Returned by `hold`.
+
     **Attributes**: `quantity`; `value` in its unit, None for the value in the scene from which the search begins.
     """
 

@@ -16,6 +16,11 @@ class Spin(eqx.Module):
     - `drilling` (count,), rad/s: a load's spin about the normal of its contact, relative to its track
     - `slip`: a (count,) array, m/s, for each coordinate of a load: the velocity of its point of contact relative to the track
       along that coordinate
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> spin = jv.Spin(drilling=jnp.array([3.0, 3.0]), slip=None)
+    >>> spin.drilling.shape
+    (2,)
     """
 
     drilling: Array | None = None
@@ -33,6 +38,11 @@ class State(eqx.Module):
       in rad and rad/s
     - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it; None under an ideal drive
     - `spin` of the loads if effects release it, see `Spin` and `with_spin`; otherwise None
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> state = jv.State(displacement=jnp.zeros(1), velocity=jnp.zeros(1), angle=(jnp.array([0.0, 0.1]),), rate=(jnp.zeros(2),))
+    >>> state.azimuth.shape, state.rotor
+    ((2,), None)
     """
 
     displacement: Array

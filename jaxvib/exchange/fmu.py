@@ -58,6 +58,8 @@ _PLATFORMS = {
 class Fmu(NamedTuple):
     """A functional mock-up unit that was written.
 
+    Returned by `export_fmu`.
+
     **Attributes**: `path` of the file; `has_binary`: True if it holds a binary of this platform beside the source; `message`, a
     sentence about that; `statements` of the equations in C.
     """

@@ -51,6 +51,8 @@ _IN_JAM = (
 class StateSpace(NamedTuple):
     """Linear model x' = A x + B u, y = C x + D u with named signals.
 
+    Returned by `state_space`.
+
     **Attributes**
 
     - `A` (nx, nx), `B` (nx, nu), `C` (ny, nx), `D` (ny, nu), SI units

@@ -37,6 +37,12 @@ class Carrier(eqx.Module):
     - `coordinates` (nd,): the name of each coordinate
     - `coordinate_units` (nd,): the unit of each coordinate, "m" or "rad"; None if all are "m"
 
+    >>> import jaxvib as jv
+    >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
+    ...                       link_stiffness=2e5, link_damping=60.0)
+    >>> machine.carrier().mass.tolist()
+    [[120.0, 0.0], [0.0, 95.0]]
+
     Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6), for rotors
     Artyunin 2013, equation (1).
     """
@@ -83,6 +89,24 @@ class Machine(Part):
     - "platform": by the number of the platform
     - "shaft": by the distance along a rotor's axis from its mass centre, m
     - "point": not at all, because the exciter's place is the only one
+
+    >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
+    >>> class Table(jv.Machine):
+    ...     mass: jax.Array
+    ...     stiffness: jax.Array
+    ...     kind: str = eqx.field(static=True, default="table", kw_only=True)
+    ...
+    ...     def carrier(self):
+    ...         mass, stiffness, no = self.mass[None, None], self.stiffness[None, None], jnp.zeros((1, 1))
+    ...         return jv.Carrier(mass, no, stiffness, bed_stiffness=stiffness, bed_damping=no, coordinates=("y1",))
+    ...
+    ...     def mount(self):
+    ...         return jv.Mount(rows=(jnp.ones((1, 1)),), axes=(1,))
+    >>> loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0)
+    >>> machine = Table(mass=jnp.asarray(49.5), stiffness=jnp.asarray(5e3))
+    >>> scene = jv.Scene(machine, loads, jv.ConstantSpeed(60.0))
+    >>> round(float(jv.natural_frequencies(scene)[0]), 3)       # sqrt(5000 / 50)
+    10.0
     """
 
     kind: eqx.AbstractVar[str]

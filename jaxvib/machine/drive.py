@@ -31,6 +31,11 @@ class Drive(Part):
     - `kind`: its name in scene files
 
     An `IdealDrive` prescribes the rotor speed. With a `Motor` the rotor's angle and speed are states.
+
+    >>> import jaxvib as jv
+    >>> drive = jv.SpinUp("100 rad/s", duration="4 s")
+    >>> drive.ideal, drive.constant, float(drive.rotor_speed(2.0, None))
+    (True, False, 50.0)
     """
 
     speed: eqx.AbstractVar[Array]
@@ -73,7 +78,28 @@ class Drive(Part):
 
 
 class IdealDrive(Drive):
-    """Drive that prescribes the rotor speed as a function of time. A new ideal drive is a subclass with three methods."""
+    """Drive that prescribes the rotor speed as a function of time. A new ideal drive is a subclass with three methods.
+
+    >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
+    >>> class Approach(jv.IdealDrive):
+    ...     '''speed(t) = n (1 - exp(-t/T)).'''
+    ...
+    ...     speed: jax.Array
+    ...     time: jax.Array
+    ...     kind: str = eqx.field(static=True, default="approach", kw_only=True)
+    ...
+    ...     def speed_at(self, t):
+    ...         return self.speed * (1.0 - jnp.exp(-t / self.time))
+    ...
+    ...     def angle_at(self, t):
+    ...         return self.speed * (t - self.time * (1.0 - jnp.exp(-t / self.time)))
+    ...
+    ...     def acceleration_at(self, t):
+    ...         return self.speed / self.time * jnp.exp(-t / self.time)
+    >>> drive = Approach(speed=jnp.asarray(100.0), time=jnp.asarray(2.0))
+    >>> round(float(drive.rotor_speed(2.0, None)), 2)
+    63.21
+    """
 
     ideal = True
 
@@ -112,6 +138,21 @@ class Motor(Drive):
 
     J (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the rotor's imbalance, not the loads;
     typical: 0.005 to 1 kg m^2.
+
+    >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
+    >>> class Turbine(jv.Motor):
+    ...     '''T = stall_torque (1 - (theta'/speed)^2).'''
+    ...
+    ...     speed: jax.Array
+    ...     stall_torque: jax.Array
+    ...     inertia: jax.Array
+    ...     kind: str = eqx.field(static=True, default="turbine", kw_only=True)
+    ...
+    ...     def torque(self, speed):
+    ...         return self.stall_torque * (1.0 - (speed / self.speed) ** 2)
+    >>> motor = Turbine(speed=jnp.asarray(300.0), stall_torque=jnp.asarray(2.0), inertia=jnp.asarray(0.01))
+    >>> float(motor.torque(motor.speed / 2.0))
+    1.5
     """
 
     ideal = False

@@ -81,6 +81,30 @@ class Loads(Part):
     - `mass` of a load, kg; typical: 0.05 to 1
     - `count`: number of loads; typical: 1 to 4
     - `kind`: its name in scene files
+
+    >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
+    >>> class Beads(jv.Loads):
+    ...     '''Beads on an elliptic wire with the half axes R and R/2.'''
+    ...
+    ...     mass: jax.Array
+    ...     radius: jax.Array
+    ...     drag: jax.Array
+    ...     count: int = eqx.field(static=True)
+    ...     kind: str = eqx.field(static=True, default="bead", kw_only=True)
+    ...
+    ...     def position(self, u):
+    ...         return self.radius * jnp.cos(u), 0.5 * self.radius * jnp.sin(u)
+    ...
+    ...     def rest(self):
+    ...         return (jnp.full((self.count,), -0.5 * jnp.pi),)
+    ...
+    ...     def inertia_factor(self):
+    ...         return jnp.ones_like(self.mass)
+    ...
+    ...     def resistance(self, u, rate, speed):
+    ...         return (self.drag * self.radius**2 * (speed - rate[0]),)
+    >>> Beads(mass=jnp.asarray(0.5), radius=jnp.asarray(0.1), drag=jnp.asarray(1.0), count=2).arm().round(3).tolist()
+    [0.05, 0.05]
     """
 
     mass: eqx.AbstractVar[Array]

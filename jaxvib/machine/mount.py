@@ -31,6 +31,13 @@ class Mount(eqx.Module):
     - `rotor_levers`: the same for the rotor's mass centre, scalars
     - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one.
       typical: 0.01 to 0.5 kg m^2, the polar inertia of the rotor
+
+    >>> import jaxvib as jv
+    >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
+    ...                       link_stiffness=2e5, link_damping=60.0)
+    >>> mount = machine.mount()
+    >>> mount.rows[0].tolist(), mount.axes, mount.levers        # the exciter moves up with platform 2
+    ([[0.0, 1.0]], (1,), (None,))
     """
 
     rows: tuple[Array, ...]

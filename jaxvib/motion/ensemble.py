@@ -71,6 +71,8 @@ class EnsembleStatus(eqx.Enumeration):
 class Ensemble(Result):
     """Ends of many runs.
 
+    Returned by `ensemble`.
+
     **Attributes** (B runs)
 
     - `state`: a `State` whose arrays have a leading axis over the runs, at the end; in single precision with angles within a

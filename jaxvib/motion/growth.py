@@ -66,6 +66,8 @@ class GrowthStatus(eqx.Enumeration):
 class Growth(Result):
     """Growth of small disturbances of a motion.
 
+    Returned by `growth`.
+
     **Attributes**
 
     - `status`: a `GrowthStatus`

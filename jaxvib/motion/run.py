@@ -63,6 +63,8 @@ class RunStatus(eqx.Enumeration):
 class Run(AbstractMeasured, Result):
     """Run of a scene: the quantities measured over its last turns (see `AbstractMeasured`), and the motion itself.
 
+    Returned by `simulate` and `settle`.
+
     **Attributes**
 
     - `status`: a `RunStatus`

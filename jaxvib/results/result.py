@@ -34,8 +34,14 @@ class Result(eqx.Module):
     - in a file: `save(path)`, `load(path)`
 
     Data and files follow from the fields: the metadata of each states its unit and the names of its axes
-    (`jaxvib.results.fields`).
-    A result class is final: no other class inherits from it.
+    (`jaxvib.results.fields`). A result class is final: no other class inherits from it.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> shapes = jv.mode_shapes(scene)
+    >>> shapes.status_name, list(shapes.as_dict())
+    ('done', ['status', 'message', 'frequency', 'shape', 'lever', 'coordinates'])
     """
 
     outer_axes = ()
@@ -96,12 +102,12 @@ class Result(eqx.Module):
     @final
     @validated
     def to_pandas(self, axis: str | None = None) -> "pandas.DataFrame":
-        """The arrays of the result along one axis as a table with a row for each point, as in `write_csv`.
+        """Return the arrays of the result along one axis as a table with a row for each point, as in `write_csv`.
 
         **Arguments**: `axis`: its name, such as "time", "mode" or "rotor_speed"; default: the axis of most arrays.
 
-        **Raises** `InputError` for an axis that the result does not have, and if pandas is not installed
-        (`pip install '.[xarray]'`).
+        **Raises** `InputError` for an axis that the result does not have, and if pandas is not installed (`pip install
+        '.[xarray]'`).
         """
         try:
             import pandas

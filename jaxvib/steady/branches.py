@@ -34,6 +34,8 @@ __all__ = ["Branches", "branches"]
 class Branches(AbstractJam):
     """Branch diagram: the arrays of `AbstractJam` along the load speed Omega, ascending, with a leading axis over the points.
 
+    Returned by `branches`.
+
     **Additional attributes**: `resonances` (nd,), rad/s, the `folds` of the branch, and the `scene`.
     """
 

@@ -29,6 +29,8 @@ __all__ = ["ModeShapes", "mode_shapes"]
 class ModeShapes(Result):
     """Undamped free vibrations, by ascending frequency.
 
+    Returned by `mode_shapes`.
+
     **Attributes**
 
     - `frequency` (nd,), rad/s

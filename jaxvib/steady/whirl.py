@@ -82,6 +82,8 @@ class CriticalSpeeds(Result):
 class Whirl(Result):
     """Natural motions of a turning rotor over rotor speeds: the Campbell diagram.
 
+    Returned by `whirl`.
+
     **Attributes** (ns rotor speeds, nd natural motions each, ascending in speed)
 
     - `rotor_speed`: (ns,) rad/s

@@ -52,6 +52,8 @@ class CaseCount(NamedTuple):
 class Sweep(Result):
     """Store of a study and its progress; the numbers themselves stay on disk.
 
+    Returned by `sweep` and `open_sweep`.
+
     **Attributes**
 
     - `status`: a `SweepStatus`

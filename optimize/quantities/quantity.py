@@ -276,6 +276,8 @@ class Combined(Quantity):
 class Demand:
     """Quantity that must be at most, or at least, another one or a value; made by `<` and `>`.
 
+    Returned by `<` and `>` of quantities.
+
     **Attributes**
 
     - `quantity` and `limit`: quantities of the same unit

@@ -106,3 +106,9 @@ def test_class_explains_each_field(name):
     kind = SURFACE[name]
     text = "\n".join(base.__doc__ or "" for base in kind.__mro__)
     assert [each.name for each in dataclasses.fields(kind) if not re.search(rf"`{each.name}\b", text)] == []
+
+
+@pytest.mark.parametrize("name", [name for name, kind in SURFACE.items() if inspect.isclass(kind)])
+def test_class_has_an_example_or_names_its_function(name):
+    kind = SURFACE[name]
+    assert issubclass(kind, eqx.Enumeration) or ">>> " in kind.__doc__ or "Returned by `" in kind.__doc__

@@ -84,6 +84,25 @@ class Effect(Part):
     """Physical effect that a scene includes. A new effect is a subclass with its numbers and its `terms`.
 
     `kind` is its name in scene files.
+
+    >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
+    >>> from jaxvib.machine.effects.terms import LoadResistance
+    >>> class AirDrag(jv.Effect):
+    ...     '''Torque - c phi' on each load, c = `drag`, N m s.'''
+    ...
+    ...     drag: jax.Array
+    ...     kind: str = eqx.field(static=True, default="air_drag", kw_only=True)
+    ...
+    ...     def terms(self):
+    ...         return (LoadResistance(self.resistance, is_smooth=True),)
+    ...
+    ...     def resistance(self, loads, u, rate):
+    ...         return (-self.drag * rate[0],)
+    >>> machine, loads = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0), jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0)
+    >>> scene = jv.Scene(machine, loads, jv.ConstantSpeed(100.0), (AirDrag(drag=jnp.asarray(0.001)),))
+    >>> state = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.array([20.0]),))
+    >>> round(float(jv.power(scene, 0.0, state)[1]), 2)         # b_W R^2 (n - phi')^2 + c phi'^2
+    64.4
     """
 
     kind: eqx.AbstractVar[str]

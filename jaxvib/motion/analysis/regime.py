@@ -64,6 +64,8 @@ REGIMES = enumeration_names(RegimeName)
 class Regime(Result):
     """Kind of motion over a part of a run, with the evidence for it.
 
+    Returned by `regime` and `Run.regime`.
+
     **Attributes**
 
     - `name`: a `RegimeName`

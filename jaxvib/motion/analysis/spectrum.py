@@ -34,6 +34,8 @@ _OVER = 1.5
 class Spectrum(Result):
     """Amplitudes over frequency, of P pieces of a run.
 
+    Returned by `Run.spectrum`.
+
     A piece is weighted by Hann's window; a vibration of constant amplitude has a peak of that height, zero to peak, to 2 %.
 
     **Attributes** (P pieces, nf frequencies)

@@ -65,6 +65,8 @@ class Envelopes(eqx.Module):
 class Envelope(AbstractMeasured, Result):
     """Averaged run of a scene: the quantities of `AbstractMeasured` over the last turns, and the averaged motion.
 
+    Returned by `envelope`.
+
     **Attributes**: those of `AbstractMeasured`, and
 
     - `status`: an `EnvelopeStatus`

@@ -39,6 +39,8 @@ __all__ = ["Criterion", "criterion", "criterion_functional", "criterion_table"]
 class Criterion(Result):
     """Result of the criterion for one machine with its loads.
 
+    Returned by `criterion`.
+
     **Attributes**
 
     - `status`: a `CriterionStatus`

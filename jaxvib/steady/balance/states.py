@@ -54,6 +54,8 @@ class BalanceStatus(eqx.Enumeration):
 class BalancedStates(Result):
     """Arrangements in which a set of loads cancels the rotor's imbalance, in the frame of the rotor.
 
+    Returned by `balanced_states`.
+
     **Attributes** (N loads)
 
     - `status`: a `BalanceStatus`

@@ -76,7 +76,10 @@ class AbstractJam(Result):
 
 
 class Jam(AbstractJam):
-    """One jam mode of a scene, see `AbstractJam`."""
+    """One jam mode of a scene, see `AbstractJam`.
+
+    Returned by `JamModes.select`.
+    """
 
     def summary(self) -> str:
         """Return one line of text; amplitude zero to peak."""
@@ -106,6 +109,8 @@ class Jam(AbstractJam):
 
 class JamModes(AbstractJam):
     """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.
+
+    Returned by `jam_modes`.
 
     - A mode that does not exist holds NaN and the status `absent`. Its derivatives are 0, so that it does not spoil those of a
       batch: test the status, not the gradient

@@ -59,6 +59,8 @@ _SAME_SPEED_DIFFERENCE, _SAME_PHASE_DIFFERENCE = 1e-6, 1e-5
 class PhaseJams(AbstractPhaseJam):
     """All jams of a search: the arrays of `AbstractPhaseJam` with a leading axis over the n jams.
 
+    Returned by `phase_jams`.
+
     They are ordered by falling speed of the loads, stable ones first if speeds are equal.
 
     **Additional attributes**: `starts` (n,): the number of starts that led to each; and the `scene`.

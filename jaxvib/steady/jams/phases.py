@@ -93,7 +93,10 @@ class AbstractPhaseJam(Result):
 
 
 class PhaseJam(AbstractPhaseJam):
-    """Jam whose loads may be at different angles, see `AbstractPhaseJam`."""
+    """Jam whose loads may be at different angles, see `AbstractPhaseJam`.
+
+    Returned by `PhaseJams.select` and `phase_jams(scene, near=...)`.
+    """
 
     @property
     def pattern_label(self) -> str:

@@ -58,6 +58,8 @@ class OrbitStatus(eqx.Enumeration):
 class Orbit(Result):
     """Exact jam: phi = theta + psi(theta), theta = Omega t, psi periodic with mean 0; everything else follows from psi.
 
+    Returned by `jam_orbit`.
+
     Numbers are NaN if the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
 
     **Attributes**

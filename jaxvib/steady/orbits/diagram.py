@@ -62,6 +62,8 @@ class SpecialPoint(NamedTuple):
 class ExactBranches(Result):
     """Branch n(Omega) of exact jams, ascending in Omega, with a leading axis over its P points.
 
+    Returned by `branches(scene, exact=True)`.
+
     **Attributes**
 
     - `omega` and `rotor_speed` (P,), rad/s; `slope`: dn/dOmega

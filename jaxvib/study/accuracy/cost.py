@@ -46,6 +46,8 @@ class CostRow(NamedTuple):
 class Cost(Result):
     """Cost of a quantity by every method.
 
+    Returned by `work_precision`.
+
     **Attributes**
 
     - `quantity`: its name

@@ -59,6 +59,19 @@ class ImplicitRoute(NamedTuple):
     `read(scene, x)` is the quantity, where `residual(scene, x)` = 0, with `solution(scene)` = x. Its derivative by the implicit
     function theorem is d read/dp - (d read/dx) (d residual/dx)^-1 (d residual/dp). x is an array (n,) or a scalar, the residual
     as long.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> def stiffness_per_mass(scene):
+    ...     return scene.machine.stiffness[0] / (scene.machine.mass[0] + scene.loads.mass)
+    >>> route = jv.ImplicitRoute(
+    ...     solution=lambda scene: jnp.sqrt(stiffness_per_mass(scene)),
+    ...     residual=lambda scene, x: x**2 - stiffness_per_mass(scene),
+    ...     read=lambda scene, x: x / (2.0 * jnp.pi),           # natural frequency in Hz
+    ... )
+    >>> scene = jv.Scene(jv.one_mass(mass=49.5, stiffness=5e3, damping=30.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+    >>> round(float(route.read(scene, route.solution(scene))), 3)
+    1.592
     """
 
     solution: Callable[[Scene], Array]
@@ -68,6 +81,8 @@ class ImplicitRoute(NamedTuple):
 
 class GradientCheck(Result):
     """Derivatives of a quantity by the numbers p of a scene, route by route, against finite differences.
+
+    Returned by `check_gradients`.
 
     All derivatives are p dq/dp, the change per relative change of the number, in the quantity's own unit. For a number that is
     0, p is its typical size (an angle's is 1 rad, a position's 0.1 m).

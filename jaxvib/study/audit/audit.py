@@ -44,6 +44,8 @@ class AuditStatus(eqx.Enumeration):
 class Audit(Result):
     """Changes and cost of each effect and each tier on a scene.
 
+    Returned by `audit`.
+
     **Attributes**
 
     - `accuracy` that was requested, relative

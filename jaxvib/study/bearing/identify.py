@@ -55,6 +55,8 @@ class IdentifyStatus(eqx.Enumeration):
 class Identified(Result):
     """Friction of a bearing, with its uncertainty.
 
+    Returned by `identify`.
+
     **Attributes**
 
     - `status`: an `IdentifyStatus`

@@ -105,6 +105,8 @@ class SwingStatus(eqx.Enumeration):
 class Swing(Result):
     """Decaying swing of a pendulum.
 
+    Returned by `swing`.
+
     **Attributes**
 
     - `status`: a `SwingStatus`

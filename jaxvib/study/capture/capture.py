@@ -56,6 +56,8 @@ class CaptureStatus(eqx.Enumeration):
 class Capture(Result):
     """Captures from initial speeds of the loads relative to the rotor.
 
+    Returned by `capture`.
+
     **Attributes** (S speeds, each tried from `starts` perturbed positions)
 
     - `status`: a `CaptureStatus`

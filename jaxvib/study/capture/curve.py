@@ -33,6 +33,8 @@ __all__ = ["ThresholdCurve", "threshold_curve"]
 class ThresholdCurve(Result):
     """Threshold of capture over a number of the scene.
 
+    Returned by `threshold_curve`.
+
     **Attributes** (V values)
 
     - `value` (V,) of that number
