@@ -106,8 +106,8 @@ class Result(eqx.Module):
 
         **Arguments**: `axis`: its name, such as "time", "mode" or "rotor_speed"; default: the axis of most arrays.
 
-        **Raises** `InputError` for an axis that the result does not have, and if pandas is not installed (`pip install
-        '.[xarray]'`).
+        **Raises** `InputError` for an axis that the result does not have, and if pandas is not installed
+        (`pip install '.[xarray]'`).
         """
         try:
             import pandas

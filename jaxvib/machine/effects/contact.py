@@ -117,7 +117,7 @@ class LoadContact(Effect):
             raise InputError("start.angle", f"{problem}; start them {size:.4g} m apart, their diameter")
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array:
-        """Return sqrt(k / mu), the natural frequency of a contact, rad/s; typical: 300 to 3000."""
+        """Return sqrt(k / mu), the natural frequency of a contact, rad/s; typical: 300 to 5000."""
         return jnp.sqrt(self.stiffness / self._reduced_mass(loads))
 
     def prepare(self, loads: Loads) -> LoadContact:
