@@ -29,6 +29,7 @@ from jaxvib.motion.start import Start, initial_state, require_start, validate_st
 from jaxvib.motion.steps import Accuracy, EqualSteps, StepChoice, Tolerance, require, small_number
 from jaxvib.motion.stiffness import fastest_decay, steps_of, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
+from jaxvib.runtime.devices import known as numpy_of_known
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import unknown_is_positive
@@ -122,7 +123,7 @@ def plan_run(
     if isinstance(steps, Accuracy) and not known:
         raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
     is_rate_needed = known or max_steps is None or is_estimated
-    fastest = frequency_bounds(scene)[0] if is_rate_needed else np.asarray(np.nan, end.dtype)
+    fastest = numpy_of_known(frequency_bounds(scene)[0]) if is_rate_needed else np.asarray(np.nan, end.dtype)
     stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
     if max_steps is None:
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_SHARE) * fastest, end)

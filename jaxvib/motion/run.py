@@ -24,7 +24,7 @@ from jaxvib.motion.analysis.separation import would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
-from jaxvib.results.status import member
+from jaxvib.results.status import member, status_name
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import REFUSED
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["Run", "RunStatus", "judged_by_separation"]
+__all__ = ["ENDS", "SETTLED_DRIFT", "Run", "RunStatus", "judged_by_separation"]
 
 
 @cached
@@ -58,6 +58,13 @@ class RunStatus(eqx.Enumeration):
     )
     would_separate = "all loads are at nearly one angle, but this motion is unstable: slightly separated loads leave it"
     refused = REFUSED
+
+
+ENDS = ("done", "beating", "creeping", "would_separate")
+"""Statuses of runs that reached their end."""
+
+SETTLED_DRIFT = 1e-3
+"""Drift below which a motion repeats itself."""
 
 
 class Run(AbstractMeasured, Result):
@@ -101,13 +108,12 @@ class Run(AbstractMeasured, Result):
     @property
     def settled(self) -> Array:
         """True if the motion repeats itself, judged by amplitudes and speed, and loads a little apart do not leave it."""
-        return (self.drift < 1e-3) & (self.status != RunStatus.would_separate)
+        return (self.drift < SETTLED_DRIFT) & (self.status != RunStatus.would_separate)
 
     @property
     def finished(self) -> Array:
         """True if the run reached its end, settled or not."""
-        ends = RunStatus.done, RunStatus.beating, RunStatus.creeping, RunStatus.would_separate
-        return functools.reduce(operator.or_, (self.status == end for end in ends))
+        return functools.reduce(operator.or_, (self.status == getattr(RunStatus, name) for name in ENDS))
 
     def summary(self) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak."""
@@ -224,6 +230,6 @@ class Run(AbstractMeasured, Result):
 
 def judged_by_separation(run: Run) -> Run:
     """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
-    if not (bool(run.finished) and would_separate(run.scene, run.window)):
+    if not (status_name(run.status) in ENDS and would_separate(run.scene, run.window)):
         return run
     return dataclasses.replace(run, status=member(RunStatus, "would_separate"))

@@ -16,16 +16,17 @@ from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
-from jaxvib.motion.integrate import frequency_bounds, whole_turns
+from jaxvib.motion.analysis.separation import prepare_separation
+from jaxvib.motion.integrate import WINDOW, frequency_bounds, whole_turns
 from jaxvib.motion.plan import RunPlan, plan_stretch, start_state
-from jaxvib.motion.run import Run, RunStatus, judged_by_separation
-from jaxvib.motion.simulate import last_state, run_planned
-from jaxvib.motion.start import START_SEPARATION, Start
+from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, judged_by_separation
+from jaxvib.motion.simulate import last_state, prepare_run, run_planned
+from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.motion.steps import StepChoice, Tolerance
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.jams.jam import jam_modes, jams_of
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 
@@ -163,10 +164,16 @@ def _plan_settle(
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
     start = ("rest" if mode is None else "jam") if start is None else start
-    separation = START_SEPARATION if separation is None and isinstance(start, str) and start == "jam" else separation
+    is_jam = isinstance(start, str) and start == "jam"
+    separation = START_SEPARATION if separation is None and is_jam else separation
+    steps = Tolerance(1e-9 if double else 1e-5) if steps is None else steps
+    if is_jam and not jams_of.is_ready(scene):
+        rest = initial_state(scene)
+        prepare_run(plan_stretch(scene, length, rest, steps, throw=throw))
+        prepare_separation(scene, rest, WINDOW)
     state = start_state(scene, start, mode, separation, throw=throw)
     return _SettlePlan(
-        first=plan_stretch(scene, length, state, Tolerance(1e-9 if double else 1e-5) if steps is None else steps, throw=throw),
+        first=plan_stretch(scene, length, state, steps, throw=throw),
         stretches=count(stretches, "stretches"),
         drift=usual if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True)),
         usual=usual,
@@ -183,7 +190,7 @@ def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
         run = run_planned(dataclasses.replace(plan.first, state=state), throw=throw)
         is_coincident, coincident = bool(run.coincident), coincident and bool(run.coincident)
         run = dataclasses.replace(run, coincident=on_device(np.asarray(coincident)))
-        if not bool(run.finished):
+        if status_name(run.status) != "done":
             return run, False
         drifts.append(float(run.drift))
         if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _AWAY * plan.drift:
@@ -195,12 +202,12 @@ def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
             measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
             if len(measured) >= plan.remembered and _steady_in_the_mean(np.array(measured[-plan.remembered :])):
                 return _judged(run, "beating"), True
-            if bool(run.settled) and plan.decay * length * len(measured) > -math.log(plan.usual):
+            if drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.usual):
                 regimes.append(run.regime)
                 if _is_creeping(regimes[-_CREEPS:]):
                     return _judged(run, "creeping"), True
         if len(drifts) == plan.stretches:
-            last = _judged(run, "done") if bool(run.settled) else run
+            last = _judged(run, "done") if drifts[-1] < SETTLED_DRIFT else run
             return last, status_name(last.status) == "would_separate"
         state = last_state(plan.first.scene, run)
 
@@ -233,7 +240,7 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
     three counts unless they decay within a window. The rate is the carrier's slowest `decay`, or if it has none the one at
     which drifts fall from stretch to stretch, of the time `stretch` each.
     """
-    half, recent = 0.5 * float(run.window.time[-1] - run.window.time[0]), max(drifts[-3:])
+    half, recent = 0.5 * float(np.ptp(np.asarray(run.window.time))), max(drifts[-3:])
     if decay == 0.0 and len(drifts) >= 6 and recent > 0.0:
         decay = max(math.log(max(drifts[-6:-3]) / recent) / (3.0 * stretch), 0.0)
     fall = -math.expm1(-decay * half)

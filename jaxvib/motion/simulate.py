@@ -17,22 +17,24 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
 from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate, whole_turns, wrap_angles
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, plan_run
-from jaxvib.motion.run import Run, RunStatus, judged_by_separation
+from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, judged_by_separation
 from jaxvib.motion.start import Start
 from jaxvib.motion.steps import StepChoice
 from jaxvib.motion.stiffness import advice
 from jaxvib.results.status import status_name
 from jaxvib.runtime.devices import known, on_device
-from jaxvib.runtime.parallel import in_threads
+from jaxvib.runtime.parallel import in_background, in_threads
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number
 
-__all__ = ["last_state", "run_planned", "simulate"]
+__all__ = ["last_state", "prepare_run", "run_planned", "simulate"]
 
 
 @validated
@@ -114,12 +116,10 @@ def simulate(
 
     Source: the antiphase paper, section 5.3; for the method `UnrolledDopri8`.
     """
-    plan = plan_run(
-        scene,
+    plan_from = partial(
+        plan_run,
+        scene := validate_scene(scene),
         until,
-        start=start,
-        mode=mode,
-        separation=separation,
         spin_up=spin_up,
         save=save,
         samples=samples,
@@ -132,8 +132,11 @@ def simulate(
         progress_meter=progress_meter,
         throw=throw,
     )
+    if isinstance(start, str) and start == "jam" and not jams_of.is_ready(scene):
+        prepare_run(plan_from(start="rest", mode=None, separation=None))
+    plan = plan_from(start=start, mode=mode, separation=separation)
     run = run_planned(plan, throw=throw)
-    return judged_by_separation(run) if plan.is_known and bool(run.settled) else run
+    return judged_by_separation(run) if plan.is_known and float(run.drift) < SETTLED_DRIFT else run
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:
@@ -159,11 +162,24 @@ def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:
 
 
 def _run_stretch(plan: RunPlan, end: Array, state: State, control: Control, *, is_measured: bool) -> Run:
+    return integrate(*_integration(plan, end, state, control, is_measured=is_measured))
+
+
+def prepare_run(plan: RunPlan) -> None:
+    """Begin to compile the program of a run in a thread, while the numbers of its start are still unknown."""
+    call = _integration(plan, plan.end, plan.state, plan.integration.control, is_measured=True)
+    in_background(partial(integrate.prepare, *call))
+
+
+def _integration(
+    plan: RunPlan, end: Array, state: State, control: Control, *, is_measured: bool
+) -> tuple[Scene, Array, State, IntegrationPlan, np.ndarray | None]:
+    """Return the arguments of `integrate` for one stretch."""
     integration, measuring = plan.integration._replace(control=control), None
     if plan.is_known and plan.integration.adjoint is None:
         # One program for runs with any limit of steps, measured or not.
         integration, measuring = _with_limit_as_number(integration), np.asarray(is_measured)
-    return integrate(plan.scene, end, state, integration, measuring)
+    return plan.scene, end, state, integration, measuring
 
 
 def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:

@@ -24,7 +24,7 @@ from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import shared_devices
 from jaxvib.runtime.stored import is_debugging
 
-__all__ = ["cores", "in_chunks", "in_parallel", "in_threads"]
+__all__ = ["cores", "in_background", "in_chunks", "in_parallel", "in_threads"]
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
@@ -162,6 +162,22 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
     for other in begun:
         other.result()
     return [value for _, value in sorted(found, key=lambda each: each[0])]
+
+
+def in_background(*tasks: Callable[[], object]) -> None:
+    """Begin tasks in threads, with JAX's options of this thread. Nobody waits for them, and their errors are ignored.
+
+    A question that calls several `cached` functions one after the other knows their programs before their numbers. Its first
+    answer takes less time if they are compiled side by side: `task = lambda: integrate.prepare(...)`. A call of the function
+    then waits for its program, and raises the error if there is one.
+    """
+
+    def run(task: Callable[[], object]) -> None:
+        task()
+
+    with_options = _same_options(run)
+    for task in tasks:
+        _threads().submit(with_options, task, None)
 
 
 @functools.cache

@@ -83,6 +83,16 @@ class CachedFunction(Generic[P, T]):
                 "adjoint", "allows reverse derivatives only; for jvp and jacfwd of a run write adjoint=diffrax.ForwardMode()"
             ) from error
 
+    def is_ready(self, *args: P.args, **kwargs: P.kwargs) -> bool:
+        """Return True if a call has no program to wait for: it is in memory, cannot be stored, or JAX is transforming."""
+        leaves, treedef = jax.tree.flatten((args, kwargs))
+        return any(map(traced, leaves)) or self.stored.is_ready(leaves, treedef)
+
+    def prepare(self, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Read the program of a call from disk, or trace and compile it, without running it."""
+        start()
+        self.stored.compiled(*jax.tree.flatten((args, kwargs)))
+
     def _transformed(self, tracers: Sequence[Any], leaves: Sequence[Any], treedef: Any, args: Any, kwargs: Any) -> T:
         """Evaluate the function under a JAX transformation."""
         if HAS_RULES and program_folder() is not None and not is_debugging() and all(map(_is_simple, tracers)):

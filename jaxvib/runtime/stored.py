@@ -84,36 +84,50 @@ class StoredFunction(Generic[T]):
         self.function = no_host_checks()(function)
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
-        self.lock = threading.RLock()  # threads that need the same program wait for the one that traces it
+        self.lock = threading.RLock()  # threads that need the same program wait for the one that compiles it
         with _listing:
             _functions.add(self)
 
     def __call__(self, leaves: Sequence[Any], treedef: Any) -> T:
         """Evaluate the function; its arguments (args, kwargs) have these leaves, none of them a tracer."""
-        folder = program_folder()
-        if folder is None or is_debugging():
+        if (program := self.compiled(leaves, treedef)) is None:
             return self._jitted(leaves, treedef)
-        home = _home(leaves)
-        call = (folder, treedef, tuple(map(leaf_key, leaves)), home, _options())
-        key = (_current_code(), call)
-        try:
-            program = self.ready.get(key, _UNKNOWN)
-        except TypeError:  # an argument without a hash
-            return self._jitted(leaves, treedef)
+        program.used = next(_clock)
+        with evaluating():  # inside a transformation JAX would dispatch a program of known numbers by its slow path
+            return program(x for x in leaves if isinstance(x, _ARRAYS))
+
+    def compiled(self, leaves: Sequence[Any], treedef: Any) -> _Program | None:
+        """Return the compiled program of these arguments; None for calls whose program cannot be stored."""
+        call, program = self._found(leaves, treedef)
         if program is _UNKNOWN:
+            folder, *_, home, _ = call
             with self.lock:
                 key = (_current_code(look=True), call)
                 program = self.ready.get(key, _UNKNOWN)
                 if program is _UNKNOWN:
                     with evaluating():  # inside a transformation JAX would trace these transfers
                         moved = arrays_on_device(leaves)
-                    program = self.ready[key] = self._program(folder, moved, treedef, home)
+                        program = self._program(folder, moved, treedef, home)
+                        if program is not None:
+                            program.compile(leaf for leaf in moved if eqx.is_array(leaf))
+                    self.ready[key] = program
             _evict_least_recently_used()
-        if program is None:
-            return self._jitted(leaves, treedef)
-        program.used = next(_clock)
-        with evaluating():  # inside a transformation JAX would dispatch a program of known numbers by its slow path
-            return program(x for x in leaves if isinstance(x, _ARRAYS))
+        return program
+
+    def is_ready(self, leaves: Sequence[Any], treedef: Any) -> bool:
+        """Return True if the program of these arguments is in memory, or cannot be stored."""
+        return self._found(leaves, treedef)[1] is not _UNKNOWN
+
+    def _found(self, leaves: Sequence[Any], treedef: Any) -> tuple[Any, _Program | None]:
+        """Return the key of a call, and its program in memory, `_UNKNOWN`, or None if it cannot be stored."""
+        folder = program_folder()
+        if folder is None or is_debugging():
+            return (), None
+        call = (folder, treedef, tuple(map(leaf_key, leaves)), _home(leaves), _options())
+        try:
+            return call, self.ready.get((_current_code(), call), _UNKNOWN)
+        except TypeError:  # an argument without a hash
+            return (), None
 
     def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
         args, kwargs = jax.tree.unflatten(treedef, arrays_on_device(leaves))
@@ -192,6 +206,10 @@ class _Program:
 
     def __call__(self, arrays: Iterable[Array | np.ndarray]) -> Any:
         return self.result.filled(self.run(*arrays))
+
+    def compile(self, arrays: Iterable[Array]) -> None:
+        """Compile the program, for arrays like these, without running it; JAX keeps the result."""
+        self.run.lower(*arrays).compile()  # pyright: ignore[reportFunctionMemberAccess]
 
 
 _pausing = threading.Lock()

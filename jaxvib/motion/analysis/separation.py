@@ -12,6 +12,7 @@ Magnus method of order 4 on the samples of the run): strong drag needs no smalle
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -27,9 +28,10 @@ from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 
-__all__ = ["GROWTH", "NEARLY_ONE_ANGLE", "is_nearly_one_angle", "separation_rate", "would_separate"]
+__all__ = ["GROWTH", "NEARLY_ONE_ANGLE", "is_nearly_one_angle", "prepare_separation", "separation_rate", "would_separate"]
 
 NEARLY_ONE_ANGLE = 0.2
 """Loads within so many rad of each other count as loads at one angle."""
@@ -60,21 +62,30 @@ def separation_rate(scene: Scene, stretch: Trajectory) -> float:
     turns = np.floor(abs(phi[-1] - phi[0]) / (2.0 * np.pi))
     covered = np.abs(phi[-1] - phi) <= 2.0 * np.pi * turns if turns else np.ones(phi.size, bool)
     first = phi.size - 1 - 2 * (np.count_nonzero(covered[:-1]) // 2)
-    transition, log_scale, duration = _transition(scene, stretch, jnp.asarray(first))
+    transition, log_scale, duration = _transition(scene, stretch.time, stretch.state, np.asarray(first))
     radius = float(np.max(np.abs(np.linalg.eigvals(np.asarray(transition)))))
     return float((np.log(max(radius, 1e-300)) + float(log_scale)) / float(duration))
 
 
+def prepare_separation(scene: Scene, state: State, samples: int) -> None:
+    """Begin to compile the program of `separation_rate` in a thread, for a stretch of so many states like `state`."""
+    states = jax.tree.map(lambda leaf: np.zeros((samples, *leaf.shape), leaf.dtype), state)
+    times = np.zeros(samples, state.displacement.dtype)
+    in_background(functools.partial(_transition.prepare, scene, times, states, np.asarray(0)))
+
+
 @cached
-def _transition(scene: Scene, stretch: Trajectory, first: Array) -> tuple[Array, Array, Array]:
+def _transition(
+    scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray
+) -> tuple[Array, Array, Array]:
     """The transition matrix from sample `first` to the last one, the logarithm of its factor, and the time between them."""
-    field, times = vector_field(scene), stretch.time
+    field = vector_field(scene)
     step = (times[-1] - times[0]) / (times.shape[0] - 1)
-    begin = jax.tree.map(lambda leaf: leaf[0], stretch.state)
+    begin = jax.tree.map(lambda leaf: leaf[0], states)
     inserted, extracted, size = _basis(scene, begin)
 
     def matrix(k: Array) -> Array:
-        state = jax.tree.map(lambda leaf: leaf[k], stretch.state)
+        state = jax.tree.map(lambda leaf: leaf[k], states)
 
         def rates(x: Array) -> Array:
             return extracted(jax.jvp(lambda s: field(times[k], s), (state,), (inserted(x),))[1])

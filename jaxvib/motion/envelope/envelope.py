@@ -30,6 +30,7 @@ from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
+from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
 from jaxvib.motion.steps import Tolerance, require, small_number
 from jaxvib.numerics.linalg import magnitude
@@ -40,8 +41,10 @@ from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
+from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.monodromy import at_constant_speed
+from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known
@@ -194,15 +197,17 @@ def envelope(
     if isinstance(chosen, Tolerance):
         chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
     asked, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
+    choices = solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
+    if isinstance(start, str) and start == "jam" and not jams_of.is_ready(scene):
+        rest = initial_state(scene)
+        in_background(partial(_run.prepare, scene, end, rest, *choices), partial(_prepare_growth, scene, rest))
     if isinstance(start, State):
         state = validate_state(scene, start, mode, separation)
     else:
         # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
         known = start in ("rest", "spin_up") and mode is None and separation is None
         state = None if known else initial_state(scene, start, mode=mode, separation=separation, throw=throw)
-    run = _run(
-        scene, end, state, solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
-    )
+    run = _run(scene, end, state, *choices)
     run = outcome(run, asked, end, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps))
     judged = when_known(lambda *_: _judged_by_separation(run), run.steps, run.status)
     return run if judged is None else judged
@@ -210,20 +215,28 @@ def envelope(
 
 def _judged_by_separation(run: Envelope) -> Envelope:
     """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
-    if not (bool(run.settled) and status_name(run.status) == "done"):
+    if not (float(run.drift) < SETTLED_DRIFT and status_name(run.status) == "done"):
         return run
     phase, time = np.asarray(run.window.phase), np.asarray(run.window.time)
     if not is_nearly_one_angle(phase):
         return run
-    growth = float(_growth_at_end(at_constant_speed(run.scene), run.window))
+    last = (np.asarray(x[-1]) for x in map(np.asarray, (run.window.omega, run.window.phase, run.window.displacement)))
+    growth = float(_growth_at_end(at_constant_speed(run.scene), *last))
     if not growth * float(time[-1] - time[0]) > GROWTH:
         return run
     return dataclasses.replace(run, status=member(EnvelopeStatus, "would_separate"))
 
 
+def _prepare_growth(scene: Scene, state: State) -> None:
+    if scene.loads.count > 1:
+        speed, phase, displacement = np.asarray(scene.drive.speed), np.asarray(state.azimuth), np.asarray(state.displacement)
+        _growth_at_end.prepare(at_constant_speed(scene), speed, phase, displacement + 0j)
+
+
 @cached
-def _growth_at_end(scene: Scene, window: Envelopes) -> Array:
-    return averaged_growth(averaged_model(linear_model(scene)), window.omega[-1], window.phase[-1], window.displacement[-1])
+def _growth_at_end(scene: Scene, omega: np.ndarray, phase: np.ndarray, displacement: np.ndarray) -> Array:
+    model = averaged_model(linear_model(scene))
+    return averaged_growth(model, *map(jnp.asarray, (omega, phase, displacement)))
 
 
 @cached

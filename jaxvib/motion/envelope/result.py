@@ -13,6 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured
+from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.steady.outcome import REFUSED
@@ -88,7 +89,7 @@ class Envelope(AbstractMeasured, Result):
     @property
     def settled(self) -> Array:
         """True if amplitudes and speed no longer change, and loads a little apart do not leave the motion."""
-        return (self.drift < 1e-3) & (self.status != EnvelopeStatus.would_separate)
+        return (self.drift < SETTLED_DRIFT) & (self.status != EnvelopeStatus.would_separate)
 
     def summary(self) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak."""

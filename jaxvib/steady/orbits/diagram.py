@@ -22,7 +22,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.roots import next_share
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
-from jaxvib.runtime.parallel import in_chunks
+from jaxvib.runtime.parallel import in_background, in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
@@ -140,6 +140,9 @@ def exact_branches(
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
     count(points, "points", low=2, each=1e4)
+    if not _fold_points.is_ready(scene):
+        lanes = np.ones(_ORBITS_PER_BATCH, scene.drive.speed.dtype)
+        in_background(functools.partial(_values.prepare, scene, lanes, _points(scene)[0], accuracy, False))
     inside, resonances = map(np.asarray, _fold_points(scene))
     lowest = np.min(resonances[resonances > 0.0], initial=np.max(resonances))
     low = float(0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True))
@@ -183,8 +186,7 @@ class _Solver:
 
     def __call__(self, omega: np.ndarray) -> _Values:
         """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
-        half = has_half_turn(self.scene.effects)
-        first, *more = _COLLOCATION_POINTS if half else [2 * p + 1 for p in _COLLOCATION_POINTS]
+        first, *more = _points(self.scene)
         found = self._batches(omega, first)
         for many in more:
             todo = np.flatnonzero(~(found.error <= self.accuracy))
@@ -195,6 +197,11 @@ class _Solver:
 
     def _batches(self, omega: np.ndarray, many: int) -> _Values:
         return in_chunks(_ORBITS_PER_BATCH, lambda w: _values(self.scene, w, many, self.accuracy, self.implicit), omega)
+
+
+def _points(scene: Scene) -> list[int]:
+    """Return numbers of collocation points to try in turn, on half a period if the motion has that symmetry."""
+    return [p if has_half_turn(scene.effects) else 2 * p + 1 for p in _COLLOCATION_POINTS]
 
 
 def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -215,8 +222,8 @@ def _is_stiff(scene: Scene, omega: Array) -> Array:
 
 
 @cached
-def _values(scene: Scene, omega: Array, many: int, accuracy: float, implicit: bool) -> _Values:
-    model = coincident_model(jammed_model(scene))
+def _values(scene: Scene, omega: Array | np.ndarray, many: int, accuracy: float, implicit: bool) -> _Values:
+    model, omega = coincident_model(jammed_model(scene)), jnp.asarray(omega)
     start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
     steps = jnp.max(steps_for(model, omega, start, implicit=implicit))
     orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy, implicit=implicit)

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
+from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, numbers_of, orbits
 from jaxvib.steady.orbits.plan import OrbitPlan, plan_orbit
 from jaxvib.steady.orbits.search import exact_mode_speeds
@@ -90,6 +96,11 @@ def jam_orbit(
 
     Source: the antiphase paper, equations (2) and (21), solved without its expansion in eps.
     """
+    scene = validate_scene(scene)
+    if mode is not None and not jams_of.is_ready(scene):
+        rough = plan_orbit(scene, mode=None, omega=None, near=scene.drive.speed, accuracy=accuracy, points=points)
+        rough = dataclasses.replace(rough, direction=np.ones_like(rough.value))
+        in_background(partial(_solve_program.prepare, *_arguments(rough, rough.points[0])))
     plan = plan_orbit(scene, mode=mode, omega=omega, near=near, accuracy=accuracy, points=points)
     if not plan.is_known:
         return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
@@ -122,7 +133,11 @@ def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
 
 
 def _solve(plan: OrbitPlan, points: int, steps: int | None = None) -> Orbit:
-    return _solve_program(
+    return _solve_program(*_arguments(plan, points, steps))
+
+
+def _arguments(plan: OrbitPlan, points: int, steps: int | None = None) -> tuple[Any, ...]:
+    return (
         plan.scene,
         plan.value,
         plan.start,
