@@ -14,7 +14,7 @@ from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
     from jaxvib.study.audit.compared import EffectRow
-    from jaxvib.study.audit.prices import PriceRow
+    from jaxvib.study.audit.operation_counts import OperationCount
 
 
 @app.command("audit")
@@ -22,13 +22,15 @@ if TYPE_CHECKING:
 @click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
 @click.option("--mode", type=int, help="Number of the jam mode [the last below the rotor's own speed that is stable].")
 @click.option("--until", help="End of the run, such as 20s, where no jam is asked for [100 slow periods after the run-up].")
-@click.option("--start", type=click.Choice(["rest", "turning"]), help="Ask for a run from there, in place of a jam.")
-@click.option("--put-in/--no-put-in", default=True, show_default=True, help="Put in the effects that the scene leaves out.")
-@click.option("--tiers/--no-tiers", default=True, show_default=True, help="Ask every tier.")
+@click.option("--start", type=click.Choice(["rest", "turning"]), help="Start of a run, in place of a jam.")
+@click.option("--put-in/--no-put-in", default=True, show_default=True, help="Add each effect that the scene lacks.")
+@click.option("--tiers/--no-tiers", default=True, show_default=True, help="Compute every tier.")
 @click.option(
-    "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Timings; the fastest counts; 0: none."
+    "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Number of timings; the fastest counts."
 )
-@click.option("--prices", "priced", is_flag=True, help="In place of SCENE: operations that effects, drives, coordinates add.")
+@click.option(
+    "--operations", "count_operations", is_flag=True, help="In place of SCENE: operations of effects, drives and coordinates."
+)
 @WITHOUT
 @shared
 def audit(
@@ -40,25 +42,25 @@ def audit(
     put_in: bool,
     tiers: bool,
     repeats: int,
-    priced: bool,
+    count_operations: bool,
     without: tuple[str, ...],
     output: Output,
 ) -> None:
     """Report the change and the cost of each effect and each tier of SCENE: negligible effects, and effects that may be
     missing.
 
-    Each effect is taken out, and each that the scene has not and could have is put in with usual numbers. --out adds the
+    Each effect of the scene is removed in turn, and each effect that it lacks is added with usual numbers. --out adds the
     figure."""
-    if priced:
-        from jaxvib.study.audit.prices import prices  # slow to import, and --help needs none of it
+    if count_operations:
+        from jaxvib.study.audit.operation_counts import operation_counts  # slow to import, not needed for --help
 
         if scene is not None:
-            raise InputError("--prices", "goes without a scene; leave one of them out")
-        rows = prices()
-        output.done({"prices": rows}, lambda: _prices_table(rows), "prices")
+            raise InputError("--operations", "was given with a scene; leave one of them out")
+        rows = operation_counts()
+        output.done({"operations": rows}, lambda: _operations_table(rows), "operations")
         return
     if scene is None:
-        raise InputError("SCENE", "is missing; give the path of a scene file, or --prices")
+        raise InputError("SCENE", "is missing; give the path of a scene file, or --operations")
     from jaxvib.units import number
 
     share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
@@ -80,7 +82,7 @@ def audit(
 def audit_text(found: jv.Audit) -> str:
     """An `Audit` as a person reads it."""
     took = "" if math.isnan(found.seconds) else f", a run of 100 turns {found.seconds:.2g} s, compiled in {found.compile:.2g} s"
-    lines = [f"{found.question}: {found.kind}; {found.message}", f"equations of motion: {found.operations} operations{took}"]
+    lines = [f"{found.motion}: {found.kind}; {found.message}", f"equations of motion: {found.operations} operations{took}"]
     head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by", "operations", "run", "compile"]
     rows = [_effect(row, found) for row in found.effects]
     if rows:
@@ -119,7 +121,7 @@ def _seconds(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.2g}"
 
 
-def _prices_table(rows: list[PriceRow]) -> str:
+def _operations_table(rows: list[OperationCount]) -> str:
     cells = [[f"{row.part}: {row.kind}", f"{row.operations}", f"{row.added:+d}", row.beside] for row in rows]
-    title = "operations of the traced equations of motion; one on a vector counts once, however long it is"
-    return table(title, ["part", "operations", "adds", "beside"], cells)
+    title = "operations of the traced equations of motion; an operation on a vector of any length counts once"
+    return table(title, ["part", "operations", "added", "compared with"], cells)

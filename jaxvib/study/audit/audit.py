@@ -20,9 +20,9 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import member
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.study.accuracy.exact_reference import usual_mode
-from jaxvib.study.audit.compared import CHANGES, EffectRow, RepeatedQuestion, effect_row, field_operations
+from jaxvib.study.audit.compared import CHANGES, EffectRow, RepeatedComparison, effect_row, field_operations
+from jaxvib.study.audit.comparisons import MIN_AMPLITUDE_SHARE, JamComparison, RunComparison, without_excluded_effects
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
-from jaxvib.study.audit.questions import LEAST, JamQuestion, RunQuestion, admitted
 from jaxvib.study.audit.tiers import TierRow, tier_rows
 from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number
@@ -36,9 +36,9 @@ __all__ = ["Audit", "AuditStatus", "audit"]
 class AuditStatus(eqx.Enumeration):
     """Outcomes of an audit. Each member is the sentence shown to the user."""
 
-    done = "what each effect changes was computed"
-    unsettled = "the motion had not settled to the accuracy that was asked for: smaller changes cannot be told; run longer"
-    failed = "the scene's own motion could not be computed, so that nothing can be compared with it"
+    done = "the change by each effect was computed"
+    unsettled = "the motion had not settled to the requested accuracy: smaller changes are not resolved; run longer"
+    failed = "the motion of the scene itself could not be computed; there is nothing to compare with"
 
 
 class Audit(Result):
@@ -49,7 +49,7 @@ class Audit(Result):
     **Attributes**
 
     - `accuracy` that was requested, relative
-    - `question` that was computed, in words
+    - `motion` that was compared, as text
     - `kind` of the scene's own motion, `omega`, rad/s, `amplitude` (nd,), m, of tilts rad, `foundation_force`, N, and `fold`,
       rad/s
     - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if no time was taken)
@@ -59,7 +59,7 @@ class Audit(Result):
 
     status: AuditStatus
     accuracy: float = eqx.field(metadata=in_unit(""))
-    question: str
+    motion: str
     kind: str
     omega: float = eqx.field(metadata=in_unit("rad/s"))
     amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "coordinate"))
@@ -80,7 +80,7 @@ class Audit(Result):
 
     def summary(self) -> str:
         """Text with the needed, negligible and missing effects of the scene."""
-        lines = [f"{self.question}: {self.kind}; {self.message}"]
+        lines = [f"{self.motion}: {self.kind}; {self.message}"]
         for row in self.effects:
             change = "no change is known" if math.isnan(row.change) else f"changes up to {100.0 * row.change:.3g} %"
             where = "" if row.present else ", not in the scene"
@@ -163,24 +163,24 @@ def audit(
     scene = validate_scene(scene)
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
-    question, words = _question(scene, mode, end, start)
-    ask = RepeatedQuestion(question, repeats)
-    own = ask.values(scene, ask.tier(scene))
-    until = question.until if isinstance(question, RunQuestion) else None
+    question, words = _comparison(scene, mode, end, start)
+    repeated = RepeatedComparison(question, repeats)
+    own = repeated.values(scene, repeated.tier(scene))
+    until = question.until if isinstance(question, RunComparison) else None
     # Of a machine that hardly moves, what its loads could do: their unbalance radius.
-    amplitude = [a * (own.magnified / LEAST if own.magnified > 1.0 else 1.0) for a in own.amplitude]
+    amplitude = [a * (own.magnified / MIN_AMPLITUDE_SHARE if own.magnified > 1.0 else 1.0) for a in own.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     status = "done"
     if not np.isfinite(own.omega):
         status = "failed"
     elif not own.uncertainty <= 0.5 * accuracy:
         status = "unsettled"
-    seconds, compiling = ask.times(scene)
-    effects = [effect_row(ask, scene, variant, float(accuracy)) for variant in variants]
+    seconds, compiling = repeated.times(scene)
+    effects = [effect_row(repeated, scene, variant, float(accuracy)) for variant in variants]
     return Audit(
         status=member(AuditStatus, status),
         accuracy=float(accuracy),
-        question=words,
+        motion=words,
         kind=own.words,
         omega=own.omega,
         amplitude=np.asarray(own.amplitude),
@@ -191,36 +191,36 @@ def audit(
         compile=compiling,
         effects=effects,
         tiers=tier_rows(scene, question, own, repeats) if tiers else [],
-        numbers=[_as_computed(row, effects) for row in dimensionless_numbers(scene, own, accuracy)],
+        numbers=[_with_computed_advice(row, effects) for row in dimensionless_numbers(scene, own, accuracy)],
         coordinates=scene.machine.structure().coordinates,
     )
 
 
-def _as_computed(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
-    """A number's row; where what its effect changes was computed, that decides, and the number says how it comes about."""
+def _with_computed_advice(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
+    """Row of a number with the advice of its effect, if that was computed."""
     for effect in effects:
         if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
-            return row._replace(advice=effect.advice, says=f"{row.says}; advised is what computing the effect came to")
+            return row._replace(advice=effect.advice, says=f"{row.says}; the advice is that of the computed effect")
     return row
 
 
-def _question(
+def _comparison(
     scene: Scene, mode: int | None, until: float | None, start: Literal["rest", "turning"] | State | None
-) -> tuple[JamQuestion | RunQuestion, str]:
+) -> tuple[JamComparison | RunComparison, str]:
     if not (start is None or isinstance(start, State) or start in ("rest", "turning")):
         raise InputError("start", f"is {quoted(start)}; it must be 'rest', 'turning' or a State")
     if mode is not None and start is not None:
-        raise InputError("mode", f"is {quoted(mode)}, which goes without a start: a jam is asked for, or a run")
+        raise InputError("mode", f"is {quoted(mode)}, but start selects a run; leave one of them out")
     if start is None and (scene.drive.constant or mode is not None):
         try:
-            chosen = usual_mode(admitted(scene)) if mode is None else mode
-            jammed = JamQuestion(chosen)
+            chosen = usual_mode(without_excluded_effects(scene)) if mode is None else mode
+            jammed = JamComparison(chosen)
             if mode is not None:
-                jam_modes(admitted(scene)).select(mode)  # raises where there is no such mode
+                jam_modes(without_excluded_effects(scene)).select(mode)  # raises an error if the mode does not exist
             return jammed, f"jam mode {chosen} at {float(scene.drive.speed):.5g} rad/s"
         except InputError:
             if mode is not None:
                 raise
-    run = RunQuestion.usual(scene, until, start)
+    run = RunComparison.of_arguments(scene, until, start)
     name = "a state" if isinstance(run.start, State) else run.start
     return run, f"the motion {run.until:.4g} s after {name}"

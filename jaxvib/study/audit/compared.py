@@ -22,15 +22,15 @@ from jaxvib.motion.start import initial_state
 from jaxvib.runtime.cache import compiled_anew
 from jaxvib.runtime.operations import operations
 from jaxvib.study.accuracy.cost import timed
-from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values, admitted
+from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison, without_excluded_effects
 from jaxvib.study.audit.variants import Variant
 
-__all__ = ["CHANGES", "EffectRow", "RepeatedQuestion", "effect_row", "field_operations", "relative_changes"]
+__all__ = ["CHANGES", "EffectRow", "RepeatedComparison", "effect_row", "field_operations", "relative_changes"]
 
 CHANGES = ("amplitude", "foundation_force", "omega", "fold")
 """The quantities whose changes an audit tells, by their names in `EffectRow`."""
 
-_TURNS, _TOLERANCE, _MOST_STEPS = 100, 1e-8, 2**24
+_TURNS, _TOLERANCE, _MAX_STEPS = 100, 1e-8, 2**24
 """Turns of the rotor of the run whose time is taken, its tolerance, and the most steps that it may make."""
 
 
@@ -67,57 +67,57 @@ class EffectRow(NamedTuple):
 
     @property
     def change(self) -> float:
-        """The largest of the changes, relative, without its sign; NaN where none is known."""
+        """Largest relative change, without its sign; NaN if no change is known."""
         known = [abs(x) for x in (self.amplitude, self.foundation_force, self.omega, self.fold) if not math.isnan(x)]
         return max(known, default=math.nan)
 
 
-class RepeatedQuestion:
-    """A question and its answers, each computed once.
+class RepeatedComparison:
+    """A comparison and its values for several scenes, each computed once.
 
-    **Arguments**: `question` a `JamQuestion` or `RunQuestion`; `repeats` of timings, 0 for none.
+    **Arguments**: `comparison`: a `JamComparison` or `RunComparison`; `repeats`: number of timings, 0 for none.
     """
 
-    def __init__(self, question: JamQuestion | RunQuestion, repeats: int):
-        self.question, self.repeats = question, repeats
-        self._known: dict[tuple[int, bool], tuple[Scene, Values]] = {}
+    def __init__(self, comparison: JamComparison | RunComparison, repeats: int):
+        self.comparison, self.repeats = comparison, repeats
+        self._known: dict[tuple[int, bool], tuple[Scene, MotionValues]] = {}
         self._times: dict[int, tuple[Scene, tuple[float, float]]] = {}
 
     def tier(self, *scenes: Scene) -> str:
-        """The tier that answers for all these scenes."""
-        return "exact orbit" if all(self.question.can(scene) for scene in scenes) else "full"
+        """Name of the tier that computes the motion of all these scenes."""
+        return "exact orbit" if all(self.comparison.has_exact_orbit(scene) for scene in scenes) else "full"
 
-    def values(self, scene: Scene, tier: str) -> Values:
-        """The scene's motion by a tier."""
+    def values(self, scene: Scene, tier: str) -> MotionValues:
+        """Values of the motion of a scene by a tier."""
         exact = tier == "exact orbit"
-        if (id(scene), exact) not in self._known:  # kept with its scene, so that no other scene gets its place in memory
-            self._known[id(scene), exact] = scene, (self.question.exact if exact else self.question.full)(scene)
+        if (id(scene), exact) not in self._known:  # stored with its scene, whose id stays unique this way
+            self._known[id(scene), exact] = scene, (self.comparison.exact if exact else self.comparison.full)(scene)
         return self._known[id(scene), exact][1]
 
     def times(self, scene: Scene) -> tuple[float, float]:
-        """Seconds of a run of 100 turns of the rotor, and what tracing and compiling it took; NaN where none are asked for."""
+        """Time of a run of 100 turns of the rotor, and of tracing and compiling it, s; NaN without timings."""
         if not self.repeats:
             return math.nan, math.nan
         if id(scene) not in self._times:
-            self._times[id(scene)] = scene, _times(scene, self.question.state(scene), self.repeats)
+            self._times[id(scene)] = scene, _times(scene, self.comparison.state(scene), self.repeats)
         return self._times[id(scene)][1]
 
 
 def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(start)):
-        start = initial_state(scene)  # there is no such jam: a run takes its time all the same
+        start = initial_state(scene)  # without the jam, a run from another state takes the same time
     end = jnp.asarray(_TURNS * 2.0 * math.pi / float(scene.drive.speed))
-    control = StepControl(jnp.asarray(_TOLERANCE, end.dtype), None, jnp.asarray(_MOST_STEPS, jnp.int32))
+    control = StepControl(jnp.asarray(_TOLERANCE, end.dtype), None, jnp.asarray(_MAX_STEPS, jnp.int32))
     arguments = (scene, end, start, control, jnp.asarray(20.0, end.dtype))
 
     @jax.jit
-    def anew(scene: Scene, end: Array, start: State, control: StepControl, turns: Array) -> Run:
-        run = inspect.unwrap(integrate)(scene, end, start, None, control, None, 0, turns, _MOST_STEPS, None)
+    def program_of_run(scene: Scene, end: Array, start: State, control: StepControl, turns: Array) -> Run:
+        run = inspect.unwrap(integrate)(scene, end, start, None, control, None, 0, turns, _MAX_STEPS, None)
         return eqx.filter(run, eqx.is_array)
 
     with compiled_anew():
-        begun = time.process_time()  # which others that compute beside do not change
-        program = anew.lower(*arguments).compile()
+        begun = time.process_time()  # processor time, which other processes do not change
+        program = program_of_run.lower(*arguments).compile()
         compiling = time.process_time() - begun
     _, seconds, _ = timed(lambda: program(*arguments).omega, repeats)
     return seconds, compiling
@@ -137,7 +137,7 @@ def field_operations(scene: Scene) -> int:
     return operations(lambda s, t, y: vector_field(s)(t, y), scene, jnp.zeros(()), state)
 
 
-def relative_changes(new: Values, old: Values, own: Values, units: tuple[str, ...]) -> dict[str, float]:
+def relative_changes(new: MotionValues, old: MotionValues, own: MotionValues, units: tuple[str, ...]) -> dict[str, float]:
     """Changes from `old` to `new`, relative to the values `own`, by the names in `CHANGES`; see `EffectRow`."""
     moved, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
     largest = {unit: max(x for x, u in zip(size, units, strict=True) if u == unit) for unit in units}
@@ -151,25 +151,25 @@ def relative_changes(new: Values, old: Values, own: Values, units: tuple[str, ..
     return found
 
 
-def _size(values: Values) -> float:
+def _size(values: MotionValues) -> float:
     size = values.magnified * max(values.amplitude)
     return size if size > 0.0 else math.nan
 
 
-def effect_row(ask: RepeatedQuestion, scene: Scene, variant: Variant, accuracy: float) -> EffectRow:
-    """The row of what `variant` has more or less than `scene`, judged at the relative `accuracy`."""
-    tier = ask.tier(scene, variant.scene)
-    own, other = ask.values(scene, tier), ask.values(variant.scene, tier)
+def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, accuracy: float) -> EffectRow:
+    """Row on the effect by which `variant` differs from `scene`, judged at the relative `accuracy`."""
+    tier = repeated.tier(scene, variant.scene)
+    own, other = repeated.values(scene, tier), repeated.values(variant.scene, tier)
     new, old = (own, other) if variant.present else (other, own)
     changes = relative_changes(new, old, own, scene.machine.structure().units)
-    sizes = [(len(each.effects), len(admitted(each).effects)) for each in (scene, variant.scene)]
+    sizes = [(len(each.effects), len(without_excluded_effects(each).effects)) for each in (scene, variant.scene)]
     if sizes[0][0] != sizes[1][0] and sizes[0][1] == sizes[1][1]:
         changes["fold"] = math.nan  # theories of jams leave the effect out of both
-    # The other one's, too, relative to this scene's own motion.
+    # The uncertainties of both motions, relative to the motion of this scene.
     uncertainty = own.uncertainty + other.uncertainty * _size(other) / _size(own)
     sign = 1 if variant.present else -1
     cost = sign * (field_operations(scene) - field_operations(variant.scene))
-    ours, theirs = ask.times(scene), ask.times(variant.scene)
+    ours, theirs = repeated.times(scene), repeated.times(variant.scene)
     row = EffectRow(
         variant.name,
         variant.present,
@@ -182,14 +182,14 @@ def effect_row(ask: RepeatedQuestion, scene: Scene, variant: Variant, accuracy: 
         advice="",
         says=variant.says,
     )
-    if isinstance(ask.question, JamQuestion) and tier == "full" and own.kind != "jammed":
+    if isinstance(repeated.comparison, JamComparison) and tier == "full" and own.kind != "jammed":
         lost = f"a run from the jam came to another motion ({own.kind})"
         return row._replace(advice="cannot tell", says="; ".join(filter(None, [row.says, lost])))
     return row._replace(**_advice(row, new.kind, old.kind, accuracy))
 
 
 def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, str]:
-    """`advice` and `says` of a row, where the motion is `new` with the effect and `old` without it."""
+    """`advice` and `says` of a row, for a motion that is `new` with the effect and `old` without it."""
     advice_if_needed = "needed" if row.present or row.says == "as given" else "perhaps needed"
     sentences = [row.says]
     if new != old:

@@ -13,7 +13,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.machine.effects.base import has_term, total_gravity
 from jaxvib.machine.effects.terms import ContactFriction, LoadInteraction, SupportForce
 from jaxvib.machine.scene import Scene
-from jaxvib.study.audit.questions import Values, mean_torque
+from jaxvib.study.audit.comparisons import MotionValues, mean_torque
 
 __all__ = ["NumberRow", "dimensionless_numbers", "gravity_share"]
 
@@ -36,7 +36,7 @@ class NumberRow(NamedTuple):
     says: str
 
 
-def dimensionless_numbers(scene: Scene, values: Values, accuracy: float) -> list[NumberRow]:
+def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -> list[NumberRow]:
     """The numbers that judge what `scene` leaves out, at the motion `values` and a relative `accuracy`.
 
     - gravity on the loads: g/(R Omega^2), its share in the force with which a load presses on its track
@@ -88,14 +88,14 @@ def _ball_radius(scene: Scene) -> tuple[float, str] | None:
     return radius, f"balls of steel of this mass have the radius {1e3 * radius:.3g} mm; "
 
 
-def _gravity(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+def _gravity(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     if total_gravity(scene.effects):
         return None
     share = gravity_share(_arm(scene), values.omega)
     return _row("gravity: g/(R Omega^2)", share, accuracy, "its share in the force with which loads press on their track")
 
 
-def _crowding(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     own, n = _ball_radius(scene), scene.loads.count
     if own is None or n < 2 or not scene.loads.circular:
         return None
@@ -112,14 +112,14 @@ def _crowding(scene: Scene, values: Values, accuracy: float) -> NumberRow | None
     return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, says)
 
 
-def _distance(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+def _distance(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     if not np.isfinite(values.closest) or has_term(scene.effects, LoadInteraction):
         return None
     says = "diameter over the least distance of two loads: above 1 they pass through each other, and load_contact is called for"
     return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, says)
 
 
-def _friction(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     drag = mean_torque(scene, values.omega)
     if has_term(scene.effects, ContactFriction) or not drag > 0.0:
         return None
@@ -136,7 +136,7 @@ def _friction(scene: Scene, values: Values, accuracy: float) -> NumberRow | None
     return _row(name, lever * pressed / drag, accuracy, says)
 
 
-def _gyroscopic(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     if scene.machine.mounting().tilt is not None:
         return None
     model = linear_model(scene)
@@ -148,7 +148,7 @@ def _gyroscopic(scene: Scene, values: Values, accuracy: float) -> NumberRow | No
     return _row("gyroscopic: sum kappa m / M", loads / whole, accuracy, says)
 
 
-def _lift(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     machine = scene.machine
     if machine.mounting().axes != (1,) or has_term(scene.effects, SupportForce):
         return None
@@ -158,7 +158,7 @@ def _lift(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
     return _row("lift: R / (M g)", values.foundation_force / weight, 1.0, says)
 
 
-_NUMBERS: tuple[Callable[[Scene, Values, float], NumberRow | None], ...] = (
+_NUMBERS: tuple[Callable[[Scene, MotionValues, float], NumberRow | None], ...] = (
     _gravity,
     _crowding,
     _distance,

@@ -15,7 +15,7 @@ from jaxvib.results.status import status_name
 from jaxvib.study.accuracy.cost import timed
 from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 from jaxvib.study.accuracy.tier import TIERS, JamValues, Tier
-from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values
+from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison
 
 __all__ = ["TierRow", "tier_rows"]
 
@@ -50,21 +50,21 @@ class TierRow(NamedTuple):
         return f"off by {100.0 * off:.2g} %{took}; {self.says}"
 
 
-def tier_rows(scene: Scene, question: JamQuestion | RunQuestion, own: Values, repeats: int) -> list[TierRow]:
+def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues, repeats: int) -> list[TierRow]:
     """A row for each of `TIERS`, against the values `own` of the best tier that answers; without times for 0 `repeats`."""
-    return [_row(tier, scene, question, own, repeats) for tier in TIERS]
+    return [_row(tier, scene, comparison, own, repeats) for tier in TIERS]
 
 
-def _row(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Values, repeats: int) -> TierRow:
+def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues, repeats: int) -> TierRow:
     nothing = (math.nan,) * 5
     refusal = tier.refusal(scene)
     if refusal is not None:
         return TierRow(tier.name, False, *nothing, says=refusal)
-    ask = _call(tier, scene, question, own)
-    if isinstance(ask, str):
-        return TierRow(tier.name, False, *nothing, says=ask)
+    call = _call(tier, scene, comparison, own)
+    if isinstance(call, str):
+        return TierRow(tier.name, False, *nothing, says=call)
     try:
-        found, seconds, compiling = timed(ask, repeats) if repeats else (ask(), math.nan, math.nan)
+        found, seconds, compiling = timed(call, repeats) if repeats else (call(), math.nan, math.nan)
     except (InputError, ComputationError) as problem:
         return TierRow(tier.name, False, *nothing, says=str(problem))
     amplitude, size = np.abs(np.asarray(found.amplitude)), np.asarray(own.amplitude)
@@ -72,7 +72,7 @@ def _row(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Val
         status = getattr(found, "status", None)
         return TierRow(tier.name, False, *nothing, says="no such motion" if status is None else status_name(status))
     says = tier.answers
-    if isinstance(question, JamQuestion) and isinstance(found, Values) and found.kind != "jammed":
+    if isinstance(comparison, JamComparison) and isinstance(found, MotionValues) and found.kind != "jammed":
         says = f"the run left the jam: {found.kind}"
     off = (amplitude - size) / np.max(size)
     return TierRow(
@@ -87,19 +87,21 @@ def _row(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Val
     )
 
 
-def _call(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Values) -> Callable[[], JamValues | Values] | str:
+def _call(
+    tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues
+) -> Callable[[], JamValues | MotionValues] | str:
     """Function that evaluates the tier, or the reason why it cannot be evaluated."""
     timeless = tier.name in ("leading order", "exact orbit")
-    if isinstance(question, JamQuestion):
+    if isinstance(comparison, JamComparison):
         if not timeless and "unstable" in own.kind:
             return "the jam is unstable, a run leaves it"
         until = 10.0 * SLOW_PERIODS * slow_period(scene)
         if tier.name == "full":
-            return lambda: question.full(scene)
-        return lambda: tier.jam(scene, question.mode, until)
+            return lambda: comparison.full(scene)
+        return lambda: tier.jam(scene, comparison.mode, until)
     if timeless:
         return "knows the jams of this scene, not which of them a run comes to"
     if tier.name == "full":
-        return lambda: question.full(scene)
-    start = question.state(scene)
-    return lambda: envelope(scene, question.until, start=start, save="window", throw=False)
+        return lambda: comparison.full(scene)
+    start = comparison.state(scene)
+    return lambda: envelope(scene, comparison.until, start=start, save="window", throw=False)

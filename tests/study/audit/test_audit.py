@@ -19,11 +19,11 @@ from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
 from jaxvib.results.status import member
 from jaxvib.study.audit import compared
-from jaxvib.study.audit.audit import _as_computed
-from jaxvib.study.audit.compared import EffectRow, RepeatedQuestion, effect_row
+from jaxvib.study.audit.audit import _with_computed_advice
+from jaxvib.study.audit.compared import EffectRow, RepeatedComparison, effect_row
+from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison, without_excluded_effects
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers, gravity_share
-from jaxvib.study.audit.prices import prices
-from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values, admitted
+from jaxvib.study.audit.operation_counts import operation_counts
 from jaxvib.study.audit.variants import Variant, possible_variants, present_variants
 
 SCENE = jv.Scene(
@@ -120,8 +120,8 @@ def test_the_command_prints_what_the_function_gives(found, capsys, tmp_path):
     np.testing.assert_allclose(document["effects"][0]["amplitude"], found.effects[0].amplitude, rtol=1e-9)
     assert command(["audit"]) == 2 and "SCENE is missing" in capsys.readouterr().err
     assert command(["audit", str(path), "--accuracy", "2"]) == 2 and "accuracy is 2" in capsys.readouterr().err
-    assert command(["audit", "--prices", "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["prices"]) > 20
+    assert command(["audit", "--operations", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["operations"]) > 20
 
 
 def program(scene):
@@ -153,7 +153,7 @@ def test_scene_without_an_effect_traces_the_same_program(scene):
 
 
 def test_every_part_has_a_price_and_none_if_absent():
-    rows = {(row.part, row.kind): row for row in prices()}
+    rows = {(row.part, row.kind): row for row in operation_counts()}
     assert {kind for part, kind in rows if part == "effect"} == set(EFFECTS)
     assert {kind for part, kind in rows if part == "drive"} == set(DRIVES)
     bare = rows["machine", "one_mass"]
@@ -206,8 +206,8 @@ def test_a_number_advises_what_computing_its_effect_came_to():
     def effect(advice, kind="gravity"):
         return EffectRow(kind, False, "exact orbit", *[math.nan] * 5, 0, math.nan, math.nan, advice, "")
 
-    assert _as_computed(row, [effect("negligible")]).advice == "negligible"
-    assert _as_computed(row, [effect("cannot tell"), effect("negligible", "stop")]) == row
+    assert _with_computed_advice(row, [effect("negligible")]).advice == "negligible"
+    assert _with_computed_advice(row, [effect("cannot tell"), effect("negligible", "stop")]) == row
 
 
 class Answers:
@@ -216,7 +216,7 @@ class Answers:
     def __init__(self, **by_kind):
         self.by_kind = by_kind
 
-    def can(self, scene):
+    def has_exact_orbit(self, scene):
         return True
 
     def exact(self, scene):
@@ -226,34 +226,34 @@ class Answers:
 @pytest.mark.parametrize(
     ("without", "present", "advice"),
     [
-        (Values("jam", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "negligible"),
-        (Values("jam", 10.0, (1.009,), 5.0, 20.0, 1e-9), True, "negligible"),
-        (Values("jam", 10.0, (1.011,), 5.0, 20.0, 1e-9), True, "needed"),
-        (Values("jam", 10.0, (1.0,), 5.0, 20.3, 1e-9), True, "needed"),
-        (Values("jam", 10.0, (1.011,), 5.0, 20.0, 1e-9), False, "perhaps needed"),
-        (Values("jam", 10.0, (1.009,), 5.0, 20.0, 2e-3), True, "cannot tell"),
-        (Values("jam", 10.0, (math.nan,), math.nan, math.nan, math.nan), True, "cannot tell"),
-        (Values("no jam", math.nan, (math.nan,), math.nan, math.nan, math.nan), True, "needed"),
-        (Values("balanced", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "needed"),
-        (Values("unsettled", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "cannot tell"),
-        (Values("jam", 10.0, (1.0003,), 5.0, 20.0, 1e-9, remark="coarse"), True, "negligible"),
-        (Values("jam", 10.0, (1.0003,), 5.0, 20.0, 1e-9, remark="at_fold"), False, "negligible"),
-        (Values("unsettled", 10.0, (1.2,), 5.0, 20.0, 0.05), True, "needed"),
+        (MotionValues("jam", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "negligible"),
+        (MotionValues("jam", 10.0, (1.009,), 5.0, 20.0, 1e-9), True, "negligible"),
+        (MotionValues("jam", 10.0, (1.011,), 5.0, 20.0, 1e-9), True, "needed"),
+        (MotionValues("jam", 10.0, (1.0,), 5.0, 20.3, 1e-9), True, "needed"),
+        (MotionValues("jam", 10.0, (1.011,), 5.0, 20.0, 1e-9), False, "perhaps needed"),
+        (MotionValues("jam", 10.0, (1.009,), 5.0, 20.0, 2e-3), True, "cannot tell"),
+        (MotionValues("jam", 10.0, (math.nan,), math.nan, math.nan, math.nan), True, "cannot tell"),
+        (MotionValues("no jam", math.nan, (math.nan,), math.nan, math.nan, math.nan), True, "needed"),
+        (MotionValues("balanced", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "needed"),
+        (MotionValues("unsettled", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "cannot tell"),
+        (MotionValues("jam", 10.0, (1.0003,), 5.0, 20.0, 1e-9, remark="coarse"), True, "negligible"),
+        (MotionValues("jam", 10.0, (1.0003,), 5.0, 20.0, 1e-9, remark="at_fold"), False, "negligible"),
+        (MotionValues("unsettled", 10.0, (1.2,), 5.0, 20.0, 0.05), True, "needed"),
     ],
 )
 def test_advice(without, present, advice):
-    own = Values("jam", 10.0, (1.0,), 5.0, 20.0, 1e-9)
+    own = MotionValues("jam", 10.0, (1.0,), 5.0, 20.0, 1e-9)
     if present:
         ask, scene, variant = Answers(with_=own, without=without), SCENE, Variant("gravity", True, BARE)
     else:
         ask, scene, variant = Answers(with_=without, without=own), BARE, Variant("gravity", False, SCENE)
-    assert effect_row(RepeatedQuestion(ask, 0), scene, variant, 0.01).advice == advice
+    assert effect_row(RepeatedComparison(ask, 0), scene, variant, 0.01).advice == advice
 
 
 def test_a_balanced_machine_is_judged_by_what_its_loads_could_do():
-    still = Values("balanced", 10.0, (1e-12,), 1e-10, math.nan, 1e-9, magnified=1e9)
+    still = MotionValues("balanced", 10.0, (1e-12,), 1e-10, math.nan, 1e-9, magnified=1e9)
     moved = still._replace(amplitude=(3e-12,), uncertainty=1e-7)
-    row = effect_row(RepeatedQuestion(Answers(with_=still, without=moved), 0), SCENE, Variant("gravity", True, BARE), 0.01)
+    row = effect_row(RepeatedComparison(Answers(with_=still, without=moved), 0), SCENE, Variant("gravity", True, BARE), 0.01)
     np.testing.assert_allclose([row.amplitude, row.foundation_force, row.uncertainty], [-2e-9, 0.0, 3e-7 + 1e-9], rtol=1e-12)
     assert row.advice == "negligible"
 
@@ -280,7 +280,7 @@ def test_gravity_in_the_radial_load_follows_the_paper():
 
 
 def test_numbers_are_those_of_the_equations():
-    values = Values("jam", 27.0, (2e-3,), 600.0, math.nan, 1e-9)
+    values = MotionValues("jam", 27.0, (2e-3,), 600.0, math.nan, 1e-9)
     heavy = jv.balls(count=5, mass=1.0, radius=0.1, drag=0.5)
     scene = jv.Scene(SCENE.machine, heavy, SCENE.drive)
     rows = {row.name.partition(":")[0]: row for row in dimensionless_numbers(scene, values, 0.01)}
@@ -307,22 +307,22 @@ def test_numbers_are_those_of_the_equations():
 
 def test_bearing_friction_is_that_of_the_effect():
     scene = jv.Scene(SCENE.machine, PENDULUMS, SCENE.drive)
-    values = Values("jam", 27.0, (2e-3,), 600.0, math.nan, 1e-9)
+    values = MotionValues("jam", 27.0, (2e-3,), 600.0, math.nan, 1e-9)
     (row,) = [row for row in dimensionless_numbers(scene, values, 0.01) if row.name.startswith("bearing")]
-    usual = jv.DryFriction.typical(scene.machine, PENDULUMS, scene.drive.speed, jnp.zeros(1)).effect
-    friction = usual.friction(PENDULUMS, (jnp.zeros(4),), (jnp.full(4, 27.0),), scene.drive.speed, {})
+    of_arguments = jv.DryFriction.typical(scene.machine, PENDULUMS, scene.drive.speed, jnp.zeros(1)).effect
+    friction = of_arguments.friction(PENDULUMS, (jnp.zeros(4),), (jnp.full(4, 27.0),), scene.drive.speed, {})
     drag = 4 * 0.14 * 0.08**2 * (60.0 - 27.0)
     np.testing.assert_allclose(row.value, float(jnp.sum(friction.lever * friction.reaction)) / drag, rtol=1e-9)
 
 
 def test_a_run_is_asked_for_where_there_is_no_jam():
-    question = RunQuestion.usual(ROTOR, None, None)
+    question = RunComparison.of_arguments(ROTOR, None, None)
     assert question.start == "rest" and question.until > 2.0 * 460.0 / 230.0
-    assert not question.can(ROTOR) and admitted(ROTOR).effects == ()
+    assert not question.has_exact_orbit(ROTOR) and without_excluded_effects(ROTOR).effects == ()
     slower = eqx.tree_at(lambda s: s.drive.speed, BARE, 20.0)
-    assert np.all(np.isnan(JamQuestion(3).state(slower).displacement))  # no jam there, and no error
-    turning = RunQuestion.usual(SCENE, 3.0, None)
-    assert turning == RunQuestion(3.0, "turning") and float(turning.state(SCENE).rate[0][0]) == 60.0
+    assert np.all(np.isnan(JamComparison(3).state(slower).displacement))  # no jam there, and no error
+    turning = RunComparison.of_arguments(SCENE, 3.0, None)
+    assert turning == RunComparison(3.0, "turning") and float(turning.state(SCENE).rate[0][0]) == 60.0
 
 
 @pytest.mark.parametrize(
@@ -331,7 +331,7 @@ def test_a_run_is_asked_for_where_there_is_no_jam():
         ({"accuracy": 0.0}, "accuracy is 0.0; it must be a number between 0 and 1"),
         ({"accuracy": True}, "accuracy is True"),
         ({"start": "here"}, "start is 'here'; it must be 'rest', 'turning' or a State"),
-        ({"start": "rest", "mode": 1}, "mode is 1, which goes without a start"),
+        ({"start": "rest", "mode": 1}, "mode is 1, but start selects a run"),
         ({"possible": ("gravity",)}, r"possible\[0\] is 'gravity'; it must be an Effect"),
         ({"repeats": -1}, "repeats is -1"),
         ({"mode": 9}, "mode is 9; this machine's jam modes are numbered 1 to 3"),
@@ -359,7 +359,7 @@ def test_every_variant_starts_from_a_state_that_it_takes(kind):
     given = jv.initial_state(spinning[0] if spinning else scene)
     for start in ("turning", "rest", given):
         for each in (scene, *(variant.scene for variant in variants)):
-            state = RunQuestion(1.0, start).state(each)
+            state = RunComparison(1.0, start).state(each)
             jax.eval_shape(jv.vector_field(each), jnp.zeros(()), state)
 
 
@@ -376,6 +376,6 @@ def test_a_status_of_the_computation_is_no_kind_of_motion(status, kind, words, m
         changed = member(jv.OrbitStatus, status)
         return eqx.tree_at(lambda o: o.status, jv.jam_orbit(scene, mode=1), changed)
 
-    monkeypatch.setattr("jaxvib.study.audit.questions.jam_orbit", orbit)
-    found = JamQuestion(1).exact(BARE)
+    monkeypatch.setattr("jaxvib.study.audit.comparisons.jam_orbit", orbit)
+    found = JamComparison(1).exact(BARE)
     assert (found.kind, found.words) == (kind, words)

@@ -1,4 +1,4 @@
-"""The questions by which two scenes are compared: a jam, or where a motion in time comes to."""
+"""Motions by which two scenes are compared: a jam, or the end of a run."""
 
 from __future__ import annotations
 
@@ -27,32 +27,41 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.search import branch_at
 from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 
-__all__ = ["LEAST", "JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]
+__all__ = [
+    "MIN_AMPLITUDE_SHARE",
+    "JamComparison",
+    "MotionValues",
+    "RunComparison",
+    "fold_speed",
+    "mean_torque",
+    "turning_state",
+    "without_excluded_effects",
+]
 
-_ROUNDING = 1e-9
+_MIN_UNCERTAINTY = 1e-9
 
-_WINDOW = 100
-"""Slow periods over which the end of a run is measured: an imbalance and jammed loads beat."""
+_WINDOW_PERIODS = 100
+"""Slow periods of the measuring window at the end of a run, which must cover the beat of an imbalance with jammed loads."""
 
-LEAST = 0.01
-"""Amplitudes below this share of the loads' unbalance radius S/M, such as a balanced rotor's, are judged relative to that."""
+MIN_AMPLITUDE_SHARE = 0.01
+"""Smallest scale of amplitudes, as a share of the unbalance radius S/M of the loads; a balanced rotor has less."""
 
-_GRID = 100
-"""Load speeds among which an exact fold is looked for at once."""
+_GRID_SPEEDS = 100
+"""Number of load speeds in a grid on which an exact fold is bracketed."""
 
 
-class Values(NamedTuple):
-    """Numbers and words by which a motion is judged.
+class MotionValues(NamedTuple):
+    """Values of a motion that are compared.
 
     **Attributes**
 
-    - `kind`: words that differ if the motions do; `remark`: on the computation alone
+    - `kind`: text that differs for different kinds of motion; `remark` on the computation
     - `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad; `foundation_force` N
-    - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or none is asked for
-    - `uncertainty`: relative, below which nothing of this can be told
-    - `closest`: the least distance of two loads in units of their diameter, NaN if they have none or are treated as coincident
-    - `magnified`: changes are relative to so many times these amplitudes and this force, more than 1 if the machine hardly
-      moves, see `LEAST`
+    - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
+    - `uncertainty`: relative uncertainty of these values
+    - `closest`: smallest distance of two loads in units of their diameter, NaN for points and for coincident loads
+    - `magnified`: factor on these amplitudes and this force in relative changes, more than 1 if the machine hardly moves, see
+      `MIN_AMPLITUDE_SHARE`
     """
 
     kind: str
@@ -71,61 +80,61 @@ class Values(NamedTuple):
         return f"{self.kind} ({self.remark})" if self.remark else self.kind
 
 
-class JamQuestion(NamedTuple):
-    """The jam `mode`: exactly, or where that is refused as the motion settles to from near it."""
+class JamComparison(NamedTuple):
+    """Comparison by the jam `mode`: by its exact orbit, or by a run from near it if the theory refuses the scene."""
 
     mode: int
 
-    def can(self, scene: Scene) -> bool:
-        """True if the exact orbit answers."""
+    def has_exact_orbit(self, scene: Scene) -> bool:
+        """True if the theory of exact orbits includes the scene."""
         try:
             require_coincident(scene)
         except InputError:
             return False
         return True
 
-    def exact(self, scene: Scene) -> Values:
-        """Values of the exact orbit; NaN, and a kind that says so, if there is no such jam."""
+    def exact(self, scene: Scene) -> MotionValues:
+        """MotionValues of the exact orbit; NaN, and a kind that says so, if there is no such jam."""
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
         there = bool(np.isfinite(orbit.omega))
         kind = f"jam mode {self.mode}, {orbit.judgement}" if there else f"no jam mode {self.mode}"
-        # Loads that nothing holds together move in another way; other statuses tell of the computation alone.
+        # Loads that would separate have another motion; the other statuses concern the computation only.
         if there and bool(orbit.status == OrbitStatus.would_separate):
             kind = f"{kind}, but the loads part"
         computed = not there or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)
-        return Values(
+        return MotionValues(
             kind,
             float(orbit.omega),
             tuple(np.abs(np.asarray(orbit.amplitude)).tolist()),
             float(orbit.foundation_force),
-            fold_speed(admitted(scene), float(orbit.omega)),
-            max(float(orbit.error), _ROUNDING) if there else math.nan,
+            fold_speed(without_excluded_effects(scene), float(orbit.omega)),
+            max(float(orbit.error), _MIN_UNCERTAINTY) if there else math.nan,
             remark="" if computed else status_name(orbit.status),
         )
 
     def state(self, scene: Scene) -> State:
         """State on the exact jam without the parts that theories of jams leave out, with separated loads; NaN without a jam."""
         n = scene.loads.count
-        orbit = jam_orbit(admitted(scene), mode=self.mode, throw=False)
+        orbit = jam_orbit(without_excluded_effects(scene), mode=self.mode, throw=False)
         displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
         spread = START_SEPARATION * jnp.asarray(np.arange(n) - 0.5 * (n - 1))
         return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
-    def full(self, scene: Scene) -> Values:
-        """Values of the full equations, from near the exact jam until they are settled."""
+    def full(self, scene: Scene) -> MotionValues:
+        """MotionValues of the full equations, from near the exact jam until they are settled."""
         run = settle(scene, start=self.state(scene), throw=False)
-        return _read(scene, run, fold_speed(admitted(scene), float(run.omega)))
+        return _read(scene, run, fold_speed(without_excluded_effects(scene), float(run.omega)))
 
 
-class RunQuestion(NamedTuple):
-    """Question about the end `until` (s) of a run from `start`: "rest", "turning" with the rotor, loads evenly spread, or a
+class RunComparison(NamedTuple):
+    """Comparison by the end, `until` s, of a run from `start`: "rest", "turning" (evenly spread loads at the rotor speed), or a
     state."""
 
     until: float
     start: Literal["rest", "turning"] | State
 
     def state(self, scene: Scene) -> State:
-        """The state that `scene` starts from, the loads' own rotation as far as its effects make it free."""
+        """Initial state of `scene`, with the loads' own rotation if its effects make it free."""
         if isinstance(self.start, State):
             with contextlib.suppress(InputError):  # the state is of a scene with another effect
                 return with_spin(scene, self.start)
@@ -134,41 +143,41 @@ class RunQuestion(NamedTuple):
             return turning_state(scene)
         return initial_state(scene, "rest")
 
-    def can(self, scene: Scene) -> bool:
-        """No: there is no exact orbit to ask for."""
+    def has_exact_orbit(self, scene: Scene) -> bool:
+        """False: a run has no exact orbit."""
         return False
 
-    def exact(self, scene: Scene) -> Values:
-        """None of these."""
+    def exact(self, scene: Scene) -> MotionValues:
+        """Never called."""
         raise NotImplementedError
 
-    def full(self, scene: Scene) -> Values:
-        """Values of the full equations."""
+    def full(self, scene: Scene) -> MotionValues:
+        """MotionValues of the full equations."""
         start = self.state(scene)
-        run = simulate(scene, self.until, start=start, save="window", turns=_WINDOW, estimate=False, throw=False)
+        run = simulate(scene, self.until, start=start, save="window", turns=_WINDOW_PERIODS, estimate=False, throw=False)
         return _read(scene, run, math.nan)
 
     @classmethod
-    def usual(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunQuestion:
-        """The run that is asked for; where its end is not named, `SLOW_PERIODS` slow periods after the drive's last jump."""
+    def of_arguments(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunComparison:
+        """Comparison by a run; default of its end: `SLOW_PERIODS` slow periods after the last jump of the drive."""
         if start is None:
             start = "turning" if scene.drive.constant else "rest"
         elif isinstance(start, State):
-            start = with_spin(scene, start)  # raises now what `state` would take for the spin of another scene
+            start = with_spin(scene, start)  # raises an error for a wrong spin, which `state` would replace
         if until is None:
             jumps = [float(t) for t in scene.drive.jump_ts()]
             until = 2.0 * max(jumps, default=0.0) + 5.0 * SLOW_PERIODS * slow_period(scene)
         return cls(until, start)
 
 
-def admitted(scene: Scene) -> Scene:
-    """The scene without the effects that theories of jams leave out, an imbalance among them: it shakes at another speed."""
+def without_excluded_effects(scene: Scene) -> Scene:
+    """Copy of the scene without the effects that theories of jams exclude, such as imbalance, which acts at another speed."""
     kept = tuple(e for e in scene.effects if all(isinstance(term, COINCIDENT_TERMS) for term in e.terms()))
     return scene if len(kept) == len(scene.effects) else Scene(scene.machine, scene.loads, scene.drive, kept)
 
 
 def turning_state(scene: Scene) -> State:
-    """The carrier at rest, the loads evenly spread and as fast as the rotor."""
+    """State with the carrier at rest and evenly spread loads at the rotor speed."""
     first, *others = scene.loads.rest()
     n, still = scene.loads.count, jnp.zeros(scene.machine.structure().mass.shape[:1])
     zero = jnp.zeros((n,))
@@ -179,7 +188,7 @@ def turning_state(scene: Scene) -> State:
 
 
 def mean_torque(scene: Scene, omega: float) -> float:
-    """Mean torque that the rotor puts into loads which turn at `omega` on the average, N m: that of drag, without friction."""
+    """Mean torque of the rotor on loads with the mean speed `omega`, N m, by drag alone."""
     n = scene.loads.count
     u = scene.loads.rest()
     rate = (jnp.full((n,), omega), *(jnp.zeros((n,)) for _ in u[1:]))
@@ -188,8 +197,8 @@ def mean_torque(scene: Scene, omega: float) -> float:
 
 
 def fold_speed(scene: Scene, omega: float) -> float:
-    """The rotor speed, rad/s, at which the exact jam at load speed `omega` ends: at the fold next above it along the branch, or
-    below it where there is none above; NaN where the branch has none there, or theories of jams refuse the scene."""
+    """Rotor speed, rad/s, of the fold at which the exact jam with load speed `omega` ends: the next fold above it on the
+    branch, otherwise the next below. NaN if there is none, or if theories of jams refuse the scene."""
     try:
         folds = jam_modes(scene).folds
     except InputError:
@@ -201,7 +210,7 @@ def fold_speed(scene: Scene, omega: float) -> float:
     near = float(above[0]) if above.size else float(below[-1])
     low, high, found = 0.97 * near, 1.03 * near, math.nan
     for _ in range(2):
-        grid = np.linspace(low, high, _GRID)
+        grid = np.linspace(low, high, _GRID_SPEEDS)
         speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(grid)[None]))
         turns = np.flatnonzero((slope[1:] > 0.0) != (slope[:-1] > 0.0))
         turns = turns[np.isfinite(slope[turns]) & np.isfinite(slope[turns + 1])]
@@ -213,22 +222,22 @@ def fold_speed(scene: Scene, omega: float) -> float:
     return found
 
 
-def _read(scene: Scene, run: Run, fold: float) -> Values:
+def _read(scene: Scene, run: Run, fold: float) -> MotionValues:
     ended = bool(run.finished)
     kind = status_name(run.regime.name) if ended else f"failed: {status_name(run.status)}"
     drift, amplitude = float(run.drift), np.asarray(run.amplitude)
     moved = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
     unit = float(natural_units(scene).displacement)
-    magnified = max(1.0, LEAST * unit / moved) if moved > 0.0 else 1.0
-    # The drift is relative to no less than another share of the unit.
-    drift *= max(moved, measure.LEAST * unit) / max(moved, LEAST * unit)
-    return Values(
+    magnified = max(1.0, MIN_AMPLITUDE_SHARE * unit / moved) if moved > 0.0 else 1.0
+    # The drift was measured relative to a scale with another lower limit.
+    drift *= max(moved, measure.LEAST * unit) / max(moved, MIN_AMPLITUDE_SHARE * unit)
+    return MotionValues(
         kind,
         float(run.omega),
         tuple(amplitude.tolist()),
         float(run.foundation_force),
         fold,
-        max(drift, _ROUNDING) if np.isfinite(drift) else math.nan,
+        max(drift, _MIN_UNCERTAINTY) if np.isfinite(drift) else math.nan,
         _closest(scene, run),
         magnified,
     )

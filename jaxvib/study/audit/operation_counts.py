@@ -19,14 +19,17 @@ from jaxvib.machine.torus import torus_balls
 from jaxvib.study.audit.compared import field_operations
 from jaxvib.units import Numbers
 
-__all__ = ["PriceRow", "prices"]
+__all__ = ["OperationCount", "operation_counts"]
 
 T = TypeVar("T")
 
 
-class PriceRow(NamedTuple):
-    """`part` of a scene ("effect", "drive", "machine", "loads") and its `kind`; `operations` of the equations of motion with
-    it, how many are `added` to those of the scene `beside` it."""
+class OperationCount(NamedTuple):
+    """Operations of the equations of motion with a part.
+
+    **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations` with it; `added`: difference to
+    the scene `beside` without it.
+    """
 
     part: str
     kind: str
@@ -35,13 +38,13 @@ class PriceRow(NamedTuple):
     beside: str
 
 
-def prices() -> list[PriceRow]:
-    """The operations that each effect, each drive, each coordinate of a machine and of a load adds to the equations of motion.
+def operation_counts() -> list[OperationCount]:
+    """Count the operations that each effect, drive, machine and kind of loads adds to the equations of motion.
 
-    Of a platform with a ball at constant speed; an effect that does not go with it stands in the simplest scene of the others
-    with which it goes. Numbers do not count, operations hold for any. **Returns** a list of `PriceRow`.
+    The scene is a platform with a ball at constant speed. An effect that this scene cannot have is counted in the simplest
+    scene that can have it. The counts do not depend on the numbers of the scene. **Returns** a list of `OperationCount`.
 
-    >>> rows = prices()
+    >>> rows = operation_counts()
     >>> [row.added for row in rows if row.kind == "constant_speed"], min(row.added for row in rows if row.part == "effect") > 0
     ([0], True)
 
@@ -74,10 +77,10 @@ def prices() -> list[PriceRow]:
     }
     constant = ConstantSpeed(1.0)
 
-    def row(part: str, kind: str, scene: Scene, beside: Scene) -> PriceRow:
+    def row(part: str, kind: str, scene: Scene, beside: Scene) -> OperationCount:
         whole, base = field_operations(scene), field_operations(beside)
         name = f"{beside.machine.kind}, {beside.loads.kind}, {beside.drive.kind}"
-        return PriceRow(part, kind, whole, whole - base, name)
+        return OperationCount(part, kind, whole, whole - base, name)
 
     platform, planar = (Scene(machines[kind], loads["ball"], constant) for kind in ("one_mass", "planar_rotor"))
     found = [
@@ -90,14 +93,14 @@ def prices() -> list[PriceRow]:
     hosts = [Scene(machines[m], each, constant) for m in ("one_mass", "rotor, loads at one station") for each in loads.values()]
     for kind, effect in EFFECTS.items():
         for host in hosts:
-            with contextlib.suppress(InputError):  # it does not go with this machine or these loads
+            with contextlib.suppress(InputError):  # this machine or these loads cannot have the effect
                 found.append(row("effect", kind, Scene(host.machine, host.loads, constant, (_made(effect),)), host))
                 break
     return found
 
 
 def _made(build: Callable[..., T]) -> T:
-    """An effect or a drive with 0.5 for each number that it needs."""
+    """Build an effect or a drive with 0.5 for each required number."""
     parameters = inspect.signature(build).parameters.values()
     return build(**{each.name: 0.5 for each in parameters if each.default is each.empty})
 
