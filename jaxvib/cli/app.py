@@ -104,6 +104,7 @@ _GROUPS = {
         "identify": "study.identify",
     },
     "What an answer is worth": {"cost": "study.cost", "audit": "study.audit"},
+    "Other tools": {"export": "export"},
 }
 """The commands by what they are for, each with the module of `jaxvib.cli` that holds it."""
 

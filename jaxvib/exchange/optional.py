@@ -17,7 +17,7 @@ def optional_module(name: str, extra: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition(".")[0]
-        raise InputError(package, f"is not installed; install it with: pip install 'jaxvib[{extra}]'") from error
+        raise InputError(package, f"is not installed; install it with: pip install '.[{extra}]'") from error
 
 
 def require_writable(path: Path) -> None:

@@ -227,5 +227,5 @@ def test_missing_packages_are_named(package, tmp_path, monkeypatch):
         "control": lambda: jv.state_space(scene()).control(),
         "scipy.io": lambda: jv.state_space(scene()).save(tmp_path / "m"),
     }
-    with pytest.raises(jv.InputError, match=r"is not installed; install it with: pip install 'jaxvib\["):
+    with pytest.raises(jv.InputError, match=r"is not installed; install it with: pip install '\.\["):
         calls[package]()

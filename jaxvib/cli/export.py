@@ -1,0 +1,51 @@
+"""jaxvib export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, loaded_scene
+from jaxvib.errors import InputError
+
+_KINDS = ("fmu", "state-space", "uff")
+_ONLY = {"fmi": "fmu", "drive": "fmu", "source_only": "fmu", "mode": "state-space", "quantity": "uff", "rotor_speed": None}
+"""Options that go with one kind of file; None: with all but fmu."""
+
+
+@app.command("export")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--to", type=click.Choice(_KINDS), required=True, help="Kind of file.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="The file that is written.")
+@click.option("--fmi", type=click.Choice(["2.0", "3.0"]), help="Version of an FMU [2.0].")
+@click.option("--drive", type=click.Choice(["scene", "input"]), help="What turns the rotor of an FMU [the drive of SCENE].")
+@click.option("--source-only", is_flag=True, default=None, help="Do not compile an FMU.")
+@click.option("--mode", type=int, help="Jam mode whose state space is written [the machine at rest].")
+@click.option(
+    "--quantity", type=click.Choice(["displacement", "velocity", "acceleration"]), help="Responses in UFF [displacement]."
+)
+@click.option("--rotor-speed", help="Rotor speed of a machine at rest, such as '3000 rpm' [the drive's].")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout, nothing else.")
+def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) -> None:
+    """Write SCENE for other tools: an FMU, a state-space model (MAT) or a universal file (UFF)."""
+    given = {name: value for name, value in options.items() if value is not None}
+    for name, value in given.items():
+        if to not in ([_ONLY[name]] if _ONLY[name] else ["state-space", "uff"]):
+            raise InputError(f"--{name.replace('_', '-')}", f"is {value}, which does not go with --to {to}; leave it out")
+    loaded, output = loaded_scene(scene), Output(as_json, None, scene=scene)
+    if to == "fmu":
+        source_only = bool(given.pop("source_only", False))
+        unit = jv.export_fmu(loaded, out, binary=not source_only, **given)  # pyright: ignore[reportArgumentType]
+        path, message = unit.path, unit.message
+    elif to == "uff":
+        path = jv.export_uff(loaded, out, **given)  # pyright: ignore[reportArgumentType]
+        message = f"{len(jv.read_uff(path).functions)} frequency response functions, nodes and natural motions"
+    else:
+        mode = given.pop("mode", None)
+        at = "rest" if mode is None else jv.jam_modes(loaded).select(mode)  # pyright: ignore[reportArgumentType]
+        model = jv.state_space(loaded, at, **given)  # pyright: ignore[reportArgumentType]
+        path, message = model.save(out), model.about
+    output.files.append(str(path))
+    output.done({"kind": to, "path": str(path), "message": message}, lambda: message, "export")
