@@ -1,7 +1,9 @@
 """Axes, samples and the grid of cases."""
 
+import dataclasses
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import scene
@@ -70,7 +72,8 @@ def test_numbers_go_where_their_names_say():
     names = ["machine.stiffness[1]", "loads.drag", "start.rate[2]", "start.angle", "start.velocity"]
     spots = [axis_of(given, name, [1.0, 2.0]).spot for name in names]
     values = np.array([7e4, 2.5, 30.0, 0.4, -0.1])
-    put_in, state = put(given, spots, values), put_start(jv.initial_state(given), spots, values)
+    moving = dataclasses.replace(jv.initial_state(given), velocity=jnp.asarray([0.3, 0.7]))
+    put_in, state = put(given, spots, values), put_start(moving, spots, values)
     assert put_in.machine.stiffness.tolist() == [5e4, 7e4] and float(put_in.loads.drag) == 2.5
     assert state.rate[0].tolist() == [0.0, 0.0, 30.0] and np.allclose(state.angle[0], 0.4 + np.deg2rad([-1.0, 0.0, 1.0]))
     assert state.velocity.tolist() == [-0.1, -0.1] and state.displacement.tolist() == [0.0, 0.0]
