@@ -86,3 +86,9 @@ def test_operations_that_no_result_needs_are_left_out(monkeypatch):
     np.testing.assert_allclose(jax.vjp(few, x)[1]([x, x])[0], slope, rtol=1e-15)
     monkeypatch.setattr(counted, "HAS_JAXPRS", False)
     assert counted.pruned(two, x)(x) == two(x)
+
+
+def test_an_operation_with_one_needed_result_stays():
+    pair = jnp.asarray([3.0, 1.0])
+    (found,) = counted.pruned(lambda x: [jax.lax.sort((x, -x), num_keys=1)[1]], pair)(pair)
+    assert found.tolist() == [-1.0, -3.0]

@@ -89,9 +89,10 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         return _find(problem, options, tell)
     if first.interrupted:
         options = replace(options, iterations=0, polishing=0)
-    random = np.random.default_rng(options.seed).uniform(size=(2 * _STARTS_PER_BOUND, problem.space.size))
-    begin = np.concatenate([_few(first), random])[: 2 * _STARTS_PER_BOUND if _spread(problem) else _STARTS_PER_BOUND]
-    if not _spread(problem):  # its best machines are near those to leading order
+    if _spread(problem):
+        random = np.random.default_rng(options.seed).uniform(size=(2 * _STARTS_PER_BOUND, problem.space.size))
+        begin = np.concatenate([_few(first), random])[: 2 * _STARTS_PER_BOUND]
+    else:  # its best machines are near those to leading order
         begin, options = _few(first), replace(options, iterations=0, polishing=max(options.polishing, 20))
     narrow = _with_lanes(problem, problem.space)
     if len(begin) == 0:

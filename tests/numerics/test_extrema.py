@@ -37,6 +37,20 @@ def test_each_half_has_its_own_and_the_whole_the_better_of_both():
     np.testing.assert_allclose(jax.vmap(jax.vmap(extremum_value))(x, v, place), [low, high], rtol=1e-13)
 
 
+@pytest.mark.parametrize("a", [0.0, 0.3])
+def test_second_derivatives_follow_the_place_of_an_extremum(a):
+    """Closed form: cos(s) + a sin(s) is at most sqrt(1 + a^2), at s = atan(a)."""
+    step, first = 2.0 * np.pi / 64.0, np.arctan(a) - 0.13
+    s = first + step * np.arange(4.0)
+
+    def height(a):
+        x, v = jnp.cos(s) + a * jnp.sin(s), step * (a * jnp.cos(s) - jnp.sin(s))
+        return extremum_value(x, v, jnp.asarray(0.13 / step))
+
+    found = [height(a), jax.grad(height)(a), jax.grad(jax.grad(height))(a)]
+    np.testing.assert_allclose(found, [(1.0 + a**2) ** 0.5, a * (1.0 + a**2) ** -0.5, (1.0 + a**2) ** -1.5], atol=1e-9)
+
+
 def test_at_the_ends_the_outermost_samples_count():
     x = jnp.asarray([0.0, 1.0, 2.0, 3.0])
     (low, high), first, place = locate_extrema(x, jnp.ones(4))
