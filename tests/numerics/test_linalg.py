@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.linalg import eigenvalues_in_turn, hermitian_modes, relative_to, small_solve, solve_definite
+from jaxvib.numerics.linalg import (
+    eigenvalues_in_turn,
+    hermitian_error,
+    hermitian_modes,
+    relative_to,
+    small_inverse,
+    small_solve,
+    solve_definite,
+)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 17])
@@ -17,6 +25,24 @@ def test_small_solve_is_numpys(n):
         a = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
         b = rng.normal(size=n) + 1j * rng.normal(size=n)
         np.testing.assert_allclose(small_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-11)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_many_small_systems_written_out_are_numpys(n):
+    """The first entry is 0 in one of three systems: its rows must be swapped."""
+    rng = np.random.default_rng(n)
+    a, b = rng.normal(size=(3, n, n)), rng.normal(size=(3, n))
+    a[0, 0, 0] = 0.0 if n > 1 else a[0, 0, 0]
+    x = small_inverse([[jnp.asarray(a[:, i, j]) for j in range(n)] for i in range(n)])(tuple(jnp.asarray(b.T)))
+    np.testing.assert_allclose(np.stack(x, axis=1), np.linalg.solve(a, b[..., None])[..., 0], rtol=1e-10)
+
+
+def test_errors_of_eigenvalues_are_those_of_rayleighs_quotient():
+    """4 (1 + 1e-3), and 1 of a shape that is off by 1e-3 towards that of 4: (1 + 4e-6)/(1 + 1e-6) - 1."""
+    pencil = jnp.diag(jnp.asarray([2.0, 8.0, 0.0])), 2.0 * jnp.eye(3)
+    shapes = jnp.asarray([[1.0, 0.0, 0.0], [1e-3, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    found = hermitian_error(pencil, jnp.asarray([1.0, 4.004, 0.0]), shapes)
+    np.testing.assert_allclose(found, [3e-6, 0.004 / 4.004, np.inf], rtol=1e-5)
 
 
 def _called(function):
