@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -219,49 +221,11 @@ def _judged(
     structure, chance = _structure(record.time[used], left, turns, len(values))
     correlation = float(covariance[4, 5] / (errors[4] * errors[5])) if dry is not None else math.nan
 
-    decrement, notes = None, []
-    if turns.amplitude.size > 20:
-        decrement = ten_periods(pendulum, record, instrument=instrument, turns=turns)
-        if dry is None and decrement.drift > 4.0:
-            notes.append("the swing decays faster the smaller it is, as by dry friction: ask for mu2 as well")
-        elif decrement.drift < -4.0:
-            notes.append("the swing decays slower the smaller it is, as by the drag of air: mu1 is too large")
-    small = float(pendulum.frequency)
-    if abs(frequency.value / small - 1.0) > 0.02:
-        wanted = f"the swing's frequency is {frequency.value:.4g} rad/s, the pendulum's length and inertia give {small:.4g}"
-        notes.append(f"{wanted}: mu1 is in proportion to the moment of inertia, check them")
-    for name, estimate in (("mu1", viscous), ("mu2", dry)):
-        if estimate is not None and estimate.low <= 0.0:
-            below = estimate.high < 0.0
-            notes.append(
-                f"{name} is below 0, its whole interval too" if below else f"{name} cannot be told from 0 in this record"
-            )
-    if math.isfinite(stop := float(fit.stopped_at)):
-        notes.append(f"dry friction holds the pendulum from {stop + record.time[0]:.4g} s on")
-
-    if samples < record.samples:
-        notes.append(f"the record after {until:.4g} s is left out: the pendulum rests, or its swing is below the noise")
-
-    structured = float(fit.noise) > 10.0 * TOLERANCE and (abs(pattern) > 4.0 / math.sqrt(samples) or chance < _STRUCTURE)
-    if structured:
-        notes.append("what the fit leaves is no noise: the intervals count noise alone and are too narrow")
-    if decrement is not None and decrement.is_drifting:
-        notes.append("the formula of ten periods is for viscous friction alone: its interval does not hold mu1 here")
-
-    status = IdentifyStatus.found
-    if not bool(fit.converged) or float(fit.noise) > 0.5 * float(np.std(record.angle[used])):
-        status = IdentifyStatus.not_converged
-    elif viscous.high < 0.0 or (dry is not None and dry.high < 0.0):
-        status = IdentifyStatus.negative
-    elif viscous.low <= 0.0 and (dry is None or dry.low <= 0.0):
-        status = IdentifyStatus.undetermined
-    elif abs(frequency.value / small - 1.0) > _CONTRADICTS + instrument:
-        status = IdentifyStatus.contradicted
-    elif structured:
-        status = IdentifyStatus.patterned
-    return Identified(
-        status=status,
-        notes=tuple(notes),
+    is_long = turns.amplitude.size > 20
+    stop = float(fit.stopped_at) + float(record.time[0])
+    found = Identified(
+        status=IdentifyStatus.found,
+        notes=(),
         viscous=viscous,
         dry=dry,
         correlation=correlation,
@@ -275,12 +239,55 @@ def _judged(
         structure=structure,
         until=until,
         fitted=record.angle + np.asarray(fit.residual),
-        stopped_at=stop + float(record.time[0]),
+        stopped_at=stop,
         width=width if dry is not None else math.nan,
-        decrement=decrement,
+        decrement=ten_periods(pendulum, record, instrument=instrument, turns=turns) if is_long else None,
         record=record,
         pendulum=pendulum,
     )
+    is_patterned = abs(pattern) > 4.0 / math.sqrt(samples) or chance < _STRUCTURE
+    is_patterned = is_patterned and found.noise > 10.0 * TOLERANCE
+    has_converged = bool(fit.converged) and found.noise <= 0.5 * float(np.std(record.angle[used]))
+    status = _status(found, has_converged=has_converged, is_patterned=is_patterned, instrument=instrument)
+    return dataclasses.replace(found, status=status, notes=tuple(_notes(found, is_patterned=is_patterned)))
+
+
+def _status(found: Identified, *, has_converged: bool, is_patterned: bool, instrument: float) -> IdentifyStatus:
+    """Return the status of a fit from its intervals."""
+    viscous, dry = found.viscous, found.dry
+    if not has_converged:
+        return IdentifyStatus.not_converged
+    if viscous.high < 0.0 or (dry is not None and dry.high < 0.0):
+        return IdentifyStatus.negative
+    if viscous.low <= 0.0 and (dry is None or dry.low <= 0.0):
+        return IdentifyStatus.undetermined
+    if abs(found.frequency.value / float(found.pendulum.frequency) - 1.0) > _CONTRADICTS + instrument:
+        return IdentifyStatus.contradicted
+    return IdentifyStatus.patterned if is_patterned else IdentifyStatus.found
+
+
+def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
+    """Yield sentences about a fit that a reader should know."""
+    decrement, frequency, small = found.decrement, found.frequency.value, float(found.pendulum.frequency)
+    if decrement is not None and found.dry is None and decrement.drift > 4.0:
+        yield "the swing decays faster the smaller it is, as by dry friction: ask for mu2 as well"
+    elif decrement is not None and decrement.drift < -4.0:
+        yield "the swing decays slower the smaller it is, as by the drag of air: mu1 is too large"
+    if abs(frequency / small - 1.0) > 0.02:
+        differs = f"the swing's frequency is {frequency:.4g} rad/s, the pendulum's length and inertia give {small:.4g}"
+        yield f"{differs}: mu1 is in proportion to the moment of inertia, check them"
+    for name, estimate in (("mu1", found.viscous), ("mu2", found.dry)):
+        if estimate is not None and estimate.low <= 0.0:
+            is_below = estimate.high < 0.0
+            yield f"{name} is below 0, its whole interval too" if is_below else f"{name} cannot be told from 0 in this record"
+    if math.isfinite(found.stopped_at):
+        yield f"dry friction holds the pendulum from {found.stopped_at:.4g} s on"
+    if np.any(found.record.time > found.until):
+        yield f"the record after {found.until:.4g} s is left out: the pendulum rests, or its swing is below the noise"
+    if is_patterned:
+        yield "what the fit leaves is no noise: the intervals count noise alone and are too narrow"
+    if decrement is not None and decrement.is_drifting:
+        yield "the formula of ten periods is for viscous friction alone: its interval does not hold mu1 here"
 
 
 def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:
