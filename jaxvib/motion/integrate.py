@@ -198,6 +198,7 @@ def integrate(
         seconds=unknown,
         scene=scene,
         coincident=_is_coincident(state.azimuth[None]) & _is_coincident(states.azimuth),
+        engine="scalar" if motion.is_scalarized else "array",
     )
 
 

@@ -31,6 +31,12 @@ def test_as_they_are_integrated_the_equations_are_the_same(machine, load, effect
         np.testing.assert_allclose(a[0], b, rtol=1e-12, atol=1e-12 * np.max(np.abs(b)))
 
 
+@pytest.mark.parametrize(("count", "engine"), [(3, "scalar"), (4, "array")])
+def test_runs_name_the_engine_that_integrated_them(count, engine):
+    s = jv.Scene(machines()["two_mass"], jv.balls(count=count, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0))
+    assert eqx.filter_eval_shape(lambda s: jv.simulate(s, 1.0, save="window"), s).engine == engine
+
+
 @pytest.mark.parametrize("name", ["imbalance, spin-up", "imbalance, dc", "supports", "friction, run-up", "contact"])
 def test_equations_are_the_same_on_numbers(name):
     """The equations as they are integrated."""
