@@ -141,3 +141,13 @@ def test_an_equation_with_its_conjugate_is_solved(size):
     x = x[:, 0]
     found = _with_conjugate(jnp.asarray(a), jnp.asarray(b), jnp.asarray(a @ x + b @ np.conj(x)))
     np.testing.assert_allclose(found, x, rtol=1e-12)
+
+
+def test_ripple_of_a_point_mass_is_its_closed_form():
+    """A load m R^2 under m R a cos(2 w t)/2 swings by a/(8 w^2 R); one at rest does not."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
+    field = averaged_field(jv.Scene(machine, jv.pendulums(count=2, mass=0.3, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0)))
+    velocity, w = jnp.asarray([0.03 - 0.04j]), 20.0
+    for rate, swing in ((w, w * 0.05 / (8.0 * w**2 * 0.1)), (0.0, 0.0)):
+        state = Amplitudes(velocity / (1j * w), velocity, jnp.full(2, rate), jnp.zeros(2))
+        np.testing.assert_allclose(field.ripple(state), swing, rtol=1e-12)
