@@ -10,7 +10,7 @@ from scenes import published, scene, some_state
 from stored_jit import stored_jit
 
 import jaxvib as jv
-from jaxvib.motion.analysis.scaled_error import estimated_error
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
 
 
 def test_equal_steps_are_of_order_8():
@@ -79,6 +79,16 @@ def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
     with pytest.raises(jv.ComputationError, match=r"asked for 1\.0e-12") as caught:
         jv.simulate(s, 200.0, **asked)
     assert caught.value.status == "not_accurate"
+
+
+def test_differences_of_states_are_the_same_within_programs():
+    a, b = (
+        jv.State(*(np.asarray([k * x]) for x in (1e-3, 0.2)), (np.asarray([k]),), (np.asarray([50.0 * k]),)) for k in (1.0, 1.5)
+    )
+    unit = jv.State(1e-4, 5e-3, (1.0,), (50.0,))
+    found = scaled_error(a, b, error_scale(b, unit))
+    assert isinstance(found, np.floating) and found == 0.5  # of the angle, rad, and of the speed
+    assert float(jax.jit(lambda a, b: scaled_error(a, b, error_scale(b, unit)))(a, b)) == 0.5
 
 
 @pytest.mark.parametrize(
