@@ -58,10 +58,16 @@ class _Node(NamedTuple):
 class UffFunction(NamedTuple):
     """Function of a universal file.
 
-    **Attributes**: `kind` "history", "response" (frequency response function) or "other"; `x` (n,), s or Hz, and `values` (n,)
-    real or complex, in SI; `quantity` such as "acceleration", "" if the file does not say; `response` and `reference`, the
-    node and the direction (1 to 6 for +X to a turn about +Z, negative for the opposite) of answer and force; `about`, the
-    first line of the file's description.
+    Returned by `read_uff` in `UffFile.functions`.
+
+    **Attributes**
+
+    - `kind`: "history", "response" (frequency response function) or "other"
+    - `x` (n,), s or Hz, and `values` (n,), real or complex, in SI
+    - `quantity` such as "acceleration", "" if the file does not state it
+    - `response` and `reference`: the node and the direction (1 to 6 for +X to a turn about +Z, negative for the opposite) of
+      answer and force
+    - `about`: the first line of the file's description
     """
 
     kind: Literal["history", "response", "other"]
@@ -74,7 +80,10 @@ class UffFunction(NamedTuple):
 
 
 class UffFile(NamedTuple):
-    """Contents of a universal file: `functions`; `nodes`, the position (x, y, z) in m of each node by its number."""
+    """Contents of a universal file: `functions`; `nodes`, the position (x, y, z) in m of each node by its number.
+
+    Returned by `read_uff`.
+    """
 
     functions: tuple[UffFunction, ...]
     nodes: dict[int, tuple[float, float, float]]
@@ -92,19 +101,31 @@ def export_uff(
     """Write a universal file (58, 55, 15, 82, 151, 164) of a scene or of a run.
 
     - Of a `Scene`: frequency response functions of every node to a force at the exciter in each of its directions, one function
-      for each node and direction, at even frequencies; natural motions, undamped (normal modes) for machines that move up
-      and down, with damping at the rotor speed (complex modes, the whirl) for machines that move across and up
+      for each node and direction, at even frequencies; natural motions, undamped (normal modes) for machines that move up and
+      down, with damping at the rotor speed (complex modes, the whirl) for machines that move across and up
     - Of a `Run`: histories of every node and of the force on the foundation (node 0), and the amplitude spectra of its end
 
-    Header, units (SI), nodes and lines come first; programs for modal analysis refuse functions without them.
+    Header, units (SI), nodes and lines come first; programs for modal analysis refuse functions without them. Numbers have 12
+    digits, those of the abscissa and of shapes 6, as the format prescribes.
 
-    **Arguments**: `quantity` of responses and histories; `frequencies`, Hz, evenly spaced (default: 2048 lines up to 1.5
-    times the highest natural frequency); `rotor_speed`, rad/s, as in `state_space`.
+    **Arguments**
+
+    - `source`: a `Scene` or a `Run`
+    - `path` of the file, which is overwritten
+    - `quantity` of responses and histories: "displacement" (the default), "velocity" or "acceleration"
+    - `frequencies`, Hz, evenly spaced; typical: 1000 to 4000 lines up to 50 Hz; default: 2048 lines up to 1.5 times the highest
+      natural frequency
+    - `rotor_speed`, rad/s, as in `state_space`; typical: 0 to 500
 
     **Returns** the path. **Raises** `InputError` for frequencies that are not even or are not positive, for accelerations of a
     run, which keeps none, and for a path that cannot be written to.
 
-    Numbers have 12 digits, those of the abscissa and of shapes 6, as the format prescribes.
+    >>> import pathlib, tempfile, numpy as np, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "machine.uff"
+    >>> jv.export_uff(scene, path, frequencies=np.linspace(0.1, 20.0, 200)).name
+    'machine.uff'
     """
     path = Path(path)
     require_writable(path)
@@ -300,7 +321,17 @@ def read_uff(path: str | Path) -> UffFile:
     Spacing may be even or not, data text or binary, real or complex. Units other than SI are converted by dataset 164; without
     one they are taken as SI.
 
+    **Arguments**: `path` of the file.
+
     **Returns** `UffFile`. **Raises** `InputError` for a file that cannot be read or has no function.
+
+    >>> import pathlib, tempfile, numpy as np, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "machine.uff"
+    >>> found = jv.read_uff(jv.export_uff(scene, path, frequencies=np.linspace(0.1, 20.0, 200)))
+    >>> found.functions[0].kind, found.functions[0].values.shape
+    ('response', (200,))
     """
     pyuff = optional_module("pyuff", "uff")
     try:
