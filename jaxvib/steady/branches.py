@@ -121,7 +121,7 @@ def branches(
     **Arguments**
 
     - `scene`; its rotor speed only determines the default of `most`
-    - `points` along Omega, crowded about the resonances, at least 2; typical: 200 to 2000 (the default). The time grows in
+    - `points` along Omega, denser near the resonances, at least 2; typical: 200 to 2000 (the default). The time grows in
       proportion
     - `most`: the greatest load speed, rad/s or text; default: a third above the scene's rotor speed
     - `exact`: True for the periodic motions of the full equations in place of their limit for light loads, with Floquet
