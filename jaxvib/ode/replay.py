@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple, TypeAlias
 
 import diffrax
@@ -149,91 +150,124 @@ def _backward(
     *rest: *_Rest,
 ) -> PyTree[Array | None]:
     end, _, y0, _, saveat, _ = inputs
-    solver = _with_tolerances(rest[0], controller)
     differentiable, fixed = eqx.partition(inputs, perturbed)
-    numbers, others = (differentiable[3], differentiable[5]), (fixed[3], fixed[5])
-    saved = _saved(saveat, cotangents.ys, y0)
-    times = saved.times
+    way = _WayBack(
+        notes=notes,
+        solver=_with_tolerances(rest[0], controller),
+        controller=controller,
+        numbers=(differentiable[3], differentiable[5]),
+        others=(fixed[3], fixed[5]),
+        saved=_saved(saveat, cotangents.ys, y0),
+        y0=y0,
+        every=_spacing(y0, rest[1]),
+    )
+    return _by_inputs(differentiable, cotangents, saveat, controller, way.saved, way.slopes(jnp.zeros_like(end)))
 
-    def span(i: Array) -> tuple[Array, Array]:
-        """When step i begins and ends."""
-        starts = notes.starts[jnp.maximum(i - 1, 0)]
-        return jnp.where(i == 0, 0.0, starts), _end_before(controller, notes.starts[i])
 
-    def step(y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
-        """The state after a step, and what makes states within it."""
-        args, term = eqx.combine(numbers, others)
+@dataclasses.dataclass(frozen=True)
+class _WayBack:
+    """Way back over the steps of a run, from the last one to the first.
+
+    **Attributes**: the `notes` of the run, with a state after `every` so many steps, and `y0` before the first; `solver` and
+    `controller`; the `numbers` of arguments and equations that are differentiated, and the `others`; the derivatives by `saved`
+    states.
+    """
+
+    notes: _Notes
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    numbers: PyTree[Array | None]
+    others: PyTree[Array | None]
+    saved: _Saved
+    y0: Y
+    every: int
+
+    def slopes(self, zero: Array) -> _Slopes:
+        """Return the slopes after the whole way; `zero` of the type of times."""
+        times = self.saved.times
+        reached = self.span(self.notes.steps - 1)[1]
+        slopes = _Slopes(
+            state=self.saved.last,
+            numbers=jax.tree.map(jnp.zeros_like, self.numbers),
+            end=zero,
+            first_step=zero,
+            times=jnp.zeros_like(times),
+            ahead=jnp.searchsorted(times, reached, side="right") - 1,
+        )
+        start = ((self.notes.steps - 1) // self.every, slopes)
+        return jax.lax.while_loop(lambda carry: carry[0] >= 0, lambda carry: self.to_note(*carry), start)[1]
+
+    def span(self, i: Array) -> tuple[Array, Array]:
+        """Begin and end of step i."""
+        starts = self.notes.starts[jnp.maximum(i - 1, 0)]
+        return jnp.where(i == 0, 0.0, starts), _end_before(self.controller, self.notes.starts[i])
+
+    def step(self, y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
+        """State after a step, and the data of the interpolation within it."""
+        args, term = eqx.combine(numbers, self.others)
         # As after a jump: nothing is known from the step before.
-        y1, _, dense, _, _ = solver.step(term, t0, t1, y, args, solver.init(term, t0, t1, y, args), True)
+        y1, _, dense, _, _ = self.solver.step(term, t0, t1, y, args, self.solver.init(term, t0, t1, y, args), True)
         return y1, dense
 
-    def within(dense: PyTree[Array], t0: Array, t1: Array, t: Array) -> Y:
-        return solver.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t)
+    def over_step(self, i: Array, y: Y, slopes: _Slopes) -> _Slopes:
+        """Slopes before step i, which begins at the state y."""
+        t0, t1 = self.span(i)
+        before = jnp.where(i == 0, -jnp.inf, self.span(jnp.maximum(i - 1, 0))[1])
+        (_, dense), transposed = jax.vjp(self.step, y, t0, t1, self.numbers)
+        ahead, by_times, (by_dense, *by_span) = self.over_saved(dense, t0, t1, before, slopes)
+        by_y, by_start, by_end, by_numbers = transposed((slopes.state, by_dense))
+        by_bounds = ((i, by_start + by_span[0]), (i + 1, by_end + by_span[1]))
+        steps = self.notes.steps
+        return _Slopes(
+            state=by_y,
+            numbers=jax.tree.map(jnp.add, slopes.numbers, by_numbers),
+            end=slopes.end + sum(_share_of_end(self.controller, steps, j) * by for j, by in by_bounds),
+            first_step=slopes.first_step + sum(jnp.where((j == 1) & (steps > 1), by, 0.0) for j, by in by_bounds),
+            times=by_times,
+            ahead=ahead,
+        )
 
-    def back(i: Array, y: Y, slopes: _Slopes) -> _Slopes:
-        """Back over step i, which begins at the state y."""
-        t0, t1 = span(i)
-        before = jnp.where(i == 0, -jnp.inf, span(jnp.maximum(i - 1, 0))[1])
-        (_, dense), transposed = jax.vjp(step, y, t0, t1, numbers)
+    def over_saved(
+        self, dense: PyTree[Array], t0: Array, t1: Array, before: Array, slopes: _Slopes
+    ) -> tuple[Array, Array, PyTree[Array]]:
+        """Slopes by the saved times in a step from t0 to t1 (after the time `before`), by its interpolation, t0 and t1."""
+        times = self.saved.times
+
+        def within(dense: PyTree[Array], t0: Array, t1: Array, t: Array) -> Y:
+            return self.solver.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t)
 
         def is_within(carry: tuple[Array, Array, PyTree[Array]]) -> Array:
             return (carry[0] >= 0) & (times[carry[0]] > before)
 
         def taken(carry: tuple[Array, Array, PyTree[Array]]) -> tuple[Array, Array, PyTree[Array]]:
             k, by_times, by_step = carry
-            *more, by_time = jax.vjp(within, dense, t0, t1, times[k])[1](jax.tree.map(lambda dy: dy[k], saved.states))
+            slope = jax.tree.map(lambda dy: dy[k], self.saved.states)
+            *more, by_time = jax.vjp(within, dense, t0, t1, times[k])[1](slope)
             return k - 1, by_times.at[k].set(by_time), jax.tree.map(jnp.add, by_step, tuple(more))
 
         none = jax.tree.map(jnp.zeros_like, (dense, t0, t1))
         carry = (slopes.ahead, slopes.times, none)
-        ahead, by_times, (by_dense, *by_span) = jax.lax.while_loop(is_within, taken, carry) if times.size else carry
-        by_y, by_start, by_end, by_numbers = transposed((slopes.state, by_dense))
-        by_bounds = ((i, by_start + by_span[0]), (i + 1, by_end + by_span[1]))
-        return _Slopes(
-            state=by_y,
-            numbers=jax.tree.map(jnp.add, slopes.numbers, by_numbers),
-            end=slopes.end + sum(_share_of_end(controller, notes.steps, j) * by for j, by in by_bounds),
-            first_step=slopes.first_step + sum(jnp.where((j == 1) & (notes.steps > 1), by, 0.0) for j, by in by_bounds),
-            times=by_times,
-            ahead=ahead,
-        )
+        return jax.lax.while_loop(is_within, taken, carry) if times.size else carry
 
-    every = _spacing(y0, rest[1])
-
-    def back_to_note(carry: tuple[Array, _Slopes]) -> tuple[Array, _Slopes]:
-        """Back over the steps since the last state that was noted."""
-        n, slopes = carry
-        first, count = n * every, jnp.minimum(every, notes.steps - n * every)
-        noted = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), y0, notes.states)
-        if every == 1:
-            return n - 1, back(n, noted, slopes)
+    def to_note(self, n: Array, slopes: _Slopes) -> tuple[Array, _Slopes]:
+        """Slopes at the n-th state that was noted, from those after the steps that follow it; n - 1 comes next."""
+        first, count = n * self.every, jnp.minimum(self.every, self.notes.steps - n * self.every)
+        noted = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), self.y0, self.notes.states)
+        if self.every == 1:
+            return n - 1, self.over_step(n, noted, slopes)
 
         def again(j: Array, states: Y) -> Y:
-            y, _ = step(jax.tree.map(lambda ys: ys[j], states), *span(first + j), numbers)
+            y, _ = self.step(jax.tree.map(lambda ys: ys[j], states), *self.span(first + j), self.numbers)
             return jax.tree.map(lambda ys, y: ys.at[j + 1].set(y), states, y)
 
-        states = jax.tree.map(lambda y: jnp.zeros((every, *y.shape), y.dtype).at[0].set(y), noted)
+        states = jax.tree.map(lambda y: jnp.zeros((self.every, *y.shape), y.dtype).at[0].set(y), noted)
         states = jax.lax.fori_loop(0, count - 1, again, states)
 
         def from_last(j: Array, slopes: _Slopes) -> _Slopes:
             k = count - 1 - j
-            return back(first + k, jax.tree.map(lambda ys: ys[k], states), slopes)
+            return self.over_step(first + k, jax.tree.map(lambda ys: ys[k], states), slopes)
 
         return n - 1, jax.lax.fori_loop(0, count, from_last, slopes)
-
-    zero = jnp.zeros_like(end)
-    reached = span(notes.steps - 1)[1]
-    slopes = _Slopes(
-        state=saved.last,
-        numbers=jax.tree.map(jnp.zeros_like, numbers),
-        end=zero,
-        first_step=zero,
-        times=jnp.zeros_like(times),
-        ahead=jnp.searchsorted(times, reached, side="right") - 1,
-    )
-    start = ((notes.steps - 1) // every, slopes)
-    _, slopes = jax.lax.while_loop(lambda carry: carry[0] >= 0, back_to_note, start)
-    return _by_inputs(differentiable, cotangents, saveat, controller, saved, slopes)
 
 
 def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractSolver:
