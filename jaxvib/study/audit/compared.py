@@ -11,12 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import StepControl, integrate
+from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate
 from jaxvib.motion.run import Run
 from jaxvib.motion.start import initial_state
 from jaxvib.runtime.cache import compiled_anew
@@ -108,18 +108,18 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
         start = initial_state(scene)  # without the jam, a run from another state takes the same time
     end = jnp.asarray(_TURNS * 2.0 * math.pi / float(scene.drive.speed))
     control = StepControl(jnp.asarray(_TOLERANCE, end.dtype), None, jnp.asarray(_MAX_STEPS, jnp.int32))
-    arguments = (scene, end, start, control, jnp.asarray(20.0, end.dtype))
+    plan = IntegrationPlan(None, control, None, 0, jnp.asarray(20.0, end.dtype), _MAX_STEPS)
+    numbers, choices = eqx.partition((scene, end, start, plan), eqx.is_array)
 
     @jax.jit
-    def program_of_run(scene: Scene, end: Array, start: State, control: StepControl, turns: Array) -> Run:
-        run = inspect.unwrap(integrate)(scene, end, start, None, control, None, 0, turns, _MAX_STEPS, None)
-        return eqx.filter(run, eqx.is_array)
+    def program_of_run(numbers: PyTree) -> Run:
+        return eqx.filter(inspect.unwrap(integrate)(*eqx.combine(numbers, choices)), eqx.is_array)
 
     with compiled_anew():
         begun = time.process_time()  # processor time, which other processes do not change
-        program = program_of_run.lower(*arguments).compile()
+        program = program_of_run.lower(numbers).compile()
         compiling = time.process_time() - begun
-    _, seconds, _ = timed(lambda: program(*arguments).omega, repeats)
+    _, seconds, _ = timed(lambda: program(numbers).omega, repeats)
     return seconds, compiling
 
 
