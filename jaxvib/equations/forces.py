@@ -217,7 +217,7 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
         N = m (centrifugal force of u' - n . (acceleration of the load's carrier + gravity upward)),    see `Loads.normal_force`
 
-    The equations keep a load on its track all the same. Friction that follows the normal force is then 0. n is the direction in
+    The equations then keep a load on its track. Friction of the normal force is then 0. n is the direction in
     which the load presses.
 
     **Arguments**

@@ -93,7 +93,7 @@ class Run(AbstractMeasured, Result):
 
     - It is the part of the difference to a run with larger steps that may remain with smaller ones, and twice of it if an
       effect is not `smooth`; rounding counts too
-    - A motion that forgets its phase has a large error and may have exact amplitudes all the same
+    - A motion that forgets its phase has a large error, but may have exact amplitudes
     """
 
     status: RunStatus
