@@ -97,7 +97,7 @@ def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tu
     # The torque of the drag is opposite to that of the acceleration -w^2 Y.
     torque = mean_torque(model.unbalance, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement))
     free = omega + torque / model.drag
-    effects = model.scene.effects
+    effects = model.scene.all_effects
     if not has_term(effects, ContactFriction):
         return free, displacement
 
