@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import equinox as eqx
@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.equations.modal import ModalResponse, modal_response
 from jaxvib.equations.model import Model, assemble
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import Effect
@@ -27,7 +28,16 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
+from jaxvib.numerics.linalg import (
+    TRUSTED,
+    hermitian_error,
+    hermitian_modes,
+    magnitude,
+    refined,
+    relative_to,
+    root_or_zero,
+    small_solve,
+)
 from jaxvib.results.status import failure
 from jaxvib.runtime.programs import cached
 from jaxvib.units.known import when_known
@@ -62,6 +72,10 @@ JAM_TERMS = (*TURNING_TERMS, ContactFriction)
 """Terms that theories of jams include."""
 
 
+_DIRECT = 3
+"""Number of coordinates up to which equations are written out, see `small_solve`."""
+
+
 class FrequencyStatus(eqx.Enumeration):
     """Outcome of a computation of natural frequencies; the members are the sentences a user reads."""
 
@@ -74,10 +88,12 @@ class LinearModel(Model):
 
         D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
 
-    **Attributes**, besides those of `Model`: `mass` M (nd, nd) kg, each load's at its own place.
+    **Attributes**, besides those of `Model`: `mass` M (nd, nd) kg, each load's at its own place; `modal`, its modal form, see
+    `JammedModel.decomposed`.
     """
 
     mass: Array
+    modal: ModalResponse | None = eqx.field(default=None, kw_only=True)
 
     @property
     def direction(self) -> Array:
@@ -114,17 +130,14 @@ class LinearModel(Model):
 def linear_model(scene: Scene) -> LinearModel:
     """Return the model of a scene with the loads on it, see `LinearModel`."""
     model = assemble(scene)
-    mass = model.carrier.mass
-    for exciter, mount in zip(scene.exciters, model.mounts, strict=True):
-        if exciter.loads is None:
-            continue
-        each = jnp.broadcast_to(exciter.loads.mass, (exciter.loads.count,))
-        if mount.at_one_point:
-            mass = mass + jnp.sum(each) * mount.rows[0].T @ mount.rows[0]
-        else:
-            rows = mount.load_rows(exciter.loads.count)
-            mass = mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
-    return LinearModel(scene, model.carrier, model.mounts, model.supports, mass)
+    carrier, mount = model.carrier, model.mount
+    each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
+    if mount.at_one_point:
+        mass = carrier.mass + jnp.sum(each) * mount.rows[0].T @ mount.rows[0]
+    else:
+        rows = mount.load_rows(scene.loads.count)
+        mass = carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
+    return LinearModel(scene, carrier, mount, model.supports, mass)
 
 
 class JammedModel(LinearModel):
@@ -143,18 +156,60 @@ class JammedModel(LinearModel):
         """The scene's loads."""
         return cast(CircularLoads, self.scene.loads)
 
+    def force(self, omega: Array) -> Array:
+        """Amplitudes (nd,), N, of the force of loads that turn at `omega` on the coordinates."""
+        return self.unbalance * omega**2 * self.force_direction
+
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
         """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
         if self.mount.gyroscopic is not None and speed is None:
             problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
-        return small_solve(self.dynamic_stiffness(omega, speed), self.unbalance * omega**2 * self.force_direction)
+        modal = self.modal
+        if modal is None:
+            return small_solve(self.dynamic_stiffness(omega, speed), self.force(omega))
+
+        def product(y: Array) -> Array:
+            """D(w) y: the matrices, of which derivatives are taken, not their eigenvectors."""
+            carrier = self.carrier
+            elastic, inertia, viscous = (_real_times(a, y) for a in (carrier.stiffness, self.mass, carrier.damping))
+            return elastic - omega**2 * inertia + 1j * omega * viscous
+
+        def solve(product: Callable[[Array], Array], right: Array) -> Array:
+            return refined(product, lambda rest: modal.solve(omega, rest), right, modal.norm(omega))
+
+        return jax.lax.custom_linear_solve(product, self.force(omega), solve, symmetric=True)
+
+    def forward_acceleration(self, omega: Array) -> Array:
+        """Return w^2 e^H B Y (scalar, m/s^2) at the load speed `omega`: minus the forward circular acceleration of the mount.
+
+        In modal form, if the model has one, it costs O(nd) and has no derivatives by numbers of the scene.
+        """
+        if self.modal is None:
+            return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))
+        return self.modal.receptance(omega, self.unbalance * omega**4)
+
+    def decomposed(self) -> JammedModel:
+        """This model with its modal form, for many load speeds; up to 3 coordinates a solution takes no longer."""
+        if self.mass.shape[0] <= _DIRECT or self.mount.gyroscopic is not None:
+            return self
+        frozen = jax.lax.stop_gradient(self)
+        frequencies, shapes = frozen.modes()
+        carrier = frozen.carrier
+        matrices = carrier.stiffness, carrier.damping, frozen.mass
+        modal = modal_response(frequencies, shapes, *matrices, frozen.force_direction)
+        return eqx.tree_at(lambda model: model.modal, self, modal, is_leaf=lambda leaf: leaf is None)
+
+
+def _real_times(matrix: Array, vector: Array) -> Array:
+    """Real matrix times complex vector, at half the cost of a complex matrix."""
+    return jax.lax.complex(matrix @ vector.real, matrix @ vector.imag)
 
 
 def jammed_model(scene: Scene) -> JammedModel:
     """The scene's carrier with jammed loads on it, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
     loads, model = jammed_loads(scene), linear_model(scene)
-    linear = model.scene, model.carrier, model.mounts, model.supports, model.mass
+    linear = model.scene, model.carrier, model.mount, model.supports, model.mass
     return JammedModel(*linear, loads.unbalance(), loads.drag_sum(), model.direction)
 
 
@@ -263,7 +318,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 def require_one_point(scene: Scene) -> None:
     """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
-    if not scene.mounting().at_one_point:
+    if not scene.machine.mounting().at_one_point:
         problem = (
             "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
         )
@@ -287,7 +342,7 @@ def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS
             "drive.kind",
             f"is {quoted(drive.kind)}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
         )
-    require_terms(scene.all_effects, included)
+    require_terms(scene.effects, included)
     return cast(CircularLoads, loads)
 
 

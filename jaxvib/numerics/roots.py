@@ -16,16 +16,26 @@ __all__ = ["bracketed_root", "known_root", "next_share"]
 Numbers = TypeVar("Numbers", np.ndarray, Array)
 
 
-def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: tuple[Array, Array] | None = None) -> Array:
+def bracketed_root(
+    f: Callable[[Array], Array],
+    low: Array,
+    high: Array,
+    ends: tuple[Array, Array] | None = None,
+    *,
+    fast: Callable[[Array], Array] | None = None,
+    polish: Array | None = None,
+) -> Array:
     """The root of `f` between `low` and `high` (scalars), where f changes sign once, to the last digits.
 
-    `ends`: f(low) and f(high), for whoever knows them already.
+    **Arguments**: `ends`, f(low) and f(high) if they are known already; `fast`, the same function at less cost, which the
+    search evaluates: f then serves derivatives, and if `polish` is True (scalar) the last steps, by Newton's method.
 
     Inverse quadratic interpolation where it is safe, halving elsewhere (Chandrupatla, Adv. Eng. Software 28, 1997).
     Derivatives of any order by the implicit function theorem.
     """
 
-    def solve(g: Callable[[Array], Array], _: Array) -> Array:
+    def solve(exact: Callable[[Array], Array], _: Array) -> Array:
+        g = exact if fast is None else fast
         tolerance = 2.0 * jnp.finfo(low.dtype).eps
 
         def open_(carry: tuple[Array, ...]) -> Array:
@@ -56,7 +66,18 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: t
         at_low, at_high = size(f_low), size(f_high)
         best, least = jnp.where(at_low < at_high, low, high), jnp.minimum(at_low, at_high)
         start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
-        return jax.lax.while_loop(open_, step, start)[6]
+        root = jax.lax.while_loop(open_, step, start)[6]
+        return root if polish is None else polished(exact, g, root, polish)
+
+    def polished(exact: Callable[[Array], Array], g: Callable[[Array], Array], root: Array, needed: Array) -> Array:
+        def newton(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            steps, x = carry
+            slope = jax.jvp(g, (x,), (jnp.ones_like(x),))[1]
+            better = x - exact(x) / _nonzero(slope)
+            inside = (better >= jnp.minimum(low, high)) & (better <= jnp.maximum(low, high))
+            return steps + 1, jnp.where(inside, better, x)
+
+        return jax.lax.while_loop(lambda carry: needed & (carry[0] < 3), newton, (jnp.asarray(0), root))[1]
 
     low, high, ends = jax.lax.stop_gradient((low, high, ends))
     return jax.lax.custom_root(f, low, solve, _by_slope)

@@ -48,6 +48,7 @@ class Part(TypedDict):
 
     part: tuple[str, ...]
     prefix: str
+    fields: Mapping[str, InUnit] | None
 
 
 class AsText(TypedDict):
@@ -70,12 +71,12 @@ def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
     return {"unit": unit, "axes": axes, "name": name}
 
 
-def part(*axes: str, prefix: str = "") -> Part:
-    """Metadata of a field that holds another tree of numbers, or a tuple of them, with these axes before their own.
+def part(*axes: str, prefix: str = "", fields: Mapping[str, InUnit] | None = None) -> Part:
+    """Metadata of a field that holds another tree of numbers, each of them with these axes before its own.
 
-    **Arguments**: `prefix` of its names in labelled data. Several trees of a tuple are numbered, and each has its own "load".
+    **Arguments**: `prefix` of its names in labelled data; `fields` the metadata of its fields where its class has none.
     """
-    return {"part": axes, "prefix": prefix}
+    return {"part": axes, "prefix": prefix, "fields": fields}
 
 
 def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callable[[T], Labels]) -> AsText:
@@ -155,7 +156,7 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
 
 def columns(result: eqx.Module) -> Iterator[Column]:
     """Every array of a result: its name, the names of its axes, its values, its unit."""
-    return _columns(result, "", (), {})
+    return _columns(result, None, "", (), {})
 
 
 def is_single(result: eqx.Module) -> bool:
@@ -182,11 +183,13 @@ def _one_unit(unit: str, units: Sequence[str]) -> str:
     return choices[("m", "rad").index(units[0])] if alike else unit
 
 
-def _columns(tree: eqx.Module, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]) -> Iterator[Column]:
+def _columns(
+    tree: eqx.Module, fields: Mapping[str, InUnit] | None, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]
+) -> Iterator[Column]:
     """Every array of a tree: its name, its axes, its values, its unit."""
     outer_axes = getattr(tree, "outer_axes", ())
     for field in dataclasses.fields(tree):
-        value, metadata = getattr(tree, field.name), field.metadata
+        value, metadata = getattr(tree, field.name), field.metadata if fields is None else fields.get(field.name, {})
 
         def axes(own: tuple[str, ...]) -> tuple[str, ...]:
             every = [axis for name in own for axis in (outer_axes if name == EACH else (name,))]
@@ -195,15 +198,12 @@ def _columns(tree: eqx.Module, prefix: str, outer: tuple[str, ...], renamed: Map
         if value is None:
             continue
         if "part" in metadata:
-            trees = value if isinstance(value, tuple) else (value,)
-            for k, each in enumerate(trees):
-                number = f"{field.name}_{k + 1}_" if len(trees) > 1 else ""
-                before = prefix + metadata["prefix"] + number
-                inner = dict(renamed) | ({"load": f"{before}load"} if number else {})
-                if metadata["prefix"]:
-                    own = [known.name for known in dataclasses.fields(each) if known.metadata.get("axes") == (known.name,)]
-                    inner |= {axis: before + axis for axis in own}
-                yield from _columns(each, before, axes(metadata["part"]), inner)
+            before = prefix + metadata["prefix"]
+            inner = dict(renamed)
+            if metadata["prefix"]:
+                own = [each.name for each in dataclasses.fields(value) if each.metadata.get("axes") == (each.name,)]
+                inner |= {axis: before + axis for axis in own}
+            yield from _columns(value, metadata["fields"], before, axes(metadata["part"]), inner)
         elif "unit" in metadata:
             name = prefix + (metadata["name"] or field.name)
             yield from _column(name, axes(metadata["axes"]), value, metadata["unit"])

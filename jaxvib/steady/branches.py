@@ -158,7 +158,7 @@ def branches(
 
 @cached
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
-    model = jammed_model(scene)
+    model = jammed_model(scene).decomposed()
     crowded, resonances = fold_points(model, per_side)
     # As many points as asked for: those of the crowded grid, thinned evenly and pressed into the range.
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)

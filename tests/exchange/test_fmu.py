@@ -258,7 +258,7 @@ def test_rotor_of_a_motor_follows_the_torque_input_alone():
 def test_speed_input_replaces_an_ideal_drive():
     found = exported("imbalance", drive="input")
     assert validate_fmu(found.path) == []
-    scene = jv.Scene(found.scene.machine, found.scene.loads, jv.SpinUp(120.0, 5.0), found.scene.all_effects)
+    scene = jv.Scene(found.scene.machine, found.scene.loads, jv.SpinUp(120.0, 5.0), found.scene.effects)
     state, t = state_of(scene), jnp.asarray(1.7)
     drive = scene.drive
     machine = opened(found)

@@ -121,7 +121,7 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
 
     Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
     """
-    direction = turning(scene.mounting())
+    direction = turning(scene.machine.mounting())
     size = circular_loads(scene).unbalance() if unbalance is None else unbalance
     receptance = jnp.sum(direction.conj() * (port_receptance(scene, omega) @ direction)).real
     return size**2 * omega**2 / 2.0 * receptance
@@ -170,7 +170,7 @@ def criterion(scene: Scene) -> Criterion:
         raise InputError(
             "loads.count", "is 1; the criterion tells loads that gather from loads that spread: it needs 2 or more"
         )
-    require_terms(scene.all_effects, CRITERION_TERMS, "acts|act on each load by itself, which the criterion leaves out")
+    require_terms(scene.effects, CRITERION_TERMS, "acts|act on each load by itself, which the criterion leaves out")
     return _judged(characteristic_speeds(scene))
 
 

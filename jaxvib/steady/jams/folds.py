@@ -94,17 +94,27 @@ def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
 def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
     """Rotor speed of `rotor_speed_at` and the amplitudes of the carrier."""
     displacement = model.displacement(omega, speed)
+    return _speed_for(model, omega, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement)), displacement
+
+
+def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
+    """Rotor speed of light loads that turn at `omega`, from w^2 e^H B Y, m/s^2, see `JammedModel.forward_acceleration`."""
     # The torque of the drag is opposite to that of the acceleration -w^2 Y.
-    torque = mean_torque(model.unbalance, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement))
+    torque = mean_torque(model.unbalance, acceleration)
     free = omega + torque / model.drag
-    effects = model.scene.all_effects
+    effects = model.scene.effects
     if not has_term(effects, ContactFriction):
-        return free, displacement
+        return free
 
     def residual(n: Array) -> Array:
         return model.drag * (n - omega) + light_friction(model.loads, effects, omega, n) - torque
 
-    return bracketed_root(residual, omega, free), displacement
+    return bracketed_root(residual, omega, free)
+
+
+def scanned_speed(model: JammedModel, omega: Array) -> Array:
+    """`rotor_speed_at` in modal form, for a search: O(nd), without derivatives by numbers of the scene."""
+    return _speed_for(model, omega, model.forward_acceleration(omega))
 
 
 def branch_tangent(model: JammedModel, omega: Array) -> tuple[Array, Array, Array]:
@@ -115,6 +125,30 @@ def branch_tangent(model: JammedModel, omega: Array) -> tuple[Array, Array, Arra
 def branch_slope(model: JammedModel, omega: Array) -> Array:
     """Slope dn/dOmega of the branch."""
     return branch_tangent(model, omega)[1]
+
+
+def scanned_slope(model: JammedModel, omega: Array) -> Array:
+    """Slope dn/dOmega of `scanned_speed`."""
+    return jax.jvp(partial(scanned_speed, model), (omega,), (jnp.ones_like(omega),))[1]
+
+
+def branch_root(
+    model: JammedModel,
+    exact: Callable[[JammedModel, Array], Array],
+    scanned: Callable[[JammedModel, Array], Array],
+    low: Array,
+    high: Array,
+    ends: tuple[Array, Array],
+) -> Array:
+    """Load speed between `low` and `high` at which a function of the branch is 0, with exact derivatives.
+
+    **Arguments**: the function from the matrices, `exact`, and in modal form, `scanned`; `ends`, its values at both ends.
+    """
+    f = partial(exact, model)
+    if model.modal is None:
+        return bracketed_root(f, low, high, ends)
+    frozen = jax.lax.stop_gradient(model)
+    return bracketed_root(f, low, high, ends, fast=partial(scanned, frozen), polish=model.modal.is_rough)
 
 
 class Pieces(NamedTuple):
@@ -135,18 +169,21 @@ def branch_pieces(model: JammedModel) -> Pieces:
     frozen = jax.lax.stop_gradient(model)
     grid, resonances = fold_points(model, _GRID_POINTS)
     nd = resonances.shape[0]
-    grid, slopes = _with_close_folds(jax.vmap(lambda w: branch_slope(frozen, w)), grid, 2 * nd)
+    grid, slopes = _with_close_folds(jax.vmap(partial(scanned_slope, frozen)), grid, 2 * nd)
     falling = slopes < 0.0
     change = _first_places(falling[1:] != falling[:-1], 4 * nd, grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
-    omega = jax.vmap(partial(bracketed_root, lambda w: branch_slope(model, w)))(*ends)
+    omega = jax.vmap(partial(branch_root, model, branch_slope, scanned_slope))(*ends)
     end = jnp.maximum(grid[-1:], 2.0 * frozen.scene.drive.speed)
-    speeds = jax.vmap(lambda w: rotor_speed_at(model, w))(jnp.concatenate([omega, end]))
+    speed = partial(rotor_speed_at, model) if model.modal is None else partial(scanned_speed, frozen)
+    speeds = jax.vmap(speed)(jnp.concatenate([omega, end]))
     speeds, speed_end = speeds[:-1], jax.lax.stop_gradient(speeds[-1:])
     main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
     omega, speeds, found = omega[main], speeds[main], found[main]
+    if model.modal is not None:  # now with derivatives, half as often
+        speeds = jax.vmap(partial(rotor_speed_at, model))(omega)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
         rotor_speed=jnp.where(found, speeds, jnp.nan),
@@ -164,17 +201,14 @@ def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
     Each peak belongs to the nearest resonance, except that two peaks never share a resonance and every peak has one.
     """
     nd = resonances.shape[0]
-    owners: list[Array] = []
-    later = jnp.sum(found[1::2]) - 1
-    for k, peak in enumerate(cuts[0::2]):
-        nearest = 1 + jnp.argmin(jnp.abs(resonances - peak))
-        free = jnp.clip(nd - (later - k), 1, nd)
-        owners.append(jnp.minimum(jnp.maximum(nearest, owners[-1] + 1 if owners else 1), free))
-    mode = []
-    for k, owner in enumerate(owners):
-        last = 2 * nd + 1
-        mode += [jnp.where(found[2 * k], 2 * owner - 1, last), jnp.where(found[2 * k], 2 * owner, last)]
-    return jnp.stack([*mode, jnp.asarray(2 * nd + 1)])
+    peak = np.arange(nd)
+    nearest = 1 + jnp.argmin(jnp.abs(resonances[None, :] - cuts[0::2, None]), axis=1)
+    # Numbers rise by at least 1 from peak to peak, and leave enough for later peaks.
+    owner = peak + jnp.minimum(jax.lax.cummax(nearest - peak), nd + 1 - jnp.sum(found[1::2]))
+    owner = jnp.minimum(owner, nd)
+    last = 2 * nd + 1
+    rising, falling = (jnp.where(found[0::2], mode, last) for mode in (2 * owner - 1, 2 * owner))
+    return jnp.append(jnp.stack([rising, falling], axis=1).ravel(), last)
 
 
 def without_ripples(speeds: Array, count: Array, most: int) -> Array:
@@ -205,8 +239,12 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
     sharp peak is at neither resonance.
     """
     resonances, _ = model.modes()
-    matrices = (model.mass, model.damping(model.scene.drive.speed), model.carrier.stiffness)
-    poles, fixed = _poles(*jax.lax.stop_gradient(matrices)), jax.lax.stop_gradient(resonances)
+    fixed = jax.lax.stop_gradient(resonances)
+    if model.modal is None:
+        matrices = (model.mass, model.damping(model.scene.drive.speed), model.carrier.stiffness)
+        poles = _poles(*jax.lax.stop_gradient(matrices))
+    else:
+        poles = model.modal.poles
     top = jnp.maximum(jnp.max(fixed), jnp.max(jnp.abs(poles)))
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]

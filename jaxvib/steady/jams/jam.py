@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -17,12 +19,20 @@ from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
-from jaxvib.numerics.roots import bracketed_root, known_root
+from jaxvib.numerics.roots import known_root
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_names
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import Folds, Pieces, branch_pieces, branch_tangent, rotor_speed_at
+from jaxvib.steady.jams.folds import (
+    Folds,
+    Pieces,
+    branch_pieces,
+    branch_root,
+    branch_tangent,
+    rotor_speed_at,
+    scanned_speed,
+)
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units.known import when_known
 
@@ -215,6 +225,9 @@ def jam_modes(scene: Scene) -> JamModes:
     **Arguments**: `scene` with a drive of constant speed and loads with drag; typical: loads of 0.1 % to 5 % of the machine's
     mass. The relative error of the result is about this share times the magnification at resonance, see `jam_orbit`.
 
+    Resonances closer to each other than their damping share one peak of the branch: their modes are one pair, with the
+    number of the resonance nearest to the peak, and the status of the others is `absent`.
+
     **Returns** `JamModes`; derivatives of every number with respect to every number of the scene are exact (implicit function
     theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
 
@@ -241,7 +254,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
 def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
     """Jams from their load speeds; without resonances and folds."""
-    n, model, there = scene.drive.speed, jammed_model(scene), jams.status != JamStatus.absent
+    n, model, there = scene.drive.speed, jammed_model(scene).decomposed(), jams.status != JamStatus.absent
     omega = jax.vmap(lambda root: known_root(lambda w: rotor_speed_at(model, w) - n, root))(jnp.where(there, jams.omega, n))
     fields = _fields(model, jnp.where(there, omega, n), there, jams.status == JamStatus.at_fold)
     return dataclasses.replace(jax.tree.map(lambda _: None, jams), **fields)
@@ -250,7 +263,7 @@ def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
 @cached(outputs_from_solution=_from_jams)
 def jams_of(scene: Scene) -> JamModes:
     """`jam_modes` for a validated scene."""
-    n, model = scene.drive.speed, jammed_model(scene)
+    n, model = scene.drive.speed, jammed_model(scene).decomposed()
     pieces = branch_pieces(model)
     omega, exists = _solved_on_pieces(model, pieces)
 
@@ -347,5 +360,9 @@ def _solved_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]
     target = model.scene.drive.speed
     gaps = pieces.speed_low - target, pieces.speed_high - target
     exists = (pieces.high > pieces.low) & (gaps[0] * gaps[1] <= 0.0)
-    roots = jax.vmap(lambda *ends: bracketed_root(lambda w: rotor_speed_at(model, w) - target, *ends))
-    return roots(pieces.low, pieces.high, gaps), exists
+
+    def gap(speed: Callable[[JammedModel, Array], Array]) -> Callable[[JammedModel, Array], Array]:
+        return lambda model, w: speed(model, w) - model.scene.drive.speed
+
+    root = partial(branch_root, model, gap(rotor_speed_at), gap(scanned_speed))
+    return jax.vmap(root)(pieces.low, pieces.high, gaps), exists
