@@ -55,49 +55,76 @@ def elastic(
     ([[1.0]], [[2.0]])
     """
     (a_rows, a), (c_rows, c), (low, high) = held, demands, box
-    s, d = slope.shape
-    me, mi = a.shape[1], c.shape[1]
+    me, mi, d = a.shape[1], c.shape[1], slope.shape[1]
+    program = _with_slacks(hessian, slope, held, demands, box, penalty)
+    # Start in the middle of the box with equal products of slacks and duals.
+    p = (low + high) / 2.0
+    broken = np.concatenate([_times(a_rows, p) + a, _times(c_rows, p) + c], axis=1)
+    wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
+    x = np.concatenate([p, np.repeat(wide[:, None], me + mi, axis=1)], axis=1)
+    slack = np.maximum(program.right - _times(program.rows, x), 1e-12)
+    x, dual = _interior_point(program, x, slack, (penalty * wide / 3.0)[:, None] / slack)
+    parts = np.split(dual, np.cumsum([me, me, mi, me + mi, d]), axis=1)
+    return Solved(np.clip(x[:, :d], low, high), parts[0] - parts[1], parts[2], parts[4] - parts[5])
+
+
+class _Program(NamedTuple):
+    """Quadratic programs min x.Q x/2 + q.x with rows x <= right: `quadratic` (s, n, n), `linear` (s, n), `rows` (s, m, n),
+    `right` (s, m)."""
+
+    quadratic: np.ndarray
+    linear: np.ndarray
+    rows: np.ndarray
+    right: np.ndarray
+
+
+def _with_slacks(
+    hessian: np.ndarray,
+    slope: np.ndarray,
+    held: tuple[np.ndarray, np.ndarray],
+    demands: tuple[np.ndarray, np.ndarray],
+    box: tuple[np.ndarray, np.ndarray],
+    penalty: np.ndarray,
+) -> _Program:
+    """Return the programs of `elastic` with x = (p, the violation of each constraint), which is not negative."""
+    (a_rows, a), (c_rows, c), (low, high) = held, demands, box
+    (s, d), me, mi = slope.shape, a.shape[1], c.shape[1]
     n = d + me + mi
     quadratic = np.zeros((s, n, n))
     quadratic[:, :d, :d] = hessian
-    linear = np.concatenate([slope, np.repeat(penalty[:, None], me + mi, axis=1)], axis=1)
     identity = np.broadcast_to(np.eye(d), (s, d, d))
 
     def row(of_p: np.ndarray, k: int, count: int) -> np.ndarray:
-        """Rows on p, with -1 on the slack of each constraint from the k-th on."""
+        """Rows on p, with -1 on the violation of each constraint from the k-th on."""
         rows = np.zeros((s, of_p.shape[1], n))
         rows[:, :, :d] = of_p
         rows[:, np.arange(count), d + k + np.arange(count)] = -1.0
         return rows
 
-    rows = np.concatenate(
-        [
-            row(a_rows, 0, me),
-            row(-a_rows, 0, me),
-            row(c_rows, me, mi),
-            row(np.zeros((s, me + mi, d)), 0, me + mi),
-            row(identity, 0, 0),
-            row(-identity, 0, 0),
-        ],
-        axis=1,
+    rows = [
+        row(a_rows, 0, me),
+        row(-a_rows, 0, me),
+        row(c_rows, me, mi),
+        row(np.zeros((s, me + mi, d)), 0, me + mi),
+        row(identity, 0, 0),
+        row(-identity, 0, 0),
+    ]
+    return _Program(
+        quadratic,
+        linear=np.concatenate([slope, np.repeat(penalty[:, None], me + mi, axis=1)], axis=1),
+        rows=np.concatenate(rows, axis=1),
+        right=np.concatenate([-a, a, -c, np.zeros((s, me + mi)), high, -low], axis=1),
     )
-    right = np.concatenate([-a, a, -c, np.zeros((s, me + mi)), high, -low], axis=1)
-    m = rows.shape[1]
-    # Start in the middle of the box with equal products of slacks and duals.
-    x = np.zeros((s, n))
-    x[:, :d] = (low + high) / 2.0
-    broken = np.concatenate([_times(a_rows, x[:, :d]) + a, _times(c_rows, x[:, :d]) + c], axis=1)
-    wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
-    x[:, d:] = wide[:, None]
-    slack = np.maximum(right - _times(rows, x), 1e-12)
-    dual = (penalty * wide / 3.0)[:, None] / slack
-    turned = np.swapaxes(rows, 1, 2)
-    scale = 1.0 + np.abs(linear).max(axis=1)
-    ridge = 1e-13 * np.eye(n)
 
+
+def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the solutions x and their duals from a start with positive slacks and duals."""
+    quadratic, linear, rows, right = program
+    s, m = right.shape
+    scale = 1.0 + np.abs(linear).max(axis=1)
     best, least, mark, improved = (x, dual), np.full(s, np.inf), np.full(s, np.inf), np.zeros(s, int)
     for k in range(_MAX_NEWTON_STEPS):
-        stationary = _times(quadratic, x) + linear + _times(turned, dual)
+        stationary = _times(quadratic, x) + linear + _times(np.swapaxes(rows, 1, 2), dual)
         primal = _times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
         # Keep the best point, since rounding may spoil a good one.
@@ -105,43 +132,45 @@ def elastic(
         better = off < least
         improved, mark = np.where(off < 0.5 * mark, k, improved), np.where(off < 0.5 * mark, off, mark)
         least = np.where(better, off, least)
-        best = tuple(np.where(better[:, None], new, old) for new, old in zip((x, dual), best, strict=True))
+        best = np.where(better[:, None], x, best[0]), np.where(better[:, None], dual, best[1])
         done = (least < 1e-11) | ((least < _NEAR_OPTIMUM) & (k - improved >= _STEPS_WITHOUT_PROGRESS))
         if np.all(done):
             break
-        weight = dual / slack
-        matrix = quadratic + (turned * weight[:, None, :]) @ rows
-        matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] / n + 1e-300 * np.eye(n)
-
-        def solved(
-            target: np.ndarray,
-            matrix: np.ndarray = matrix,
-            weight: np.ndarray = weight,
-            stationary: np.ndarray = stationary,
-            primal: np.ndarray = primal,
-            slack: np.ndarray = slack,
-        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Step that increases the products of slacks and duals by `target`."""
-            rest = -stationary - _times(turned, weight * primal + target / slack)
-            dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
-            ds = -primal - _times(rows, dx)
-            return dx, ds, target / slack - weight * ds
-
-        def longest(value: np.ndarray, step: np.ndarray) -> np.ndarray:
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                return np.minimum(1.0, np.where(step < 0.0, -value / step, np.inf).min(axis=1))
-
-        _, ds, dl = solved(-slack * dual)
-        by_s, by_l = longest(slack, ds), longest(dual, dl)
-        after = np.einsum("sm,sm->s", slack + by_s[:, None] * ds, dual + by_l[:, None] * dl) / m
-        centre = (after / np.maximum(gap, 1e-300)) ** 3 * gap
-        dx, ds, dl = solved(centre[:, None] - slack * dual - ds * dl)
+        dx, ds, dl = _predicted_and_corrected(program, stationary, primal, gap, slack, dual)
         keep = np.where(done, 0.0, 0.995)
         # One step length for both, since the equation of the duals contains the quadratic term.
-        by = keep * np.minimum(longest(slack, ds), longest(dual, dl))
+        by = keep * np.minimum(_longest(slack, ds), _longest(dual, dl))
         x = x + by[:, None] * dx
         slack = np.maximum(slack + by[:, None] * ds, 1e-300)
         dual = np.maximum(dual + by[:, None] * dl, 1e-300)
-    x, dual = best
-    parts = np.split(dual, np.cumsum([me, me, mi, me + mi, d]), axis=1)
-    return Solved(np.clip(x[:, :d], low, high), parts[0] - parts[1], parts[2], parts[4] - parts[5])
+    return best
+
+
+def _predicted_and_corrected(
+    program: _Program, stationary: np.ndarray, primal: np.ndarray, gap: np.ndarray, slack: np.ndarray, dual: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Mehrotra's step of x, slacks and duals: a predictor shows how far the products of slacks and duals can fall."""
+    rows, turned = program.rows, np.swapaxes(program.rows, 1, 2)
+    (m, n), weight = rows.shape[1:], dual / slack
+    matrix = program.quadratic + (turned * weight[:, None, :]) @ rows
+    ridge = 1e-13 * np.eye(n)
+    matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] / n + 1e-300 * np.eye(n)
+
+    def solved(target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Step that increases the products of slacks and duals by `target`."""
+        rest = -stationary - _times(turned, weight * primal + target / slack)
+        dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
+        ds = -primal - _times(rows, dx)
+        return dx, ds, target / slack - weight * ds
+
+    _, ds, dl = solved(-slack * dual)
+    by_s, by_l = _longest(slack, ds), _longest(dual, dl)
+    after = np.einsum("sm,sm->s", slack + by_s[:, None] * ds, dual + by_l[:, None] * dl) / m
+    centre = (after / np.maximum(gap, 1e-300)) ** 3 * gap
+    return solved(centre[:, None] - slack * dual - ds * dl)
+
+
+def _longest(value: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return the largest part of a step, 1 at most, that leaves all values positive."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return np.minimum(1.0, np.where(step < 0.0, -value / step, np.inf).min(axis=1))
