@@ -220,17 +220,12 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             merits = [_merit(problem, each, size[index], penalty[index]) for each in tried]
             first = merits[0] <= merits[-1]
             new, new_merit = tried[0].where(first, tried[-1]), np.minimum(merits[0], merits[-1])
-            kept = violation(problem, new) < np.maximum(FEASIBLE, violation(problem, here))
             merit = _merit(problem, here, size[index], penalty[index])
-            better = new_merit < merit
-            # The last step converges quadratically: rounding hides the decrease of the objective, but slopes are still exact.
-            better |= kept & (left[index] < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
-            better |= kept & (violation(problem, here) > FEASIBLE) & new.exists()
+            better = _is_better(problem, here, new, merit, new_merit, left[index])
             point = point.put(index, new.where(better, here))
             step = np.max(np.abs(np.where(first[:, None], models[0].p, models[-1].p)), axis=1)
-            trust_radius[index] = np.where(
-                better, np.where(step > 0.9 * trust_radius[index], 2.0 * trust_radius[index], trust_radius[index]), 0.25 * step
-            )
+            radius = trust_radius[index]
+            trust_radius[index] = np.where(better, np.where(step > 0.9 * radius, 2.0 * radius, radius), 0.25 * step)
             trust_radius = np.clip(trust_radius, 1e-9, 0.5)
             multipliers[index] = np.clip(dual, -1e6, 1e6)
             shares[index] = model.shares
@@ -242,6 +237,18 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
         history.append(point.values[:, 0])
         tell(min(k + 1, steps) / max(steps, 1), point)
     return Polished(point, np.asarray(history), left, violation(problem, point), optimality(problem, point))
+
+
+def _is_better(
+    problem: Problem, here: Point, new: Point, merit: np.ndarray, new_merit: np.ndarray, left: np.ndarray
+) -> np.ndarray:
+    """Return True for designs whose step is taken; `left` is the decrease of the objective that their models predict."""
+    kept = violation(problem, new) < np.maximum(FEASIBLE, violation(problem, here))
+    better = new_merit < merit
+    # The last step converges quadratically: rounding hides the decrease of the objective, but slopes are still exact.
+    better |= kept & (left < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
+    better |= kept & (violation(problem, here) > FEASIBLE) & new.exists()
+    return better
 
 
 def _initial_multipliers(problem: Problem, point: Point) -> np.ndarray:

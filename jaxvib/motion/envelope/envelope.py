@@ -259,11 +259,7 @@ def _run(
     field, frozen = averaged_model(model), jax.lax.stop_gradient(scene)
     units = _units(jax.lax.stop_gradient(model))
     speed, frequencies = frozen.drive.speed, estimated_frequencies(frozen)
-    slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
-    window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _MAX_WINDOW_TURNS / speed)
-    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]
-    if samples:
-        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
+    saves = _saves(speed, frequencies, end, samples, turns)
 
     given = isinstance(control, diffrax.AbstractStepSizeController)
     controller = control if given else diffrax.PIDController(rtol=control, atol=control)
@@ -289,13 +285,7 @@ def _run(
     kept = envelopes(solution.ts[0], solution.ys[0])
     finite = is_finite(kept)
     turning = _turning(scene, field, begin, kept)
-    result = solution.result
-    failed = EnvelopeStatus.where(result == diffrax.RESULTS.dt_min_reached, EnvelopeStatus.not_finite, EnvelopeStatus.no_step)
-    failed = EnvelopeStatus.where(result == diffrax.RESULTS.max_steps_reached, EnvelopeStatus.max_steps_reached, failed)
-    status = EnvelopeStatus.where(turning, EnvelopeStatus.done, EnvelopeStatus.not_turning)
-    status = EnvelopeStatus.where(finite, status, EnvelopeStatus.not_finite)
-    status = EnvelopeStatus.where(result == diffrax.RESULTS.successful, status, failed)
-    status = EnvelopeStatus.where(exists, status, EnvelopeStatus.no_start)
+    status = _status(solution.result, exists, finite, turning)
     whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
     seen = (_measure(model, kept), jnp.max(kept.ripple, axis=0), whole, kept)
     measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
@@ -309,6 +299,25 @@ def _run(
         rejected=solution.stats["num_rejected_steps"],
         scene=scene,
     )
+
+
+def _saves(speed: Array, frequencies: Array, end: Array, samples: int, turns: int) -> list[diffrax.SubSaveAt]:
+    """Return the times of the measuring window at the end, and of the whole run if it has `samples`."""
+    slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
+    window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _MAX_WINDOW_TURNS / speed)
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]
+    if samples:
+        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
+    return saves
+
+
+def _status(result: diffrax.RESULTS, exists: Array, finite: Array, turning: Array) -> EnvelopeStatus:
+    failed = EnvelopeStatus.where(result == diffrax.RESULTS.dt_min_reached, EnvelopeStatus.not_finite, EnvelopeStatus.no_step)
+    failed = EnvelopeStatus.where(result == diffrax.RESULTS.max_steps_reached, EnvelopeStatus.max_steps_reached, failed)
+    status = EnvelopeStatus.where(turning, EnvelopeStatus.done, EnvelopeStatus.not_turning)
+    status = EnvelopeStatus.where(finite, status, EnvelopeStatus.not_finite)
+    status = EnvelopeStatus.where(result == diffrax.RESULTS.successful, status, failed)
+    return EnvelopeStatus.where(exists, status, EnvelopeStatus.no_start)
 
 
 def _at_rest(scene: Scene) -> Amplitudes:

@@ -303,15 +303,9 @@ def swing_states(
     if free is not None:
         assert dry is not None
         last, stopped = jnp.where(free, last, times[0]), stopped | ~free
-        # The last bit of the way by the sharp sign: harmonic, about the end of the dead zone that it moves away from.
-        way = jnp.where(end_slip < 0.0, -1.0, 1.0)
-        middle = -way * pendulum.dead_zone(dry)
-        reach = jnp.hypot(end - middle, end_slip / frequency)
-        last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - middle)) / frequency
-        phase = frequency * jnp.maximum(last - times, 0.0)
+        last, rest = _last_part(pendulum, dry, times, last, (end, end_slip))
         after = stopped & ~jnp.isfinite(f)
-        f = jnp.where(after, middle + way * reach * jnp.cos(phase), f)
-        slip = jnp.where(after, way * reach * frequency * jnp.sin(phase), slip)
+        f, slip = (jnp.where(after, value, before) for value, before in zip(rest, (f, slip), strict=True))
     finished = stopped | (solution.result == diffrax.RESULTS.successful)
     status = SwingStatus.where(stopped, SwingStatus.stopped, SwingStatus.swinging)
     status = SwingStatus.where(finished, status, SwingStatus.max_steps_reached)
@@ -325,3 +319,17 @@ def swing_states(
         width=jnp.full_like(frequency, jnp.nan) if width is None else width,
         steps=solution.stats["num_steps"],
     )
+
+
+def _last_part(
+    pendulum: BearingPendulum, dry: Array, times: Array, last: Array, y: tuple[Array, Array]
+) -> tuple[Array, tuple[Array, Array]]:
+    """Return the time at which a slow pendulum comes to rest, and its angles and rates until then, from the time `last` and the
+    state `y` there: by the sharp sign of dry friction, harmonic about the end of the dead zone that it moves away from."""
+    (end, end_slip), frequency = y, pendulum.frequency
+    way = jnp.where(end_slip < 0.0, -1.0, 1.0)
+    middle = -way * pendulum.dead_zone(dry)
+    reach = jnp.hypot(end - middle, end_slip / frequency)
+    last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - middle)) / frequency
+    phase = frequency * jnp.maximum(last - times, 0.0)
+    return last, (middle + way * reach * jnp.cos(phase), way * reach * frequency * jnp.sin(phase))
