@@ -205,7 +205,7 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
 def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
     if not np.ndim(jam.omega) == 0 or not np.isfinite(jam.omega):
         raise InputError("at", f"is no single jam that exists ({jam.message}); take one that does, with select(mode)")
-    scene = Scene(scene.machine, scene.loads, ConstantSpeed(jam.rotor_speed), scene.effects)
+    scene = eqx.tree_at(lambda s: s.drive, scene, ConstantSpeed(jam.rotor_speed))
     phase = jam.phase if isinstance(jam, PhaseJam) else jnp.zeros(scene.loads.count)
     if phase.shape != (scene.loads.count,) or jam.displacement.shape != scene.machine.structure().mass.shape[:1]:
         raise InputError(
