@@ -176,7 +176,7 @@ quantity = "support_frequency_squared"   # the sum of k/M over the supports: how
 # mode = 3
 # of = [1, 2]
 # at_least = "2 mm"
-# tier = "exact"                  # of the exact motion; "leading" (of light loads) unless said otherwise
+# tier = "exact"                  # of the exact motion (default); "leading": of light loads
 
 # [ties]                          # what follows what: equal, or [name, factor], or [name, "keep"] for the present ratio
 # "machine.stiffness[1]" = "machine.stiffness[0]"

@@ -277,8 +277,8 @@ def _if_moved(gain: float) -> str:
     while abs(gain) * share > _LINEAR:
         share /= 10.0
     if share < _LEAST_MOVE:
-        return "beside its slope the objective is almost nothing"
-    return f"moved by {share:g} %: about {gain * share:+.3g} % of the objective"
+        return "the objective is almost zero relative to its slope"
+    return f"changed by {share:g} %: about {gain * share:+.3g} % of the objective"
 
 
 def objective_text(objective: str) -> str:

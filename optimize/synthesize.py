@@ -236,7 +236,7 @@ def _searched(
         missing = _missing(space, objective, demands, options)
         raise ComputationError(
             "no_feasible_start",
-            f"of the random designs in the bounds ({options.starts} starts) none has {missing}; widen the bounds or ask for "
+            f"of the random designs in the bounds ({options.starts} starts) none has {missing}; widen the bounds or choose "
             "another mode",
         )
     return best[0], best[1], best[2]._replace(existing=existing, drawn=drawn)
@@ -276,7 +276,7 @@ def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]
     if mode is None:
         return None, "the objective and the demands belong to no jam mode that could be integrated"
     if not verify:
-        return None, "not asked for"
+        return None, "not requested"
     try:  # the machine that was found is worth more than the check that failed
         orbit = _exact_motion(scene, mode)
         if orbit is None:

@@ -75,7 +75,7 @@ def tiers():
 
 def synthesis():
     outcome = Outcome({"machine.stiffness": [4e4]}, True, 27.0, (1e-3,), 100.0, 1e5)
-    rest = dict(unverified="not asked for", starts=2, drawn=9, converged=1, same=1, objective="amplitude", unit="m")
+    rest = dict(unverified="not requested", starts=2, drawn=9, converged=1, same=1, objective="amplitude", unit="m")
     found = dict(designs=np.zeros((2, 1)), values=np.ones(2), done=np.array([True, False]), history=np.ones((3, 2)))
     told = dict(
         status=SynthesisStatus.done,
@@ -97,7 +97,7 @@ def audited():
     numbers = [NumberRow("lift: R / (M g)", 2.0, 1.0, "perhaps needed", "springs would have to pull")]
     own = dict(kind="jam mode 1", omega=27.0, amplitude=np.ones(1), foundation_force=9.0, fold=90.0, coordinates=("y1",))
     cost = dict(operations=200, seconds=0.1, compile=2.0, effects=rows, tiers=tiers, numbers=numbers)
-    return jv.Audit(status=AuditStatus.done, accuracy=0.01, question="jam mode 1 at 60 rad/s", **own, **cost)
+    return jv.Audit(status=AuditStatus.done, accuracy=0.01, motion="jam mode 1 at 60 rad/s", **own, **cost)
 
 
 def cached(make):

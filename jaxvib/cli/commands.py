@@ -84,7 +84,7 @@ def simulate(
     from jaxvib.ode.progress import ProgressBar  # slow to import, and --help needs none of it
 
     if csv is not None and window:
-        raise InputError("--csv", "goes without --window, which keeps no trajectory to write")
+        raise InputError("--csv", "needs a trajectory, which --window does not keep; leave one of them out")
     loaded = jv.load_scene(scene)
     run = jv.simulate(
         loaded,

@@ -74,7 +74,7 @@ def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...
             table("rotor speeds", ["", "from, rad/s", "to, rad/s"], spans),
         ]
         if check:
-            lines.append(f"exact stability was looked for up to {top:.5g} rad/s")
+            lines.append(f"exact stability was computed up to {top:.5g} rad/s")
         return "\n".join(lines)
 
     output.done(document, text, "criterion", judged)

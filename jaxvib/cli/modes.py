@@ -23,8 +23,8 @@ _RPM = 30.0 / math.pi
 @click.argument("scene", type=click.Path(path_type=Path))
 @SPEED
 @UNIT
-@click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
-@click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
+@click.option("--exact", is_flag=True, help="Exact periodic motions of the full equations, instead of jams of light loads.")
+@click.option("--phases", is_flag=True, help="Jams of light loads at any phases (always for a rotor without --exact).")
 @WITHOUT
 @CSV
 @shared
@@ -50,7 +50,7 @@ def modes(
 
     loaded = loaded_scene(scene, without, speed)
     if exact and phases:
-        raise InputError("--phases", "goes without --exact: jams at unequal phases are known for light loads only")
+        raise InputError("--phases", "was given with --exact; jams at unequal phases are computed for light loads only")
     if exact:
         _exact(loaded, unit, csv, output)
         return
@@ -172,7 +172,7 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
             for jam in jams
         ]
         speed = float(scene.drive.speed)
-        head = ["rad/s", "rpm", "", "loads stand", "at, degrees", "force on bed, N"]
+        head = ["rad/s", "rpm", "", "loads stand", "at, degrees", "foundation force, N"]
         title = f"jams of light loads at any phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
         if not rows:
             return f"no jam at {speed:.5g} rad/s"
@@ -224,7 +224,7 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
             ]
             for k, jam in known.items()
         ]
-        head = ["mode", "rad/s", "rpm", "exactly", "multiplier", *(f"{name}, mm" for name in names), "force on bed, N"]
+        head = ["mode", "rad/s", "rpm", "exactly", "multiplier", *(f"{name}, mm" for name in names), "foundation force, N"]
         points = [[p.kind.replace("_", " "), f"{p.omega:.6g}", f"{p.rotor_speed:.6g}"] for p in diagram.special]
         lines = [
             f"rotor {float(scene.drive.speed):.5g} rad/s ({_RPM * float(scene.drive.speed):.5g} rpm)",

@@ -18,15 +18,11 @@ if TYPE_CHECKING:
 
 @app.command("optimize")
 @click.argument("design", type=click.Path(path_type=Path))
-@click.option("--starts", type=int, help="Random starts, in place of the design file's.")
-@click.option("--seed", type=int, help="Which random starts, in place of the design file's.")
-@click.option(
-    "--searcher", type=click.Choice(["gradients", "cma"]), help="Adam from starts, or CMA-ES, in place of the design file's."
-)
-@click.option(
-    "--resume", type=click.Path(path_type=Path), help="Go on from the search.npz of an earlier search of this design."
-)
-@click.option("--no-verify", is_flag=True, help="Do not check the best machine by its exact motion and by time integration.")
+@click.option("--starts", type=int, help="Number of random starts [as in DESIGN].")
+@click.option("--seed", type=int, help="Seed of the random starts [as in DESIGN].")
+@click.option("--searcher", type=click.Choice(["gradients", "cma"]), help="Adam from many starts, or CMA-ES [as in DESIGN].")
+@click.option("--resume", type=click.Path(path_type=Path), help="search.npz of an earlier search of this design to continue.")
+@click.option("--no-verify", is_flag=True, help="Skip the verification by exact motion and time integration.")
 @shared
 def optimize(
     design: Path,

@@ -192,7 +192,7 @@ def audit_chart(
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     low = max(min([accuracy, *shown]) / 3.0, 1e-8)
     unknown = np.maximum(100.0 * np.nan_to_num(uncertainty), low)
-    left.hlines(place, low, unknown, color=_FLOOR, lw=14, label="cannot be told")
+    left.hlines(place, low, unknown, color=_FLOOR, lw=14, label="not resolved")
     for color, mark, (name, values) in zip(COLORS, "os^D", changes.items(), strict=False):
         if not np.any(np.isfinite(values)):
             continue
@@ -201,7 +201,7 @@ def audit_chart(
     left.set_xscale("log")
     left.set_xlim(left=low)
     log_ticks(left, "x")
-    left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="accuracy asked for")
+    left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="requested accuracy")
     left.set_yticks(place, labels)
     left.set_ylim(n - 0.4, -0.6)
     left.set_xlabel("changes by, %")

@@ -254,9 +254,9 @@ def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
     frequencies, shapes = model.modes()
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
     lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * TRUSTED
-    # A motion of frequency 0 is free to drift unless a spring to the bed resists it.
-    bed = jnp.max(jnp.abs(carrier.bed_stiffness @ x), axis=0)
-    resisted = bed > 1e-3 * jnp.max(jnp.abs(carrier.bed_stiffness)) * jnp.max(jnp.abs(x), axis=0)
+    # A motion of frequency 0 is free to drift unless a spring to the foundation resists it.
+    restoring = jnp.max(jnp.abs(carrier.foundation_stiffness @ x), axis=0)
+    resisted = restoring > 1e-3 * jnp.max(jnp.abs(carrier.foundation_stiffness)) * jnp.max(jnp.abs(x), axis=0)
     return frequencies, jnp.where(w > 0.0, lost, resisted)
 
 

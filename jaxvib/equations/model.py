@@ -30,7 +30,7 @@ class Model(eqx.Module):
 
     def foundation_force(self, displacement: Array, velocity: Array) -> Array:
         """Return the force of all supports on the foundation, gravity excluded, (nb,) N."""
-        force = self.carrier.bed_force(displacement, velocity)
+        force = self.carrier.foundation_force(displacement, velocity)
         for term, rows in zip(terms_of(self.scene.effects, SupportForce), self.supports, strict=True):
             force = force + term.force(rows @ displacement, rows @ velocity)
         return force

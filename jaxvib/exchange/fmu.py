@@ -132,7 +132,7 @@ def export_fmu(
     path = path if path.suffix == ".fmu" else path.with_name(path.name + ".fmu")
     require_writable(path)
     files, statements, identifier = _sources(scene, state, path.stem, fmi, drive)
-    message = "source only: no binary was asked for"
+    message = "source only: no binary was requested"
     library = None
     if binary:
         library, message = _compiled(files, fmi, identifier)

@@ -33,7 +33,7 @@ def force_inputs(carrier: Carrier) -> tuple[Signal, ...]:
 
 def foundation_forces(carrier: Carrier) -> tuple[Signal, ...]:
     """Signals of the force on the foundation."""
-    return tuple(Signal(f"foundation_force.{direction}", "N") for direction in carrier.bed_directions)
+    return tuple(Signal(f"foundation_force.{direction}", "N") for direction in carrier.foundation_directions)
 
 
 def signals_of(names: Sequence[str], unit: str) -> tuple[Signal, ...]:

@@ -185,7 +185,7 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
     model = linear_model(scene)
     carrier, nd = model.carrier, model.mass.shape[0]
     stiffness, damping = carrier.stiffness, model.damping(speed)
-    foundation = [carrier.bed_stiffness, carrier.bed_damping]
+    foundation = [carrier.foundation_stiffness, carrier.foundation_damping]
     rest = jnp.zeros(nd, model.mass.dtype)
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         slopes = [slope @ rows for slope in jax.jacfwd(term.force, (0, 1))(rows @ rest, rows @ rest)]
@@ -255,7 +255,7 @@ def _jam_matrices(
 
     def outputs(x: Array, speed: Array) -> Array:
         moving = amplitudes(x)
-        force = carrier.bed_force(moving.displacement, moving.velocity)
+        force = carrier.foundation_force(moving.displacement, moving.velocity)
         return jnp.concatenate([jnp.mean(moving.rate)[None], magnitude(moving.displacement), magnitude(force)])
 
     turned = displacement * jnp.exp(-1j * phase[0])

@@ -33,7 +33,7 @@ class Carrier(eqx.Module):
     - `mass` M (nd, nd), kg, of tilts kg m^2; typical: 50 to 5000 kg, of rotors 5 to 50 kg
     - `damping` C (nd, nd), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(K M)
     - `stiffness` K (nd, nd), N/m; typical: 1e4 to 1e6
-    - `bed_stiffness` T_K and `bed_damping` T_C (nb, nd): the supports on the foundation, N/m and N s/m
+    - `foundation_stiffness` T_K and `foundation_damping` T_C (nb, nd): the supports on the foundation, N/m and N s/m
     - `coordinates` (nd,): the name of each coordinate
     - `coordinate_units` (nd,): the unit of each coordinate, "m" or "rad"; None if all are "m"
 
@@ -50,8 +50,8 @@ class Carrier(eqx.Module):
     mass: Array
     damping: Array
     stiffness: Array
-    bed_stiffness: Array
-    bed_damping: Array
+    foundation_stiffness: Array
+    foundation_damping: Array
     coordinates: tuple[str, ...] = eqx.field(static=True)
     coordinate_units: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
@@ -66,11 +66,11 @@ class Carrier(eqx.Module):
         return self.coordinate_units or ("m",) * len(self.coordinates)
 
     @property
-    def bed_directions(self) -> tuple[str, ...]:
+    def foundation_directions(self) -> tuple[str, ...]:
         """Names of the directions of the force on the foundation, (nb,): "up", or "across" and "up"."""
-        return ("up",) if self.bed_stiffness.shape[0] == 1 else ("across", "up")
+        return ("up",) if self.foundation_stiffness.shape[0] == 1 else ("across", "up")
 
-    def bed_force(self, displacement: Array, velocity: Array) -> Array:
+    def foundation_force(self, displacement: Array, velocity: Array) -> Array:
         """Return the force on the foundation, T_K q + T_C q', (nb,) N, without effects.
 
         **Arguments**
@@ -78,7 +78,7 @@ class Carrier(eqx.Module):
         - `displacement` q (nd,), m, of tilts rad; complex amplitudes are allowed
         - `velocity` q' (nd,), m/s, of tilts rad/s
         """
-        return self.bed_stiffness @ displacement + self.bed_damping @ velocity
+        return self.foundation_stiffness @ displacement + self.foundation_damping @ velocity
 
 
 class Machine(Part):
@@ -98,7 +98,8 @@ class Machine(Part):
     ...
     ...     def carrier(self):
     ...         mass, stiffness, no = self.mass[None, None], self.stiffness[None, None], jnp.zeros((1, 1))
-    ...         return jv.Carrier(mass, no, stiffness, bed_stiffness=stiffness, bed_damping=no, coordinates=("y1",))
+    ...         return jv.Carrier(mass, no, stiffness, foundation_stiffness=stiffness, foundation_damping=no,
+    coordinates=("y1",))
     ...
     ...     def mount(self):
     ...         return jv.Mount(rows=(jnp.ones((1, 1)),), axes=(1,))

@@ -363,7 +363,7 @@ damping = 40.0              # N s/m
 [machine]
 kind = "two_mass"
 mass = [120.0, 117.6]       # kg; of platform 2 with the auto-balancer's body, loads not counted
-stiffness = [5.0e4, 5.0e4]  # N/m, of the supports to the bed
+stiffness = [5.0e4, 5.0e4]  # N/m, of the supports to the foundation
 damping = [40.0, 40.0]      # N s/m
 link_stiffness = 2.0e5      # N/m, between the platforms
 link_damping = 60.0         # N s/m

@@ -62,8 +62,8 @@ class Platforms(Machine):
             mass=self.mass[None] * np.eye(n, dtype=self.mass.dtype),
             damping=assembled(self.damping, self.link_damping),
             stiffness=assembled(self.stiffness, self.link_stiffness),
-            bed_stiffness=self.stiffness[None, :],
-            bed_damping=self.damping[None, :],
+            foundation_stiffness=self.stiffness[None, :],
+            foundation_damping=self.damping[None, :],
             coordinates=tuple(f"y{i + 1}" for i in range(n)),
         )
 

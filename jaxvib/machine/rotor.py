@@ -77,8 +77,8 @@ class Rotor(Machine):
             mass=matrix(self.mass, zero, self.transverse_inertia),
             damping=matrix(*damping),
             stiffness=matrix(*stiffness),
-            bed_stiffness=stiffness[0] * across + stiffness[1] * tilt,
-            bed_damping=damping[0] * across + damping[1] * tilt,
+            foundation_stiffness=stiffness[0] * across + stiffness[1] * tilt,
+            foundation_damping=damping[0] * across + damping[1] * tilt,
             coordinates=("y", "z", "theta", "psi"),
             coordinate_units=("m", "m", "rad", "rad"),
         )
@@ -240,8 +240,8 @@ class PlanarRotor(Machine):
             mass=self.mass * eye,
             damping=self.damping * eye,
             stiffness=self.stiffness * eye,
-            bed_stiffness=self.stiffness * eye,
-            bed_damping=self.damping * eye,
+            foundation_stiffness=self.stiffness * eye,
+            foundation_damping=self.damping * eye,
             coordinates=("y", "z"),
         )
 

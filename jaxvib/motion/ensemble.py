@@ -62,8 +62,8 @@ class EnsembleStatus(eqx.Enumeration):
     """Outcomes of a run of an ensemble; the members are the sentences a user reads."""
 
     done = "the run reached its end"
-    detached = "the run reached its end, but on the way a load did not press on its track and was kept on it all the same"
-    not_finite = "the motion grew beyond all bounds"
+    detached = "the run reached its end, but on the way a load lost contact with its track; the equations keep it there"
+    not_finite = "the motion grew without bounds"
     refused = REFUSED
     not_resolved = "the steps are too long for the decay of the loads by drag, or of the machine by damping: give more steps"
 

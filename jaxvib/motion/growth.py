@@ -155,10 +155,10 @@ def growth(
     scene = validate_scene(scene)
     if not scene.drive.constant:
         raise InputError(
-            "drive", f"is {quoted(scene.drive.kind)}; how disturbances grow is asked under a constant speed: use ConstantSpeed"
+            "drive", f"is {quoted(scene.drive.kind)}; the growth of disturbances needs a constant speed, use ConstantSpeed"
         )
     if count(stretches, "stretches") < 8:
-        raise InputError("stretches", f"is {stretches}; at least 8 are needed to tell a rate from its scatter")
+        raise InputError("stretches", f"is {stretches}; at least 8 are needed to estimate the scatter of the rate")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
     state = start_state(scene, start, mode, separation)
     stretch, unit = whole_turns(scene, end / stretches), natural_units(scene)

@@ -121,7 +121,7 @@ def plan_run(
     known = is_known(scene, end, state)
     is_estimated = isinstance(control, StepControl) and (known if estimate is None else estimate)
     if isinstance(steps, Accuracy) and not known:
-        raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
+        raise InputError("accuracy", "repeats the run and cannot be used inside jit, grad or vmap; use Tolerance(...)")
     is_rate_needed = known or max_steps is None or is_estimated
     fastest = numpy_of_known(frequency_bounds(scene)[0]) if is_rate_needed else np.asarray(np.nan, end.dtype)
     stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
@@ -193,7 +193,7 @@ def _enough_samples(scene: Scene, end: Array) -> int:
 def _sample_size(scene: Scene) -> float:
     """Bytes of a kept state with its forces, held three times while it is computed."""
     structure, coordinates = scene.machine.structure(), len(scene.loads.rest())
-    numbers = 2 * structure.mass.shape[0] + 2 * coordinates * scene.loads.count + structure.bed_stiffness.shape[0] + 5
+    numbers = 2 * structure.mass.shape[0] + 2 * coordinates * scene.loads.count + structure.foundation_stiffness.shape[0] + 5
     return 3.0 * scene.drive.speed.dtype.itemsize * numbers
 
 

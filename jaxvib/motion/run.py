@@ -48,9 +48,9 @@ class RunStatus(eqx.Enumeration):
 
     done = "the run reached its end"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
-    not_finite = "the motion grew beyond all bounds"
+    not_finite = "the motion grew without bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
-    not_accurate = "the run reached its end, but its estimated error is larger than the accuracy that was asked for"
+    not_accurate = "the run reached its end, but its estimated error is larger than the requested accuracy"
     no_start = "the state to start from does not exist or is not finite"
     beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
     creeping = (
@@ -150,7 +150,7 @@ class Run(AbstractMeasured, Result):
         if not np.any(np.isfinite(times)):
             return []
         left = ", ".join(f"{j + 1} at {t:.6g} s" for j, t in enumerate(times) if np.isfinite(t))
-        return [f"  detached: loads do not press on their track (load {left}), and were kept on it all the same"]
+        return [f"  detached: loads lost contact with their track (load {left}); the equations keep them there"]
 
     @property
     def regime(self) -> Regime:
@@ -189,7 +189,7 @@ class Run(AbstractMeasured, Result):
             [np.asarray(x) for x in (t.time, t.state.displacement, t.state.azimuth_rate, t.rotor_speed, t.foundation_force)]
             for t in (self.window if self.trajectory is None else self.trajectory, self.window)
         )
-        named = dict(names=structure.coordinates, units=structure.units, directions=structure.bed_directions)
+        named = dict(names=structure.coordinates, units=structure.units, directions=structure.foundation_directions)
         return time_histories(whole, end, **named, unit=unit, ax=ax)
 
     @validated

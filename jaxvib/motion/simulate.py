@@ -349,5 +349,5 @@ def _hint(plan: RunPlan, run: Run, name: str) -> str:
         most = plan.integration.max_steps
         hint += f" ({most} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
     if name == "not_accurate":
-        hint += f" ({float(run.error):.1e}, asked for {plan.accuracy:.1e}); give a larger accuracy, or a shorter run"
+        hint += f" ({float(run.error):.1e}; requested {plan.accuracy:.1e}); give a larger accuracy, or a shorter run"
     return hint

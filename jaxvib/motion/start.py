@@ -88,7 +88,7 @@ def initial_state(
     if start not in ("rest", "jam", "spin_up"):
         raise InputError("start", f"is {quoted(start)}; it must be 'rest', 'jam' or 'spin_up'")
     if start != "jam" and mode is not None:
-        raise InputError("mode", f"is {quoted(mode)}, which goes with start='jam' only; leave it out or start in a jam")
+        raise InputError("mode", f"is {quoted(mode)}, for start='jam' only; leave it out or start in a jam")
     scene = validate_scene(scene)
     n = scene.loads.count
     mass = scene.machine.structure().mass
@@ -217,7 +217,7 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
     """
     if not (isinstance(start, str) and start == "spin_up"):
         if spin_up is not None:
-            raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
+            raise InputError("spin_up", "is for start='spin_up' only; leave it out or start with 'spin_up'")
         return scene
     if not scene.drive.constant:
         raise InputError("start", f"is 'spin_up', but the drive is {quoted(scene.drive.kind)} already; start at 'rest'")

@@ -49,7 +49,7 @@ def status_names(status: eqx.Enumeration) -> np.ndarray:
     try:
         numbers = np.asarray(numbers)
     except jax.errors.TracerArrayConversionError as error:
-        raise TypeError("a status under a JAX transformation has no name yet; look at it outside") from error
+        raise TypeError("a status under a JAX transformation has no name yet; read it outside of jit, grad and vmap") from error
     return np.asarray(enumeration_names(enumeration_of(status)))[numbers]
 
 
@@ -74,7 +74,7 @@ def sentence(status: eqx.Enumeration) -> str:
         return enumeration[getattr(enumeration, str(names))]
     counts = {name: int(np.sum(names == name)) for name in enumeration_names(enumeration)}
     parts = [f"{enumeration[getattr(enumeration, name)]} ({k} of {names.size})" for name, k in counts.items() if k]
-    return "; ".join(parts) or "there is none"
+    return "; ".join(parts) or "no members"
 
 
 def failure(status: eqx.Enumeration, hint: str = "") -> ComputationError:

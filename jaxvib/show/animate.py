@@ -1,4 +1,4 @@
-"""Films of a machine as it moves: platforms, springs, rotor, loads, and the forces on the bed."""
+"""Films of a machine as it moves: platforms, springs, rotor, loads, and the forces on the foundation."""
 
 from __future__ import annotations
 
@@ -103,7 +103,9 @@ def animate(
     count = round(float(np.clip(pictures, 2, _MAX_PICTURES)))
     if turns / count > _TURN:
         most = first + _TURN * 2.0 * np.pi * count / speed
-        problem = f"makes the rotor go on by {turns / count:.3g} turns from one picture to the next, which deceives the eye"
+        problem = (
+            f"advances the rotor by {turns / count:.3g} turns from one picture to the next, which looks like another speed"
+        )
         raise InputError("end", f"{problem}; end at {most:.4g} s or before, or let the film last more seconds")
     # An orbit closes: its last picture is the one before its first.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
@@ -120,7 +122,7 @@ def animate(
 def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
     if isinstance(motion, Run):
         if scene is not None:
-            raise InputError("scene", "goes with an Orbit only; a run has its own")
+            raise InputError("scene", "is for an Orbit only, a run has its own scene; leave it out")
         return motion.scene
     if not isinstance(motion, Orbit):
         raise InputError("motion", f"is a {type(motion).__name__}; give a Run, or an Orbit with its scene")
@@ -198,7 +200,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
         for artist, part in zip(artists, parts(k), strict=True):
             _move(artist, part.points)
         total = " ".join(f"{force:8.0f}" for force in shown.force[k])
-        clock.set_text(f"t = {shown.time[k]:8.3f} s    force on the bed {total} N")
+        clock.set_text(f"t = {shown.time[k]:8.3f} s    foundation force {total} N")
         for cursor in cursors:
             cursor.set_xdata([shown.time[k]] * 2)
 
@@ -224,9 +226,9 @@ def _strips(axes: tuple[Axes, Axes], scene: Scene, shown: Stretch) -> list[Line2
         upper.plot(shown.time, 1e3 * shown.displacement[:, k], label=label, **look)
     upper.set_ylabel("mm, mrad" if "rad" in structure.units else "mm")
     legend_above(upper, 6)
-    for k, name in enumerate(structure.bed_directions):
+    for k, name in enumerate(structure.foundation_directions):
         look = {"color": "black" if k else COLORS[1], "ls": STROKES[k], "lw": 1.2}
-        lower.plot(shown.time, shown.force[:, k], label=f"force on the bed, {name}", **look)
+        lower.plot(shown.time, shown.force[:, k], label=f"foundation force, {name}", **look)
     lower.set_ylabel("N")
     lower.set_xlabel("time, s")
     legend_above(lower)

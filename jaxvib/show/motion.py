@@ -22,7 +22,7 @@ _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
 
 class Stretch(NamedTuple):
     """A motion at some times (nt,) s: `displacement`, `velocity` (nt, nd), the loads' coordinates `angle`, (nt, count) each,
-    the rotor's `turn` (nt,) rad, the `force` on the bed (nt, nb) N."""
+    the rotor's `turn` (nt,) rad, the `force` on the foundation (nt, nb) N."""
 
     time: np.ndarray
     displacement: np.ndarray
@@ -76,7 +76,7 @@ def _kept(run: Run, time: np.ndarray) -> Trajectory:
         if float(states.time[0]) - slack <= time[0] and time[-1] <= float(states.time[-1]) + slack:
             return states
     first, last = float(kept[-1].time[0]), float(kept[-1].time[-1])
-    problem = f"asks for {time[0]:.6g} to {time[-1]:.6g} s; the run keeps {first:.6g} to {last:.6g} s"
+    problem = f"selects {time[0]:.6g} to {time[-1]:.6g} s; the run keeps {first:.6g} to {last:.6g} s"
     raise InputError("begin", problem + ("" if run.trajectory is not None else " (simulate with save='all' for the rest)"))
 
 

@@ -22,8 +22,8 @@ _SECONDS = 1.6
 
 
 def moving(scene: Scene, jam: Jam) -> str:
-    """The sketch of a scene, moving as a jam mode says, with the forces on the bed as arrows; the rotor runs ahead of the loads
-    at its own speed. Loads stand where they stay together, upon each other.
+    """The sketch of a scene, moving as a jam mode says, with the forces on the foundation as arrows; the rotor runs ahead of
+    the loads at its own speed. Loads stand where they stay together, upon each other.
 
     **Arguments**: `scene` of platforms, and a `jam` of it, from `jam_modes`.
 

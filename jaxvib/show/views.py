@@ -55,7 +55,9 @@ class View(abc.ABC):
         self.mass, self.stiffness, self.damping = (
             np.asarray(x, float) for x in (carrier.mass, carrier.stiffness, carrier.damping)
         )
-        self.bed_stiffness, self.bed_damping = (np.asarray(x, float) for x in (carrier.bed_stiffness, carrier.bed_damping))
+        self.foundation_stiffness, self.foundation_damping = (
+            np.asarray(x, float) for x in (carrier.foundation_stiffness, carrier.foundation_damping)
+        )
 
     @abc.abstractmethod
     def parts(self, pose: Pose, reach: float) -> list[Part]:
@@ -82,7 +84,7 @@ class View(abc.ABC):
         """Force of each support on the foundation, (supports, 2) N across and up, without supports that are effects."""
 
     def arrows(self, pose: Pose, total: np.ndarray, per_newton: float) -> list[Part]:
-        """The forces on the bed as arrows: of each support where it stands, and the `total` (nb,) N, darker, beside the
+        """The forces on the foundation as arrows: of each support where it stands, and the `total` (nb,) N, darker, beside the
         machine.
         """
         whole = (0.0, float(total[0])) if total.size == 1 else (float(total[0]), float(total[1]))
@@ -96,7 +98,7 @@ class View(abc.ABC):
 
 
 class PlatformView(View):
-    """Platforms above each other, numbered from the bed upward, each spring in a lane of its own."""
+    """Platforms above each other, numbered from the foundation upward, each spring in a lane of its own."""
 
     pitch, thick, lane = 1.9, 0.34, 2.0
 
@@ -105,7 +107,9 @@ class PlatformView(View):
         n = self.mass.shape[0]
         self.rows = [np.asarray(scene.machine.rows_at(level))[0] for level in range(1, n + 1)]
         self.exciter = int(np.argmax(self.rows @ np.asarray(self.mount.rows[0])[0])) + 1
-        self.ties = [Tie(0, i + 1, float(self.bed_stiffness[0, i]), float(self.bed_damping[0, i])) for i in range(n)]
+        self.ties = [
+            Tie(0, i + 1, float(self.foundation_stiffness[0, i]), float(self.foundation_damping[0, i])) for i in range(n)
+        ]
         self.ties += [
             Tie(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j])) for j in range(n) for i in range(j)
         ]
@@ -126,7 +130,7 @@ class PlatformView(View):
         return level * self.pitch + (reach * float(self.rows[level - 1] @ pose.displacement) if level else 0.0)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """The bed, the springs and dampers, the platforms, the exciter."""
+        """The foundation, the springs and dampers, the platforms, the exciter."""
         found = [Part(ground((-0.2, 0.0), (self.width, 0.0)), _BED)]
         for k, tie in enumerate(self.ties):
             if not tie.exciter:
@@ -164,7 +168,7 @@ class PlatformView(View):
 
     def support_forces(self, pose: Pose) -> np.ndarray:
         """k_i y_i + b_i y_i', upward."""
-        force = self.bed_stiffness[0] * pose.displacement + self.bed_damping[0] * pose.velocity
+        force = self.foundation_stiffness[0] * pose.displacement + self.foundation_damping[0] * pose.velocity
         return np.array([[0.0, force[tie.high - 1]] for tie in self.ties if tie.low == 0])
 
 
@@ -183,9 +187,9 @@ class FrontView(View):
         return float(across), float(up)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """The bed below and a wall to the left, springs and dampers, the rotor."""
+        """The foundation below and a wall to the left, springs and dampers, the rotor."""
         x, y = self._centre(pose, reach)
-        k, c = self.bed_stiffness[1], self.bed_damping[1]
+        k, c = self.foundation_stiffness[1], self.foundation_damping[1]
         stiffness, damping = float(np.max(k)), float(np.max(c))
         found = [Part(ground((-1.2, -2.4), (1.6, -2.4)), _BED), Part(ground((-2.7, 1.2), (-2.7, -1.6)), _BED)]
         found += _tie((x, -2.4), (x, y - self.wheel.rim), stiffness, damping)
@@ -218,7 +222,7 @@ class FrontView(View):
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """The mass, and the support's numbers, which hold both ways."""
-        label = _spring_text(float(np.max(self.bed_stiffness[1])), float(np.max(self.bed_damping[1])))
+        label = _spring_text(float(np.max(self.foundation_stiffness[1])), float(np.max(self.foundation_damping[1])))
         small: Look = {"fontsize": "small"}
         mass = f"M = {shown(float(self.mass[0, 0]), 'kg')}"
         found = [
@@ -231,12 +235,12 @@ class FrontView(View):
         ]
 
     def supports(self) -> list[tuple[float, float]]:
-        """The feet on the bed and on the wall."""
+        """The feet on the foundation and on the wall."""
         return [(0.0, -2.4), (-2.7, 0.0)]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """T_K q + T_C q': up on the bed, across on the wall."""
-        force = self.bed_stiffness @ pose.displacement + self.bed_damping @ pose.velocity
+        """T_K q + T_C q': up on the foundation, across on the wall."""
+        force = self.foundation_stiffness @ pose.displacement + self.foundation_damping @ pose.velocity
         return np.array([[0.0, force[1]], [force[0], 0.0]])
 
 
@@ -263,7 +267,7 @@ class ShaftView(View):
         return reach * float(self._rows(float(s))[axis] @ pose.displacement)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """The bed, supports, shaft and body, a disc at each station with its loads, and the rotor along its axis."""
+        """The foundation, supports, shaft and body, a disc at each station with its loads, and the rotor along its axis."""
         found = [Part(ground((-3.2, -2.2), (3.2, -2.2)), _BED)]
         for s, k, c in self.stands:
             found += _tie((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)

@@ -296,7 +296,7 @@ def _require_springs(stiffness: np.ndarray) -> None:
     """**Raises** `InputError` if a motion of the rotor has no spring."""
     if not _held(stiffness):
         single = stiffness.dtype.itemsize < 8
-        problem = "leaves a motion of the rotor without a spring" + (", as far as single precision can tell" if single else "")
+        problem = "leaves a motion of the rotor without a spring" + (", within single precision" if single else "")
         raise InputError(
             "machine.stiffness", f"{problem}; give every motion one{', or use double precision' if single else ''}"
         )

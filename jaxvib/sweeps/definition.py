@@ -43,8 +43,8 @@ class CaseStatus(eqx.Enumeration):
 
     missing = "the case was not computed yet"
     done = "the case was computed"
-    absent = "something that was asked for does not exist in this case, such as a jam beyond its fold"
-    not_finite = "the motion grew beyond all bounds"
+    absent = "a requested quantity does not exist in this case, such as a jam beyond its fold"
+    not_finite = "the motion grew without bounds"
     failed = "an error was raised, see the sentence beside it"
     lost = "the worker that computed it died, several times"
 
@@ -57,7 +57,7 @@ class SweepStatus(eqx.Enumeration):
     """Progress of a study. Each member is the sentence shown to the user."""
 
     done = "every case was computed"
-    partly = "not every case was computed yet; run the study again to go on"
+    partly = "not every case was computed yet; run the study again to continue"
 
 
 @dataclass(frozen=True)

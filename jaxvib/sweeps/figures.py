@@ -93,7 +93,7 @@ def figures(
     if len(grid) >= 2:
         yield "map", plot_map(store, measure, x=x, y=y, theory=theory)
     elif x or y:
-        raise InputError("--over", f"asks for a map, which needs two axes; this study has: {', '.join(grid) or 'none'}")
+        raise InputError("--over", f"selects a map, which needs two axes; this study has:  {', '.join(grid) or 'none'}")
     if grid and _has_labels(opened):
         yield "shares", plot_shares(store, x)
     if measure is not None or any(not _is_label(opened, name) for name in opened.names):

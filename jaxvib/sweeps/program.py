@@ -103,7 +103,7 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
     step, implicit = steps_of(float(np.max(fastest)), float(np.max(decay)), 1.0, given)
     if until / step > _MAX_STEPS:
         name = "until" if steps is None else "steps"
-        raise InputError(name, f"asks for {until / step:.3g} steps of every run; take a shorter run or fewer steps")
+        raise InputError(name, f"needs {until / step:.3g} steps for every run; give a shorter run or fewer steps")
     each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
     # a number that is whole but for rounding stays what it is
     counts = (int(np.ceil(x - 1e-9)) or 1 for x in (each, between))

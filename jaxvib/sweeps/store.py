@@ -134,7 +134,7 @@ class Store:
         """**Raises** `InputError` if the store is of another study, or of other versions, or if that cannot be told."""
         for name, mine in study.identities.items():
             if isinstance(mine, dict) and UNKNOWN in mine and self.record["measure"].get(name) != mine:
-                problem = f"{mine[UNKNOWN]}, so that nobody can tell if the numbers in {str(self.path)!r} are its own"
+                problem = f"{mine[UNKNOWN]}; the numbers in {str(self.path)!r} may be of other code"
                 raise InputError(f"measure.{name}", f"{problem}; name another store")
         if (found := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
             name, mine, its = found[0].replace(".tuple[", "[").replace(".dict[", "["), *found[1:]
@@ -145,7 +145,7 @@ class Store:
         for name, version in versions().items():
             if self.attributes["versions"].get(name) != version:
                 begun = f"was begun with {name} {self.attributes['versions'].get(name)}, and this is {version}"
-                raise InputError("store", f"{begun}: digits would differ; go on with that version, or name another store")
+                raise InputError("store", f"{begun}: digits would differ; continue with that version, or name another store")
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -296,7 +296,7 @@ def _short(value: Plain) -> str:
 def cannot_write(path: Path, error: OSError) -> InputError:
     """The error to raise where a store cannot be written: finished chunks are safe all the same."""
     why = error.strerror or str(error)
-    advice = "make room or name another store; chunks that are finished are kept, and the same command goes on from there"
+    advice = "make room or name another store; finished chunks are kept, run the same command again to continue"
     return InputError("store", f"is {quoted(str(path))}, which cannot be written ({why}); {advice}")
 
 

@@ -75,7 +75,7 @@ def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
 
     monkeypatch.setattr(command._Lines, "__call__", stop_once)
     code, _, err = typed("sweep", "study.toml")
-    assert code == 1 and "what is finished is kept in study.zarr; the same command goes on from there" in err
+    assert code == 1 and "finished cases are kept in study.zarr; run the same command again to continue" in err
     code, out, _ = typed("show", "study.zarr")
     assert code == 0 and "not every case was computed yet" in out and "6 missing" in out
     assert "6 of them in this call" in typed("sweep", "study.toml")[1]

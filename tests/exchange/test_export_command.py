@@ -24,7 +24,7 @@ def exported(capsys, *words):
 
 def test_units_are_exported(machine, tmp_path, capsys):
     code, document = exported(capsys, machine, "--to", "fmu", "--out", tmp_path / "m.fmu", "--fmi", "3.0", "--source-only")
-    assert code == 0 and document["message"] == "source only: no binary was asked for" and (tmp_path / "m.fmu").is_file()
+    assert code == 0 and document["message"] == "source only: no binary was requested" and (tmp_path / "m.fmu").is_file()
 
 
 def test_state_space_of_a_jam_is_exported(machine, tmp_path, capsys):

@@ -114,7 +114,7 @@ def test_unit_is_valid_and_has_the_rates_of_the_field(name, fmi, opened):
     given = machine.value(*rates_of(found))
     np.testing.assert_allclose(given, list(expected.values()), rtol=1e-10, atol=1e-10 * np.max(np.abs(given)))
     force = jv.foundation_force(found.scene, state)
-    names = [f"foundation_force.{each}" for each in found.scene.machine.structure().bed_directions]
+    names = [f"foundation_force.{each}" for each in found.scene.machine.structure().foundation_directions]
     np.testing.assert_allclose(machine.value(*names), force, rtol=1e-12)
 
 

@@ -20,8 +20,8 @@ class Rotor(jv.Machine):
             mass=jnp.diag(jnp.array([37.0, 37.0, 0.479, 0.479])),
             damping=jnp.kron(plane, jnp.eye(2)) * 300.0,
             stiffness=jnp.kron(plane, jnp.diag(self.stiffness)),
-            bed_stiffness=jnp.zeros((2, 4)),
-            bed_damping=jnp.zeros((2, 4)),
+            foundation_stiffness=jnp.zeros((2, 4)),
+            foundation_damping=jnp.zeros((2, 4)),
             coordinates=("y", "z", "theta", "psi"),
             coordinate_units=("m", "m", "rad", "rad"),
         )

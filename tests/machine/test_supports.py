@@ -13,7 +13,7 @@ def test_a_stop_never_pulls(side, sign):
     (support,) = jv.Stop(1e4, gap=1e-3, damping=100.0, side=side).terms()
 
     def force(beyond, rate):
-        """Away from the bed's side, N: what presses is positive."""
+        """Away from the foundation's side, N: what presses is positive."""
         return sign * float(support.force(jnp.full(1, sign * (1e-3 + beyond)), jnp.full(1, sign * rate))[0])
 
     np.testing.assert_allclose(force(2e-3, 0.3), 1e4 * 2e-3 + 100.0 * 0.3)

@@ -76,7 +76,7 @@ def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
     # So long that rounding alone makes more than this error.
     run = jv.simulate(s, 200.0, **asked, throw=False)
     assert bool(run.status == jv.RunStatus.not_accurate) and float(run.error) > 1e-12
-    with pytest.raises(jv.ComputationError, match=r"asked for 1\.0e-12") as caught:
+    with pytest.raises(jv.ComputationError, match=r"requested 1\.0e-12") as caught:
         jv.simulate(s, 200.0, **asked)
     assert caught.value.status == "not_accurate"
 
@@ -111,7 +111,7 @@ def test_accuracy_looks_at_numbers():
     def omega(n):
         return jv.simulate(eqx.tree_at(lambda x: x.drive.speed, s, n), 1.0, stepsize_controller=jv.Accuracy(1e-4)).omega
 
-    with pytest.raises(jv.InputError, match="under a JAX transformation give a Tolerance"):
+    with pytest.raises(jv.InputError, match="use Tolerance"):
         stored_jit(omega)(jnp.asarray(2.0))
 
 

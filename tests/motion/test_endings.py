@@ -107,7 +107,7 @@ def test_where_a_run_blew_up_is_said(stiffness):
     """Loads are flung round ever faster, so that steps get smaller without end: more of them would not help."""
     soft = scene("one_mass", "rollers", speed=60.0, effects=(jv.CubicSupport(stiffness),))
     start = jv.State(jnp.asarray([0.01]), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
-    with pytest.raises(jv.ComputationError, match="the motion grew beyond all bounds") as error:
+    with pytest.raises(jv.ComputationError, match="the motion grew without bounds") as error:
         jv.simulate(soft, 5.0, start=start, max_steps=2000)
     assert error.value.status == "not_finite" and (stiffness < -1e10 or ", after t = 0.02" in str(error.value))
 

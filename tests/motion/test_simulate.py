@@ -29,13 +29,13 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
         (dict(start="warm"), "start is 'warm'; it must be 'rest', 'jam' or 'spin_up'"),
         (dict(start="jam"), "mode is missing"),
         (dict(start="jam", mode=9), "mode is 9; this machine's jam modes are numbered 1 to 5"),
-        (dict(mode=3), "mode is 3, which goes with start='jam' only"),
+        (dict(mode=3), "mode is 3, for start='jam' only"),
         (
             dict(stepsize_controller=jv.Tolerance(1e-17)),
             "tolerance is 1e-17; in float64 it must be at least 2.3e-15 and less than 1",
         ),
         (dict(stepsize_controller=jv.Tolerance(2.0)), "tolerance is 2.0; in float64"),
-        (dict(spin_up=3.0), "spin_up goes with start='spin_up' only"),
+        (dict(spin_up=3.0), "spin_up is for start='spin_up' only"),
         (dict(start="spin_up", spin_up=-3.0), "drive.duration is -3 s; it must be greater than 0"),
         (dict(save="none"), "save is 'none'; it must be 'all' or 'window'"),
         (dict(samples=1), "samples is 1; it must be a whole number, at least 2"),
@@ -61,8 +61,9 @@ def test_steps_resolve_what_effects_add_to_the_fastest_load():
 
 @pytest.mark.parametrize("s", [scene("two_mass", "balls"), torus.scene()], ids=["angles", "angles and places in a tube"])
 def test_a_sample_takes_what_is_kept_of_it(s):
-    """The state, the force on the bed, time, angle and speed of the rotor, 8 bytes each, three times; two more may be spare."""
-    force = s.machine.carrier().bed_stiffness.shape[0]
+    """The state, the force on the foundation, time, angle and speed of the rotor, 8 bytes each, three times; two more may be
+    spare."""
+    force = s.machine.carrier().foundation_stiffness.shape[0]
     kept = sum(leaf.size for leaf in jax.tree.leaves(jv.initial_state(s))) + force + 3
     assert 24.0 * kept <= _sample_size(s) <= 24.0 * (kept + 2)
 
@@ -204,10 +205,10 @@ def test_next_tolerance_has_a_safety_margin(monkeypatch):
 
 def test_a_run_to_an_accuracy_that_needs_more_steps_says_so(monkeypatch):
     run, asked = small_run(save="window"), jv.Accuracy(1e-6)
-    for status, says in ((jv.RunStatus.max_steps_reached, "64 steps"), (jv.RunStatus.not_accurate, "asked for 1.0e-06")):
+    for status, says in ((jv.RunStatus.max_steps_reached, "64 steps"), (jv.RunStatus.not_accurate, "requested 1.0e-06")):
         failed = dataclasses.replace(run, status=status)
         monkeypatch.setattr("jaxvib.motion.simulate._run_to_accuracy", lambda *_, failed=failed: failed)
         with pytest.raises(jv.ComputationError) as error:
             jv.simulate(run.scene, 20.0, save="window", stepsize_controller=asked, max_steps=64)
         assert says in str(error.value)
-        assert ("asked for" in str(error.value)) == (status is jv.RunStatus.not_accurate)
+        assert ("requested" in str(error.value)) == (status is jv.RunStatus.not_accurate)

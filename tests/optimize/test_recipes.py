@@ -104,7 +104,8 @@ def test_lightest_exciter_gives_exactly_the_requested_amplitude():
 
 @pytest.mark.slow
 def test_antiphase_machine_has_equal_partial_frequencies():
-    """Little damped platforms in antiphase leave the bed alone where M1 y1 + M2 y2 = 0 and k1 y1 + k2 y2 = 0: k1/M1 = k2/M2."""
+    """Little damped platforms in antiphase leave the foundation alone where M1 y1 + M2 y2 = 0 and k1 y1 + k2 y2 = 0: k1/M1 =
+    k2/M2."""
     light = eqx.tree_at(
         lambda s: (s.machine.damping, s.machine.link_damping), SCENE, (jnp.array([0.04, 0.02]), jnp.array([0.06]))
     )

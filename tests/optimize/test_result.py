@@ -34,7 +34,7 @@ def test_results_are_given_in_the_units_of_designers(searched):
     influences = (*(Influence(f"number {k}", float(k), -float(k) / 2.0) for k in range(7)), Influence("last", -1.5, 9.0))
     machines = (Machine(3, 2e4, (1.0,)), Machine(1, 3e4, (2.0,)))
     said = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines).findings()
-    assert said[0] == "  at its limit: first at most 2 mm (2 mm); moved by 1 %: about -0.5 % of the objective"
+    assert said[0] == "  at its limit: first at most 2 mm (2 mm); changed by 1 %: about -0.5 % of the objective"
     assert said[1] == "  not met: second at most 3 mm; at best 3.3 mm, 10 % off"
     assert said[2] == "  met: third at most 4 mm (1 mm)"
     assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
@@ -54,11 +54,11 @@ def test_rows_are_in_units_of_the_largest_value(searched):
     )
     rows = dataclasses.replace(searched, table=table).rows()
     assert rows == [["a, N/mm", "0.5", "2", "", ""], ["b", "-3", "1", "2", ""], ["c, s", "", "", "", ""]]
-    summary = dataclasses.replace(searched, table=table, unverified="not asked for").summary().splitlines()
+    summary = dataclasses.replace(searched, table=table, unverified="not requested").summary().splitlines()
     assert (
         summary[0].startswith("least off by: the search ended where") and "2 starts (2 drawn), 2 converged, 2 to" in summary[1]
     )
-    assert "  not verified: not asked for" in summary
+    assert "  not verified: not requested" in summary
     columns = [line.index(word) + len(word) for line, word in zip(summary[2:5], ("before", "0.5", "-3"), strict=True)]
     assert len(set(columns)) == 1
     assert objective_text("negative foundation_force") == "greatest foundation force"
@@ -90,11 +90,11 @@ def test_shortfalls_are_told_in_a_designers_units():
 @pytest.mark.parametrize(
     ("gain", "says"),
     [
-        (-10.0, "moved by 1 %: about -10 % of the objective"),
-        (10.1, "moved by 0.1 %: about +1.01 % of the objective"),
-        (-2833.0, "moved by 0.001 %: about -2.83 % of the objective"),  # not -1360 N of a force of 48 N
-        (1e12, "beside its slope the objective is almost nothing"),
-        (0.0, "moved by 1 %: about +0 % of the objective"),
+        (-10.0, "changed by 1 %: about -10 % of the objective"),
+        (10.1, "changed by 0.1 %: about +1.01 % of the objective"),
+        (-2833.0, "changed by 0.001 %: about -2.83 % of the objective"),  # not -1360 N of a force of 48 N
+        (1e12, "the objective is almost zero relative to its slope"),
+        (0.0, "changed by 1 %: about +0 % of the objective"),
     ],
 )
 def test_slopes_tell_small_changes_only(searched, gain, says):

@@ -118,7 +118,7 @@ def test_wrong_questions_are_said_in_one_sentence():
         with pytest.raises(jv.InputError, match=says):
             synthesize(space, wish, subject_to=subject_to, begin=begin)
     assert _run(SCENE, None, True)[1].startswith("the objective and the demands belong to no jam mode")
-    assert _run(SCENE, 3, False) == (None, "not asked for")
+    assert _run(SCENE, 3, False) == (None, "not requested")
 
 
 def test_unstable_modes_are_not_verified():

@@ -74,7 +74,7 @@ def test_forces_of_supports_add_up_to_the_force_on_the_bed():
         view, rest = view_of(scene), at_rest(scene)
         q, v = rng.normal(size=(2, rest.displacement.size))
         total = np.sum(view.support_forces(Pose(q, v, rest.angle, 0.0)), axis=0)
-        force = np.asarray(scene.machine.carrier().bed_force(q, v))
+        force = np.asarray(scene.machine.carrier().foundation_force(q, v))
         np.testing.assert_allclose(total[1], force[-1], rtol=1e-9)
 
 
@@ -130,7 +130,7 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
     assert not re.search(r"https?:|src=[\"']?//|<link|@import", page) and page.count("iVBOR") == 8
     assert "<title>a&lt;b&gt;</title>" in page
     clock = film.figure.axes[0].get_title(loc="left")
-    assert re.match(r"t =\s+1\.[56]\d\d s\s+force on the bed\s+-?\d+ N", clock)
+    assert re.match(r"t =\s+1\.[56]\d\d s\s+foundation force\s+-?\d+ N", clock)
     assert "slowed down 4 x" in film.figure.axes[0].texts[0].get_text()
     assert jv.animate(orbit, scene=SCENE, width=3.0).count > 50
 
@@ -141,13 +141,16 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
         (lambda run, orbit: jv.sketch(3.0), "scene is 3.0; it must be a Scene"),
         (lambda run, orbit: jax.jit(lambda s: jv.sketch(s) and 0.0)(SCENE), "a drawing decides by their values"),
         (lambda run, orbit: jv.animate(orbit), r"scene is missing; an Orbit does not have it"),
-        (lambda run, orbit: jv.animate(run, scene=SCENE), "scene goes with an Orbit only"),
+        (lambda run, orbit: jv.animate(run, scene=SCENE), "scene is for an Orbit only"),
         (lambda run, orbit: jv.animate(SCENE), "it must be a Run or an Orbit"),
         (lambda run, orbit: jv.animate(run, "a.mp4"), "path is 'a.mp4'; films are written as .gif or .html"),
         (lambda run, orbit: jv.animate(run, "no/such/folder.gif", begin=1.99), "cannot be written"),
         (lambda run, orbit: jv.animate(run, begin=1.0, end="0.5 s"), "end is 0.5 s; it must be after the beginning, 1 s"),
-        (lambda run, orbit: jv.animate(run, end=3.0), "begin asks for .* the run keeps 0 to 2 s"),
-        (lambda run, orbit: jv.animate(run, begin=0.0, seconds=1.0), "end makes the rotor go on by 0.955 turns .* deceives"),
+        (lambda run, orbit: jv.animate(run, end=3.0), "begin selects .* the run keeps 0 to 2 s"),
+        (
+            lambda run, orbit: jv.animate(run, begin=0.0, seconds=1.0),
+            "end advances the rotor by 0.955 turns",
+        ),
         (lambda run, orbit: jv.animate(run, seconds=-1.0), "seconds is -1 s; it must be greater than 0"),
         (lambda run, orbit: jv.animate(run, fps=0), "fps is 0; it must be a whole number"),
         (lambda run, orbit: jv.animate(run, width=-1.0), "width is -1 inches; it must be from 1 to 50"),
@@ -208,7 +211,7 @@ def test_forces_on_a_rotors_bed_differ_by_colour_and_stroke():
     rotor = jv.Scene(jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0), SCENE.loads, SCENE.drive)
     short = jv.simulate(rotor, 0.4, samples=256, estimate=False)
     film = jv.animate(short, begin=0.3, end=0.4, seconds=0.4, width=2.0)
-    forces = [line for line in film.figure.axes[2].lines if line.get_label().startswith("force on the bed")]
+    forces = [line for line in film.figure.axes[2].lines if line.get_label().startswith("foundation force")]
     assert len({line.get_color() for line in forces}) == len({line.get_linestyle() for line in forces}) == 2
 
 

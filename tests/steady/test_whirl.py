@@ -190,5 +190,5 @@ def test_single_precision_says_which_whirls_it_loses(soft):
             assert ours.status_name == ("lost_digits" if np.any(lost) else "done")
             np.testing.assert_allclose(speed[~lost & np.isfinite(right)], right[~lost & np.isfinite(right)], rtol=0.01)
         assert bool(np.any(np.isnan(np.asarray(single.speed)))) == (soft < 1e4)
-        with pytest.raises(jv.InputError, match=r"as far as single precision can tell.*or use double precision"):
+        with pytest.raises(jv.InputError, match=r"within single precision.*or use double precision"):
             found((1e8, 10.0))

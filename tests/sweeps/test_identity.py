@@ -244,7 +244,7 @@ def test_a_function_in_doubt_is_computed_but_not_reused(tmp_path, monkeypatch):
 
     assert run_study(asked(), "study.zarr").data.m.values.tolist() == [100.0, 120.0]
     (tmp_path / "numbers.txt").write_text("4.0")
-    with pytest.raises(jv.InputError, match=r"measure.m calls loadtxt, which can read a file, so that nobody can tell"):
+    with pytest.raises(jv.InputError, match=r"measure.m calls loadtxt, which can read a file; the numbers in"):
         run_study(asked(), "study.zarr")
 
 

@@ -102,7 +102,7 @@ def test_method_of_too_low_order_fails():
         (Answer([1.0]), "FAILED", "1 values in place of 2"),
         (Answer([], status="absent"), "named", "absent"),
         (Answer([], status="not_converged"), "FAILED", "not_converged"),
-        (jv.ComputationError("absent", "there is none"), "named", "absent"),
+        (jv.ComputationError("absent", "no members"), "named", "absent"),
         (jv.ComputationError("not_settled", "it moves"), "FAILED", "not_settled"),
         (jv.InputError("loads", "is wrong"), "FAILED", "refused"),
         (TypeError("unhashable"), "FAILED", "TypeError: unhashable"),

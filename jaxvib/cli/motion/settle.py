@@ -113,7 +113,9 @@ def growth(
 ) -> None:
     """Growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and after which time derivatives fail."""
     if start == "spin_up":
-        raise InputError("--start", "is 'spin_up'; how disturbances grow is asked under a constant speed, from rest or a jam")
+        raise InputError(
+            "--start", "is 'spin_up'; the growth of disturbances needs a constant speed, start from rest or in a jam"
+        )
     begin = ("rest" if mode is None else "jam") if start is None else start
     loaded = loaded_scene(scene, speed=speed, constant=True)
     found = jv.growth(loaded, until, start=begin, mode=mode, separation=separation, stretches=stretches)

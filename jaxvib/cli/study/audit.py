@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 @app.command("audit")
 @click.argument("scene", type=click.Path(path_type=Path), required=False)
 @click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
-@click.option("--mode", type=int, help="Number of the jam mode [the last below the rotor's own speed that is stable].")
-@click.option("--until", help="End of the run, such as 20s, where no jam is asked for [100 slow periods after the run-up].")
+@click.option("--mode", type=int, help="Number of the jam mode [the last stable one below the rotor speed].")
+@click.option("--until", help="End of a run, such as 20s, without a jam [100 slow periods after the run-up].")
 @click.option("--start", type=click.Choice(["rest", "turning"]), help="Start of a run, in place of a jam.")
-@click.option("--put-in/--no-put-in", default=True, show_default=True, help="Add each effect that the scene lacks.")
+@click.option("--add-missing/--no-add-missing", default=True, show_default=True, help="Add each effect that the scene lacks.")
 @click.option("--tiers/--no-tiers", default=True, show_default=True, help="Compute every tier.")
 @click.option(
     "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Number of timings; the fastest counts."
@@ -39,7 +39,7 @@ def audit(
     mode: int | None,
     until: str | None,
     start: Literal["rest", "turning"] | None,
-    put_in: bool,
+    add_missing: bool,
     tiers: bool,
     repeats: int,
     count_operations: bool,
@@ -70,7 +70,7 @@ def audit(
         mode=mode,
         until=until,
         start=start,
-        possible=None if put_in else (),
+        possible=None if add_missing else (),
         tiers=tiers,
         repeats=repeats,
     )
@@ -86,20 +86,26 @@ def audit_text(found: jv.Audit) -> str:
     head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by", "operations", "run", "compile"]
     rows = [_effect(row, found) for row in found.effects]
     if rows:
-        heading = f"what effects change, %; asked for {100.0 * found.accuracy:g} %"
+        heading = f"changes by effects, %; requested accuracy {100.0 * found.accuracy:g} %"
         absent = any(not row.present for row in found.effects)
-        lines.append(table(f"{heading}; (in brackets) what the scene has not, put in" if absent else heading, head, rows))
+        lines.append(table(f"{heading}; in brackets: added effects" if absent else heading, head, rows))
     lines += [f"{row.effect}: {row.says}" for row in found.effects if row.says]
     offs = [
         [t.tier, *map(_percent, (t.amplitude, t.foundation_force, t.omega)), _seconds(t.seconds), _seconds(t.compile)]
         for t in found.tiers
     ]
     if offs:
-        lines.append(table("tiers: off by, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], offs))
+        lines.append(table("tiers: error, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], offs))
     lines += [f"{t.tier}: {t.says}" for t in found.tiers]
     if found.numbers:
         numbers = [[n.name, f"{n.value:.3g}", f"{n.limit:.3g}", n.advice] for n in found.numbers]
-        lines.append(table("not modelled: what numbers say", ["number", "value", "limit", "advice"], numbers))
+        lines.append(
+            table(
+                "effects that are not in the scene, judged by dimensionless numbers",
+                ["number", "value", "limit", "advice"],
+                numbers,
+            )
+        )
         lines += [f"{n.name.partition(':')[0]}: {n.says}" for n in found.numbers]
     return "\n".join(lines)
 

@@ -23,7 +23,7 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
 @app.command("cost")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="What is computed.")
-@click.option("--mode", type=int, help="Number of the jam mode [the last below the rotor's own speed that is stable].")
+@click.option("--mode", type=int, help="Number of the jam mode [the last stable one below the rotor speed].")
 @click.option(
     "--until", help="End of the time integration, such as 20s [20 slow periods; for a jam until it forgets its start]."
 )
@@ -70,13 +70,13 @@ def cost_table(cost: Cost) -> str:
         [row.tier, row.method, row.dtype, row.setting, f"{row.error:.1e}", f"{row.seconds:.2e}", f"{row.compile:.2f}"]
         for row in cost.rows
     ]
-    title = f"{cost.quantity.replace('_', ' ')}; the reference itself is good to {cost.reference_error:.1e}"
+    title = f"{cost.quantity.replace('_', ' ')}; the reference has an error of {cost.reference_error:.1e}"
     chosen = [[f"{error:.0e}", *_named(cost.cheapest(error))] for error in WANTED]
-    parts = [table(title, head, rows), table("cheapest", ["error", "way", "seconds"], chosen)]
+    parts = [table(title, head, rows), table("cheapest", ["error", "method", "seconds"], chosen)]
     return "\n".join(parts + [f"left out: {reason}" for reason in cost.left_out])
 
 
 def _named(row: CostRow | None) -> list[str]:
     if row is None:
-        return ["none of these, or the reference cannot tell", ""]
+        return ["none of these, or below the error of the reference", ""]
     return [", ".join(part for part in (row.tier, row.method, row.dtype, row.setting) if part), f"{row.seconds:.2e}"]

@@ -20,13 +20,13 @@ Command = TypeVar("Command", bound=Callable)
 
 _NAMED = (
     ("mass", "pendulum", "Mass of the pendulum, such as '300 g'."),
-    ("length", "pendulum", "From the bearing's axis to the mass centre, such as '25 cm'."),
-    ("inertia", "pendulum", "About the mass centre, kg m^2 [0: a point mass]."),
+    ("length", "pendulum", "Distance of the mass centre from the axis of the bearing, such as '25 cm'."),
+    ("inertia", "pendulum", "Moment of inertia about the mass centre, kg m^2 [0, a point mass]."),
     ("bearing", "pendulum", "Diameter of the bearing, for --dry, such as '20 mm'."),
     ("g", "pendulum", "Gravity [9.81 m/s^2]."),
-    ("angle-unit", "record", "Unit of the angle, such as deg, in place of the header's."),
-    ("from", "record", "Leave out what was before this time."),
-    ("until", "record", "Leave out what was after this time."),
+    ("angle-unit", "record", "Unit of the angle, such as deg [as in the header]."),
+    ("from", "record", "First time of the record that is used."),
+    ("until", "record", "Last time of the record that is used."),
     ("instrument", "identify", "Relative uncertainty of the moment of inertia, such as 0.03, for the intervals."),
 )
 
@@ -41,7 +41,7 @@ def _named(command: Command) -> Command:
 @click.argument("record", type=click.Path(path_type=Path))
 @_named
 @click.option("--columns", "record__columns", help="Names of the columns of time and angle, such as 't,phi'.")
-@click.option("--dry/--no-dry", "identify__dry", default=None, help="Find mu2 of dry friction as well as mu1, or not.")
+@click.option("--dry/--no-dry", "identify__dry", default=None, help="Identify mu2 of dry friction as well as mu1.")
 @shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a measurement

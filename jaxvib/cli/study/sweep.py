@@ -47,7 +47,7 @@ def sweep(
         found = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
     except KeyboardInterrupt:
         show.end()
-        click.echo(f"stopped: what is finished is kept in {path}; the same command goes on from there", err=True)
+        click.echo(f"stopped: finished cases are kept in {path}; run the same command again to continue", err=True)
         raise
     show.end()
     _tell(found, output, "sweep")

@@ -68,7 +68,7 @@ def time_histories(
     ax: Onto = None,
 ) -> Drawn:
     """Two columns over time: the `whole` run as bands between its peaks, and the last periods of its `end` as they are. Rows:
-    displacements mm, tilts mrad where there are any, speeds of the loads and the rotor in `unit`, force on the bed N.
+    displacements mm, tilts mrad where there are any, speeds of the loads and the rotor in `unit`, force on the foundation N.
 
     `whole` and `end` hold time (nt,) s, displacement (nt, nd), speeds of the loads (nt, count) and of the rotor (nt,) rad/s,
     force (nt, nb) N; `displacement` is in m, and in rad where `units` (nd,) say "rad"; if None, all is in m.
@@ -77,7 +77,7 @@ def time_histories(
     >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
     >>> figure = time_histories(*[(t, q, one, t, one)] * 2, names=("y", "theta"), units=("m", "rad"))
     >>> [axes.get_ylabel() for axes in figure.axes][::2]
-    ['displacement, mm', 'tilt, mrad', 'speed, rad/s', 'force on the bed, N']
+    ['displacement, mm', 'tilt, mrad', 'speed, rad/s', 'foundation force, N']
     """
     units = ["m"] * len(names) if units is None else units
     scale = speed_scale(unit)
@@ -109,7 +109,7 @@ def time_histories(
     for k, name in enumerate(directions):
         _band(left, whole[0], whole[4][:, k], k, name, bins)
         right.plot(part[0], part[4][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
-    left.set_ylabel("force on the bed, N")
+    left.set_ylabel("foundation force, N")
     if len(directions) > 1:
         legend_above(left)
     for axis, text in zip(axes[:2], ("the whole run: bands between peaks", f"its last {_SHOWN} periods"), strict=True):
@@ -144,7 +144,7 @@ def amplitude_histories(
     ax: Onto = None,
 ) -> Drawn:
     """Panels over time (nt,) s of an averaged run: amplitudes (nt, nd) mm and mrad, speeds of the loads (nt, count) and of the
-    rotor (nt,), amplitude of the force on the bed (nt, nb) N; zero to peak."""
+    rotor (nt,), amplitude of the force on the foundation (nt, nb) N; zero to peak."""
     scale = speed_scale(unit)
     kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)
@@ -163,7 +163,7 @@ def amplitude_histories(
     axes[-2].set_ylabel(f"speed, {unit}")
     legend_above(axes[-2], 6)
     lines(axes[-1], force, range(len(directions)), directions)
-    axes[-1].set_ylabel("force on the bed, N")
+    axes[-1].set_ylabel("foundation force, N")
     if len(directions) > 1:
         legend_above(axes[-1])
     axes[-1].set_xlabel("time, s")

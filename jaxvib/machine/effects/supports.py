@@ -84,14 +84,14 @@ class CubicSupport(_Support):
         """
         carrier = machine.carrier()
         length = jnp.asarray([unit == "m" for unit in carrier.units])
-        moved = jnp.where(jnp.any(carrier.bed_stiffness != 0.0, axis=0) & length, jnp.abs(amplitude), 0.0)
+        moved = jnp.where(jnp.any(carrier.foundation_stiffness != 0.0, axis=0) & length, jnp.abs(amplitude), 0.0)
         which = int(jnp.argmax(moved))
         a = moved[which]
         if not float(a) > 0.0:
             return None
         platform = which + 1 if machine.places == "platform" else None
         position = 0.0 if machine.places == "shaft" else None
-        stiffness = jnp.max(jnp.abs(carrier.bed_stiffness[:, which])) * 0.04 / (3.0 * a**2)
+        stiffness = jnp.max(jnp.abs(carrier.foundation_stiffness[:, which])) * 0.04 / (3.0 * a**2)
         return Typical(cls(stiffness, platform, position), f"1 % stiffer in the mean at a swing of {1e3 * float(a):.3g} mm")
 
     def terms(self) -> tuple[Term, ...]:

@@ -349,7 +349,7 @@ def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
         displacement=state.displacement,
         velocity=state.velocity,
         amplitude=magnitude(state.displacement),
-        foundation_force=magnitude(model.carrier.bed_force(state.displacement, state.velocity)),
+        foundation_force=magnitude(model.carrier.foundation_force(state.displacement, state.velocity)),
         omega=jnp.mean(state.rate),
         load_speed=state.rate,
         phase=state.phase,

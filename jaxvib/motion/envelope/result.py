@@ -29,7 +29,7 @@ class EnvelopeStatus(eqx.Enumeration):
 
     done = "the averaged run reached its end"
     max_steps_reached = "the averaged run did not reach its end in the steps it was allowed"
-    not_finite = "the motion grew beyond all bounds"
+    not_finite = "the motion grew without bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     no_start = "the state to start from does not exist or is not finite"
     would_separate = "all loads are at nearly one angle, but this motion is unstable: slightly separated loads leave it"
@@ -124,7 +124,7 @@ class Envelope(AbstractMeasured, Result):
             *map(np.asarray, (kept.time, kept.amplitude, kept.load_speed, kept.foundation_force, kept.rotor_speed)),
             names=structure.coordinates,
             units=structure.units,
-            directions=structure.bed_directions,
+            directions=structure.foundation_directions,
             unit=unit,
             ax=ax,
         )

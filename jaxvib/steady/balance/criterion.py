@@ -167,10 +167,8 @@ def criterion(scene: Scene) -> Criterion:
     scene = validate_scene(scene)
     require_one_point(scene)
     if scene.loads.count < 2:
-        raise InputError(
-            "loads.count", "is 1; the criterion tells loads that gather from loads that spread: it needs 2 or more"
-        )
-    require_terms(scene.effects, CRITERION_TERMS, "acts|act on each load by itself, which the criterion leaves out")
+        raise InputError("loads.count", "is 1; the criterion, on the gathering of loads, needs 2 or more")
+    require_terms(scene.effects, CRITERION_TERMS, "acts|act on each load separately, which the criterion excludes")
     return _judged(characteristic_speeds(scene))
 
 

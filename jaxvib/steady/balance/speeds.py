@@ -145,7 +145,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     K y = w^2 (M_S - i G) y, its zeros those of the same problem on b^H y = 0 (the port held), and they interlace.
     Damped, its sign changes are bracketed on a grid between the lowest and the highest undamped resonance: outside that
     range damping cannot change the sign, since Re(b^H D^-1 b) = y^H (K - w^2 M_S) y with y = D^-1 b. A damper between
-    the exciter's platform and the bed moves no speed at all: it adds to the imaginary part of 1/A alone.
+    the exciter's platform and the foundation moves no speed at all: it adds to the imaginary part of 1/A alone.
 
     **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every number of the scene,
     forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).

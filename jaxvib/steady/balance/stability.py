@@ -23,7 +23,7 @@ class StabilityStatus(eqx.Enumeration):
 
     stable = "errors of the balanced motion die out"
     unstable = "errors of the balanced motion grow"
-    undecided = "errors of the balanced motion change less in a turn than the computation can tell"
+    undecided = "errors of the balanced motion change in a turn by less than the error of the computation"
 
 
 class BalancedStability(Result):

@@ -330,7 +330,7 @@ def jam_at(
         slope=slope,
         displacement=displacement,
         amplitude=magnitude(displacement),
-        foundation_force=peak_force(model.carrier.bed_force(displacement, 1j * omega * displacement)),
+        foundation_force=peak_force(model.carrier.foundation_force(displacement, 1j * omega * displacement)),
         coordinates=model.carrier.coordinates,
     )
 

@@ -273,7 +273,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     turn = jnp.exp(1j * angles)
     torque = torques_at(balance, influence, w, turn)
     z = w**2 * answer @ (balance.unbalance * turn)
-    force = balance.model.carrier.bed_force(z, 1j * w * z)
+    force = balance.model.carrier.foundation_force(z, 1j * w * z)
     residual = jnp.max(jnp.abs(balance.drag * (balance.speed - w) + torque)) / jnp.max(balance.drag * balance.speed)
     tiny = jnp.sqrt(jnp.finfo(w.dtype).eps)
     slip = (frozen.speed - w) / frozen.speed

@@ -185,7 +185,7 @@ class Orbit(Result):
         panels = [
             (f"displacement, {' or '.join(shown)}", 1e3 * motion, [f"coordinate {k + 1}" for k in range(motion.shape[1])]),
             ("loads ahead of Ωt, degrees", deviation, several if len(several) > 1 else ["all loads"]),
-            ("force on the bed, N", force, ["across", "up"][-force.shape[1] :]),
+            ("foundation force, N", force, ["across", "up"][-force.shape[1] :]),
         ]
         return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)
 
@@ -342,7 +342,7 @@ def _motion_quantities(
     power = power + model.linear.dissipated(velocity)
     nd = harmonics.displacement.shape[0]
     swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
-    # Directions of the force on the bed are put together as those of a vector.
+    # Directions of the force on the foundation are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
     contact_torque = _least_contact_torque(model, grid, motion, harmonics)
     return (swings[:nd], force, power, contact_torque)

@@ -73,7 +73,7 @@ def plan_orbit(
     named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
     if len(named) != 1:
         given = " and ".join(named) if named else "none"
-        raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
+        raise InputError("jam_orbit", f"was called with {given}; give one of mode=3, omega=95.0, near=95.0")
     scene = validate_scene(scene)
     all_known = is_known(scene, omega, near)
     # Starts have no derivatives. A known scene stays the same object, because it is validated already.
@@ -131,7 +131,7 @@ def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known
 def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
     """Return whether the leading order has the jam mode, the sign of dn/dOmega there, and its load speed, rad/s."""
     if scene.machine.mounting().gyroscopic is not None:
-        raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
+        raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
     jams = jams_of(scene)
     light, speed = known(jams.omega)[jams.row(mode)], known(scene.drive.speed)
     direction = on_device(np.asarray(1.0 if mode % 2 == 1 else -1.0, speed.dtype))

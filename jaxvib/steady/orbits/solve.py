@@ -354,5 +354,5 @@ def harmonics_of(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, r
         analyzed(motion.deviation, deviation_analysis(grid)),
         displacement,
         -(model.linear.mount.rows[0] @ displacement) * w[None] ** 2,
-        carrier.bed_force(displacement, 1j * w[None] * displacement),
+        carrier.foundation_force(displacement, 1j * w[None] * displacement),
     )

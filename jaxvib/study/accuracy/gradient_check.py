@@ -47,10 +47,12 @@ class GradientStatus(eqx.Enumeration):
     """Outcomes of a check. Each member is the sentence shown to the user."""
 
     agree = "every derivative agrees with finite differences"
-    differ = "derivatives differ from finite differences by more than was asked for and these may be off"
-    noisy = "no derivative differs, but finite differences are too noisy to tell to the tolerance that was asked for"
+    differ = "derivatives differ from finite differences by more than the tolerance and the error of these"
+    noisy = "no derivative differs, but finite differences are too noisy for the requested tolerance"
     not_finite = "a derivative, or the quantity beside the point, is not a finite number"
-    chaotic = "the quantity changes as much however little a number does: nearby motions part, and no derivative means anything"
+    chaotic = (
+        "the quantity changes as much for any small change of a number: nearby motions diverge, derivatives are meaningless"
+    )
 
 
 class ImplicitRoute(NamedTuple):
@@ -120,7 +122,7 @@ class GradientCheck(Result):
         scale = _scale(self.difference)
         with np.errstate(invalid="ignore"):
             worst = np.max(np.where(np.isfinite(self.error), self.error, np.inf), axis=0)
-        lines = [f"{self.message} (asked for {self.tolerance:.0e}, relative)"]
+        lines = [f"{self.message} (relative tolerance {self.tolerance:.0e})"]
         for i in np.argsort(-worst):
             found = ", ".join(f"{route} off by {self.error[k, i]:.1e}" for k, route in enumerate(self.routes))
             floor = f"finite differences good to {self.noise[i] / scale[i]:.1e} at a step of {self.step[i]:.1e}"

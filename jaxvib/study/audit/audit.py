@@ -101,7 +101,7 @@ class Audit(Result):
 
         plain_names = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
         changes = {plain_names[name]: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}
-        labels = [f"{row.effect.replace('_', ' ')}{'' if row.present else ' (put in)'}: {row.advice}" for row in self.effects]
+        labels = [f"{row.effect.replace('_', ' ')}{'' if row.present else ' (added)'}: {row.advice}" for row in self.effects]
         uncertainty = np.array([row.uncertainty for row in self.effects])
         added = np.array([row.operations for row in self.effects], float) / self.operations
         return audit_chart(labels, changes, uncertainty, self.accuracy, added, ax=ax)

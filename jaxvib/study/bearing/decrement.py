@@ -255,7 +255,7 @@ def ten_periods(
     pairs = a.size - n
     if pairs < 1:
         there = f"has {a.size / 2.0:g} periods between turning points"
-        raise InputError(record.name, f"{there}; {periods + 0.5:g} are needed, record longer or ask for fewer periods")
+        raise InputError(record.name, f"{there}; {periods + 0.5:g} are needed; record longer or give fewer periods")
     span = when[n : n + pairs] - when[:pairs]
     factor = 2.0 * float(pendulum.total_inertia) / span
     estimates = factor * _shrinkage(a[:pairs], a[n:])

@@ -93,7 +93,8 @@ class Record(eqx.Module):
         if np.ptp(self.angle) > 2.0 * np.pi:
             size = f"{np.ptp(self.angle):.3g} rad from end to end"
             raise InputError(
-                name, f"swings {size}, more than a full turn; if these are degrees, say so in the header or the unit"
+                name,
+                f"swings {size}, more than a full turn; if these are degrees, give the unit in the header or as angle_unit",
             )
 
     @property

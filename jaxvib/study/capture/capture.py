@@ -111,14 +111,12 @@ class Capture(Result):
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
-            head += (
-                f"\n  detached: in {share:.3g} % of the runs a ball did not press on its wall, and was kept on it all the same"
-            )
+            head += f"\n  detached: in {share:.3g} % of the runs a ball lost contact with its wall; the equations keep it there"
         if np.isnan(self.threshold):
             return head
         below = self.fraction[self.speed < float(self.threshold)]
         where = f"threshold {float(self.threshold):.4f} +- {float(self.uncertainty):.1e} of the rotor's speed"
-        lone = f"; below it {100.0 * np.mean(below):.3g} % are captured all the same" if np.any(below > 0.0) else ""
+        lone = f"; below it {100.0 * np.mean(below):.3g} % are captured, too" if np.any(below > 0.0) else ""
         return f"{head}\n  {where}{lone}"
 
     @validated
@@ -213,9 +211,7 @@ def capture(
     scene = validate_scene(scene)
     in_torus(scene.loads, "capture")
     if not scene.drive.constant:
-        raise InputError(
-            "drive.kind", f"is {quoted(scene.drive.kind)}; capture is asked for at a given speed: use ConstantSpeed"
-        )
+        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a given speed, use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:
         raise InputError("resolution", f"is {quoted(resolution)}; it must be between 0 and 1, such as 1e-3")
     if turning not in get_args(Turning):

@@ -170,7 +170,7 @@ def run_ups(
     drags = jnp.atleast_1d(given)
     n = scene.loads.count
     if starts is not None and angles is not None:
-        raise InputError("starts", "goes without angles: either random angles or those that are named")
+        raise InputError("starts", "was given with angles; give a number of random starts or the angles")
     if separation is not None and not (starts is None and angles is None):
         raise InputError(
             "separation",

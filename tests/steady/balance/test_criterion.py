@@ -343,9 +343,9 @@ def test_the_criterion_is_for_several_loads_that_nothing_pulls():
         loads = jv.balls(count=count, mass=0.5, radius=0.1, drag=1.0, ball_radius=0.01)
         return jv.criterion(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), effects))
 
-    with pytest.raises(jv.InputError, match=r"loads\.count is 1; the criterion tells loads that gather"):
+    with pytest.raises(jv.InputError, match=r"loads\.count is 1; the criterion, on the gathering of loads"):
         asked(1)
-    with pytest.raises(jv.InputError, match=r"effects\.gravity acts on each load by itself.*\(term LoadPotential\)"):
+    with pytest.raises(jv.InputError, match=r"effects\.gravity acts on each load separately.*\(term LoadPotential\)"):
         asked(2, jv.Gravity())
     assert asked(2, jv.LoadContact(1e5)).status_name == "judged"
 

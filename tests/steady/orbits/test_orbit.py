@@ -92,7 +92,7 @@ def test_amplitudes_force_and_power_are_those_of_the_motion(name):
     carrier = scene.machine.carrier()
     np.testing.assert_allclose(orbit.amplitude, (q.max(0) - q.min(0)) / 2.0, rtol=2e-6)
     assert np.all(np.asarray(orbit.amplitude) >= np.asarray(q.max(0) - q.min(0)) / 2.0 * (1.0 - 1e-12))
-    force = q @ carrier.bed_stiffness.T + velocity @ carrier.bed_damping.T
+    force = q @ carrier.foundation_stiffness.T + velocity @ carrier.foundation_damping.T
     np.testing.assert_allclose(orbit.foundation_force, np.linalg.norm((force.max(0) - force.min(0)) / 2.0), rtol=2e-6)
 
     # What the rotor gives is what the drag on the loads and the dampers take.
@@ -330,7 +330,7 @@ def test_single_precision_answers_as_well_as_it_can():
 
 def test_wrong_questions_are_refused():
     scene = published().scene()
-    with pytest.raises(jv.InputError, match="jam_orbit was asked with none"):
+    with pytest.raises(jv.InputError, match="jam_orbit was called with none"):
         jv.jam_orbit(scene)
     with pytest.raises(jv.InputError, match="mode and omega"):
         jv.jam_orbit(scene, mode=3, omega=0.9)

@@ -152,7 +152,7 @@ def test_a_quantity_of_chaos_is_named_and_one_with_noise_is_not():
     asked = dict(free=("machine.stiffness",), routes=("forward",))
     found = jv.check_gradients(SCENE, of_orbit(60), **asked)
     assert found.status_name == "chaotic" and np.abs(found.gradient[0, 0]) > 1e7
-    with pytest.raises(jv.ComputationError, match="no derivative means anything"):
+    with pytest.raises(jv.ComputationError, match="derivatives are meaningless"):
         found.require()
     assert jv.check_gradients(SCENE, of_orbit(5), **asked).status_name == "agree"
     noisy = jv.check_gradients(SCENE, lambda s: closed(s) * (1.0 + 1e-2 * jnp.sin(jax.lax.stop_gradient(closed(s)))), **asked)

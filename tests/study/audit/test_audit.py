@@ -107,7 +107,7 @@ def test_tiers_are_judged_against_the_best_that_answers(found):
 
 def test_the_command_prints_what_the_function_gives(found, capsys, tmp_path):
     path = jv.save_scene(SCENE, tmp_path / "machine.toml")
-    words = ["audit", str(path), "--mode", "1", "--accuracy", "0.1%", "--no-put-in", "--no-tiers", "--repeats", "0"]
+    words = ["audit", str(path), "--mode", "1", "--accuracy", "0.1%", "--no-add-missing", "--no-tiers", "--repeats", "0"]
     assert command([*words, "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "gravity" in said and "needed" in said and "lift: R / (M g)" in said

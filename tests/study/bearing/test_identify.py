@@ -31,7 +31,7 @@ def test_records_that_end_at_rest_hold_both_frictions(degrees, dry):
         found = jv.identify(ROD, jv.Record(T, 0.3 + noisy(clean, 5e-4, seed)), dry=True)
         held += found.viscous.low < 5e-4 < found.viscous.high and found.dry.low < dry < found.dry.high
         assert found.status_name == "found" and found.dry.value > 0.0
-        assert found.viscous.value > 0.0 or any("mu1 cannot be told from 0" in note for note in found.notes)
+        assert found.viscous.value > 0.0 or any("mu1 cannot be distinguished from 0" in note for note in found.notes)
         assert not stop < 17.0 or (found.until < stop and any("left out" in note for note in found.notes))
     assert held >= 3
 
@@ -47,7 +47,7 @@ def test_what_comes_before_the_release_is_left_out():
     ("law", "degrees", "note"),
     [
         (dict(air=2e-3), 10.0, "as by the drag of air"),
-        (dict(dry=0.02), 10.0, "ask for mu2"),
+        (dict(dry=0.02), 10.0, "identify mu2"),
         (dict(torque=0.1), 40.0, ""),
     ],
 )
@@ -139,10 +139,10 @@ def test_what_is_wrong_with_a_fit_is_said():
     t = T
     clean, _ = scipy_swing(ROD, t, 0.3, 0.0, 3e-4, 0.03)
     without = jv.identify(ROD, jv.Record(t, noisy(clean, 5e-4, 1)))
-    assert without.status_name == "patterned" and any("ask for mu2" in note for note in without.notes)
+    assert without.status_name == "patterned" and any("identify mu2" in note for note in without.notes)
     frictionless = scipy_swing(ROD, t, 0.1, 0.0, 0.0)[0]
     nothing = [jv.identify(ROD, jv.Record(t, noisy(frictionless, 5e-3, k))) for k in range(3)]
-    assert any(found.status_name == "undetermined" and "cannot be told from 0" in found.notes[0] for found in nothing)
+    assert any(found.status_name == "undetermined" and "cannot be distinguished from 0" in found.notes[0] for found in nothing)
     heavier = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.008)
     clean, _ = scipy_swing(ROD, t, 0.3, 0.0, 1e-3)
     other = jv.identify(heavier, jv.Record(t, noisy(clean, 5e-4, 2)))

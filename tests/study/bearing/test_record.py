@@ -70,7 +70,7 @@ def test_columns_are_named_as_in_the_file(tmp_path, columns):
         (table("TIME,ANGLE_RAW\n"), "has the column 'ANGLE_RAW' for the angle, whose unit is not known"),
         (table("frame,angle_deg\n"), "has the column 'frame' for the time, whose unit is not known; write time (s)"),
         ("0,1\n1,2\n", "has 2 samples; a swing needs at least 16"),
-        (table("").replace("0.100\n", "25.0\n"), "more than a full turn; if these are degrees, say so"),
+        (table("").replace("0.100\n", "25.0\n"), "more than a full turn; if these are degrees, give the unit"),
     ],
 )
 def test_wrong_tables_say_which_line(tmp_path, text, says):

@@ -189,7 +189,7 @@ def test_reverse_derivatives_are_the_forward_ones():
         ),
         (
             lambda s: jv.capture(jv.Scene(s.machine, s.loads, jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1))),
-            "drive.kind is 'dc_motor'; capture is asked for at a given speed",
+            "drive.kind is 'dc_motor'; capture needs a given speed",
         ),
         (
             lambda s: capture_time(jv.simulate(s, 0.1, start=thrown_state(s, -0.1), save="window", estimate=False)),

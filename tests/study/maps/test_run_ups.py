@@ -34,7 +34,7 @@ def test_run_ups_name_each_lane():
     for more, says in ((dict(drag=np.zeros(0)), "drag is an empty array"), (dict(starts=2, seed=-1), "seed is -1")):
         with pytest.raises(jv.InputError, match=says):
             jv.run_ups(s, 5.0, **more)
-    with pytest.raises(jv.InputError, match="goes without angles"):
+    with pytest.raises(jv.InputError, match="was given with angles"):
         jv.run_ups(s, 5.0, starts=3, angles=[[0.0, 0.1]])
 
 

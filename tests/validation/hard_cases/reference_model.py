@@ -161,7 +161,7 @@ def reference_model(scene: Scene) -> ReferenceModel:
 
 def light_speed(p: ReferenceModel, omega: float) -> tuple[float, NDArray[np.complex128], float]:
     """Motion of coincident light loads that turn at `omega`: the rotor speed n, the complex displacements (nd,), the force on
-    the bed.
+    the foundation.
 
     n = w - w^4 S^2 Im A / (2 sum b R^2),    A the receptance at the exciter, S = sum m R
     """
