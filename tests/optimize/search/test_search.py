@@ -37,6 +37,8 @@ def test_multipliers_are_those_computed_by_hand():
     best = found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[SUM < "90 N/mm", FIRST < 4.5e4])
     np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [4.5e4, 4.5e4], rtol=1e-7)
     assert best.status_name == "done" and best.converged == best.same == 4 and best.kkt < 1e-8
+    ((often, _, numbers),) = best.machines  # all starts end at one machine
+    assert often == 4 and numbers == pytest.approx((4.5e4, 4.5e4))
     budget, first = best.limits
     # d objective / d limit = - multiplier; the whole limit is 9, or 4.5.
     np.testing.assert_allclose([budget.multiplier, first.multiplier], [-1e8 * 9.0, -2e8 * 4.5], rtol=1e-6)
