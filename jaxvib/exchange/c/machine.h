@@ -77,19 +77,24 @@ static void destroy(Machine *m) {
     free(m);
 }
 
-/* Rates, outputs and indicators of the present values; 0 if one of them is not finite. */
-static int update(Machine *m) {
+/* Rates, outputs and indicators of the present values. */
+static void compute(Machine *m) {
     Data *d = &m->data;
     double *v = d->values;
     if (!d->prepared) prepare(v + AT_PARAMETERS, d->constants);
     d->prepared = 1;
-    if (d->evaluated) return 1;
     evaluate(v + AT_PARAMETERS, d->constants, v[0], v + AT_STATES, v + AT_INPUTS, v + AT_RATES, v + AT_OUTPUTS,
              v + AT_INDICATORS);
-    for (int i = AT_RATES; i < VALUES; i++)
-        if (!isfinite(v[i]) && (i < AT_INPUTS || (i >= AT_OUTPUTS && i < AT_PARAMETERS)))
-            return report(m, "%s is not finite at %g s", NAMES[i], v[0]);
-    d->evaluated = 1;
+}
+
+/* The same if they are not there yet; 0 if one of them is not finite. */
+static int update(Machine *m) {
+    double *v = m->data.values;
+    if (m->data.evaluated) return 1;
+    compute(m);
+    for (int i = AT_STATES; i < AT_PARAMETERS; i++)
+        if (!isfinite(v[i])) return report(m, "%s is not finite at %g s", NAMES[i], v[0]);
+    m->data.evaluated = 1;
     return 1;
 }
 
@@ -176,11 +181,13 @@ static int advance(Machine *m, double time, double length) {
         memset(sum, 0, sizeof sum);
         for (int stage = 0; stage < 4; stage++) {
             for (int i = 0; i < STATES; i++) x[i] = begin[i] + (stage ? share[stage] * h * rate[i] : 0.0);
-            set_time(m, time + (n + share[stage]) * h);
-            if (!update(m)) return 0;
+            m->data.values[0] = time + (n + share[stage]) * h;
+            compute(m);
             for (int i = 0; i < STATES; i++) sum[i] += weight[stage] * rate[i];
         }
         for (int i = 0; i < STATES; i++) x[i] = begin[i] + h / 6.0 * sum[i];
+        for (int i = 0; i < STATES; i++)
+            if (!isfinite(x[i])) return report(m, "%s is not finite after %g s", NAMES[AT_STATES + i], time + (n + 1.0) * h);
     }
     set_time(m, time + length);
     return update(m);
