@@ -1,7 +1,7 @@
 """Functional mock-up units: time of the right-hand side in C beside a native loop, and time to write a unit.
 
     pip install numba
-    python benchmarks/exchange.py
+    python benchmarks/trials/exported_units.py
 
 The right-hand side is that of the published machine with one load, in steps of co-simulation through the interface of the unit;
 the native loop is hand-written (`parts/native.py`). Both are times per evaluation of the equations.
@@ -10,6 +10,7 @@ the native loop is hand-written (`parts/native.py`). Both are times per evaluati
 from __future__ import annotations
 
 import ctypes
+import sys
 import tempfile
 import time
 import zipfile
@@ -23,6 +24,7 @@ import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from parts import native  # noqa: E402
 from parts.common import best, flat, machine_line, published, thrown  # noqa: E402
 
