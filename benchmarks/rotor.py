@@ -152,8 +152,8 @@ def numbers(scene: jv.Scene) -> tuple[np.ndarray, np.ndarray]:
     machine: Any = scene.machine
     loads: Any = scene.loads
     drive: Any = scene.drive
-    gravity: Any = scene.effects[0]
-    imbalance: Any = scene.effects[1]
+    gravity: Any = scene.all_effects[0]
+    imbalance: Any = scene.all_effects[1]
     par = [machine.mass, machine.transverse_inertia, machine.polar_inertia, *machine.stiffness_terms, *machine.damping_terms]
     par += [
         loads.mass,

@@ -35,7 +35,7 @@ from jaxvib.study.capture.capture import thrown_state  # noqa: E402
 from jaxvib.study.capture.refinement import DOUBLINGS  # noqa: E402
 
 SCENE = published_torus(2.5)
-TOUCHING = jv.Scene(SCENE.machine, SCENE.loads, SCENE.drive, (*SCENE.effects, CONTACT))
+TOUCHING = jv.Scene(SCENE.machine, SCENE.loads, SCENE.drive, (*SCENE.all_effects, CONTACT))
 
 
 def free(speed: jax.Array) -> tuple[jv.Scene, jv.State]:

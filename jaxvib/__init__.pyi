@@ -29,11 +29,11 @@ from jaxvib.machine.effects.supports import CubicSupport, Stop
 
 # Scenes, and their files
 from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 
 # The equations
 from jaxvib.equations.dynamics import vector_field
-from jaxvib.equations.state import Spin, State
+from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.equations.forces import energy, foundation_force, normal_force, power
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.motion.start import initial_state, with_spin
@@ -158,12 +158,14 @@ __all__ = [
     "LoadContact",
     # Scenes, and their files
     "Scene",
+    "Exciter",
     "load_scene",
     "save_scene",
     "scene_from_toml",
     "scene_to_toml",
     # The equations
     "State",
+    "ExciterState",
     "Spin",
     "vector_field",
     "initial_state",

@@ -78,6 +78,24 @@ class InputError(ValueError):
         return type(self), (self.field, self.problem)  # processes hand errors to each other
 
 
+@contextlib.contextmanager
+def within(place: str) -> Iterator[None]:
+    """Put a place before the names of fields in errors.
+
+    >>> with within("exciters[1]."):
+    ...     raise InputError("drive.speed", "is -1 rad/s; it must be greater than 0")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: exciters[1].drive.speed is -1 rad/s; it must be greater than 0
+    """
+    try:
+        yield
+    except InputError as error:
+        if not place:
+            raise
+        raise InputError(place + error.field, error.problem) from error
+
+
 def quoted(value: object, longest: int = 60) -> str:
     """Return the value as an error message quotes it: its representation, at most `longest` characters of one line.
 

@@ -159,7 +159,7 @@ def test_numbers_and_paths_are_known_by_their_kind():
     assert is_real(2) and is_real(np.ones(3, np.float16)) and is_real(jnp.ones(2, jnp.bfloat16)) and is_whole(np.int8(1))
     assert not any(map(is_real, (True, 1j, "1", None, np.datetime64("2020"), np.asarray([True], dtype=object))))
     assert not is_whole(True) and not is_whole(np.timedelta64(1, "s")) and not is_whole(1.0)
-    for wrong in (b"a", "", "a\0", "\ud800", 5000 * "a", None, ["a"]):
+    for wrong in (b"a", "", "a\0", "\ud800", "a\ud800", 5000 * "a", None, ["a"]):
         with pytest.raises(jv.InputError, match=r"^path is .*; it must be the path of a file"):
             require_path(wrong, "path")
 

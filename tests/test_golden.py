@@ -51,7 +51,7 @@ def test_scenes_hold_every_load_drive_and_effect():
     assert kinds >= {"one_mass", "two_mass", "three_mass", "network", "planar_rotor", "rotor"}
     assert kinds >= {"ball", "roller", "pendulum", "torus_ball"}
     assert kinds >= {"constant_speed", "spin_up", "run_up", "dc_motor", "induction_motor"}
-    effects = {type(effect) for scene in found for effect in scene.effects}
+    effects = {type(effect) for scene in found for effect in scene.all_effects}
     assert effects == {getattr(jv, name) for name in jv.__all__ if is_effect(getattr(jv, name))}
 
 

@@ -81,7 +81,7 @@ _ROTOR = """
 
 def numbers(scene: Any) -> tuple[float, ...]:
     """The scene's numbers as the native code takes them."""
-    machine, loads, (gravity, imbalance, rolling) = scene.machine, scene.loads, scene.effects
+    machine, loads, (gravity, imbalance, rolling) = scene.machine, scene.loads, scene.all_effects
     values = (machine.mass, machine.stiffness, machine.damping, loads.mass, loads.radius, loads.gap, scene.drive.speed)
     lever = rolling.coefficient / loads.ball_radius
     return tuple(float(x) for x in (*values, gravity.g, imbalance.moment, lever, rolling.width))

@@ -29,21 +29,20 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     that the scene has not, and for what is no speed."""
     from jaxvib.machine.drive import ConstantSpeed  # slow to import, as what follows, and --help needs none of it
     from jaxvib.machine.files import load_scene
-    from jaxvib.machine.scene import Scene
 
     scene = load_scene(path)
     if speed is not None:
-        scene = Scene(scene.machine, scene.loads, ConstantSpeed(speed), scene.effects)
+        scene = scene.replace(drive=ConstantSpeed(speed))
     elif constant and scene.drive.ideal and not scene.drive.constant:
         end = float(scene.drive.speed)
         click.echo(f"at a constant speed of {end:.6g} rad/s, at which the drive ({scene.drive.kind}) ends", err=True)
-        scene = Scene(scene.machine, scene.loads, ConstantSpeed(end), scene.effects)
-    there = [effect.kind for effect in scene.effects]
+        scene = scene.replace(drive=ConstantSpeed(end))
+    there = [effect.kind for effect in scene.all_effects]
     for kind in without:
         if kind not in there:
             raise InputError("--without", f"is {quoted(kind)}; the scene's effects are: {', '.join(there) or 'none'}")
-    kept = tuple(effect for effect in scene.effects if effect.kind not in without)
-    return scene if len(kept) == len(there) else Scene(scene.machine, scene.loads, scene.drive, kept)
+    kept = tuple(effect for effect in scene.all_effects if effect.kind not in without)
+    return scene if len(kept) == len(there) else scene.replace(effects=kept)
 
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")

@@ -28,11 +28,13 @@ def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Toleranc
 def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, object]:
     """End of a motion, and values measured over its last turns."""
     structure = scene.machine.structure()
+    rotors = (run.window.rotor_speed,) if isinstance(run, jv.Envelope) else run.window.rotor_speeds
+    speeds = [speed[-1] for speed in rotors]
     return {
         "status": run.status_name,
         "message": run.message,
         "time": run.window.time[-1],
-        "rotor_speed": run.window.rotor_speed[-1],
+        "rotor_speed": speeds[0] if len(speeds) == 1 else speeds,
         **fields_of(run, "omega", "load_speed"),
         "coordinates": structure.coordinates,
         "units": structure.units,
@@ -44,7 +46,7 @@ def run_document(run: jv.Run) -> dict[str, object]:
     """A run's quantities over its last turns, its error and its cost."""
     return {
         **measured_document(run, run.scene),
-        "regime": _regime(run.regime),
+        **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
         **fields_of(run, "coincident", "error", "evaluations", "seconds"),
     }
 

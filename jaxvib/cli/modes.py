@@ -54,7 +54,7 @@ def modes(
     if exact:
         _exact(loaded, unit, csv, output)
         return
-    if phases or loaded.machine.mounting().axes != (1,):
+    if phases or loaded.mounting().axes != (1,):
         if csv is not None:
             raise InputError("--csv", "writes branches over the load speed; jams at any phases have none, see --json")
         _phases(loaded, unit, output)
@@ -134,7 +134,7 @@ def _left_out(scene: jv.Scene) -> list[str]:
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import RotorImbalance
 
-    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.effects if has_term([effect], RotorImbalance))
+    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.all_effects if has_term([effect], RotorImbalance))
     return [f"amplitudes and forces are the loads' alone: the {named} shakes at the rotor's own speed, on top"] if named else []
 
 

@@ -98,7 +98,7 @@ class CoincidentModel(eqx.Module):
 
 def coincident_model(linear: JammedModel) -> CoincidentModel:
     """The coincident loads as bodies on their carrier. **Raises** `InputError` for a rotor out of balance."""
-    loads, effects = linear.loads, linear.scene.effects
+    loads, effects = linear.loads, linear.scene.all_effects
     _require_balance(effects)
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
     if loads.alike:
@@ -112,7 +112,7 @@ def coincident_model(linear: JammedModel) -> CoincidentModel:
 def require_coincident(scene: Scene) -> CircularLoads:
     """The loads of a scene whose jams repeat. **Raises** `InputError` for a rotor out of balance, and as `jammed_loads`."""
     loads = jammed_loads(scene)
-    _require_balance(scene.effects)
+    _require_balance(scene.all_effects)
     return loads
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
+import operator
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -10,14 +13,22 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.exciter import Eliminated, Exciter, depends_on_acceleration, signed, without_coupling
+from jaxvib.equations.exciter import (
+    Eliminated,
+    ExciterDynamics,
+    RotorDynamics,
+    depends_on_acceleration,
+    signed,
+    without_coupling,
+)
 from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.sliding import ContactSolution
 from jaxvib.equations.state import State
-from jaxvib.machine.effects.base import has_term, terms_of
+from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
-from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import small_inverse, small_solve, times
+from jaxvib.machine.mount import Mount
+from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
 
 __all__ = ["Dynamics", "dynamics_of", "vector_field"]
 
@@ -37,7 +48,8 @@ class Dynamics(eqx.Module):
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
     - `input_matrix` M^-1 P^T (nd, nP), acceleration per force on the rows; `accelerance` P M^-1 P^T (nP, nP); `rows` P (nP, nd)
-    - `exciters`, see `Exciter`; `supports`, a place for each `SupportForce`
+    - `mass` M (nd, nd) if P has more rows than there are coordinates, otherwise None
+    - `exciters`, see `RotorDynamics`; `supports`, a place for each `SupportForce`
     """
 
     stiffness: Array
@@ -46,19 +58,22 @@ class Dynamics(eqx.Module):
     input_matrix: Array
     accelerance: Array
     rows: Array
-    exciters: tuple[Exciter, ...]
+    mass: Array | None
+    exciters: tuple[RotorDynamics, ...]
     supports: tuple[_Support, ...]
 
     def __call__(self, t: Array, state: State) -> State:
         """Return the time derivative of `state` at time `t`.
 
-        Each exciter is eliminated first, see `Exciter.eliminate`. With the added mass W and the reaction g of all exciters, the
-        accelerations a of P's rows then follow from (1 + accelerance W) a = a_free - accelerance g: one equation per row,
-        however many platforms and loads there are.
+        Each exciter is eliminated first, see `RotorDynamics.eliminate`. With the added mass W and the reaction g of all
+        exciters, the accelerations a of P's rows then follow from (1 + accelerance W) a = a_free - accelerance g: one equation
+        per row, however many platforms and loads there are. If there are more rows than coordinates, q'' follows from
+        (M + P^T W P) q'' = M q''_free - P^T g.
         """
-        speeds = [exciter.drive.rotor_speed(t, state.rotor) for exciter in self.exciters]
+        pairs = list(zip(self.exciters, state.exciters, strict=True))
+        speeds = [exciter.drive.rotor_speed(t, own.rotor) for exciter, own in pairs]
         unforced = self._unforced(state, speeds)
-        motions = [exciter.motion(t, state, speed) for exciter, speed in zip(self.exciters, speeds, strict=True)]
+        motions = [exciter.motion(t, own, speed) for (exciter, own), speed in zip(pairs, speeds, strict=True)]
 
         def solve(contacts: Sequence[ContactSolution]) -> tuple[list[tuple[Eliminated, list[Array]]], Array]:
             cases = zip(self.exciters, motions, contacts, strict=True)
@@ -78,41 +93,55 @@ class Dynamics(eqx.Module):
             cases = zip(self.exciters, motions, contacts, solved, strict=True)
             solved, carrier = solve([exciter.slide(motion, contact, *part) for exciter, motion, contact, part in cases])
         cases = zip(self.exciters, motions, rolling, solved, strict=True)
-        (rates,) = [exciter.rates(motion, contact, *part) for exciter, motion, contact, part in cases]
-        return State(state.velocity, carrier, *rates)
+        rates = [exciter.rates(motion, contact, *part) for exciter, motion, contact, part in cases]
+        return State(state.velocity, carrier, exciters=rates)
 
     def _unforced(self, state: State, speeds: Sequence[Array]) -> Array:
         """Return the accelerations of the carrier without exciters."""
         flow = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
-            (speed,) = speeds
+            speed = speeds[0] if len(speeds) == 1 else sum(speeds[1:], speeds[0]) / len(speeds)
             flow = flow - speed * times(self.gyroscopic, state.velocity)
-        terms = [term for exciter in self.exciters for term in terms_of(exciter.effects, SupportForce)]
-        for term, support in zip(terms, self.supports, strict=True):
+        for term, support in zip(terms_of(self.exciters[0].effects, SupportForce), self.supports, strict=True):
             x, v = times(support.rows, state.displacement), times(support.rows, state.velocity)
             flow = flow - times(support.input_matrix, term.force(x, v))
         return flow
 
     def _close(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
         """Return the accelerations of the rows of each exciter, and of the carrier."""
-        sizes = [len(part.reaction) for part in parts]
-        ends = np.cumsum(sizes).tolist()
-        n, reaction = ends[-1], [g for part in parts for g in part.reaction]
-        weight = [
-            [*[0.0] * (end - size), *line, *[0.0] * (n - end)]
-            for part, size, end in zip(parts, sizes, ends, strict=True)
-            for line in part.added_mass
+        ends = np.cumsum([len(part.reaction) for part in parts]).tolist()
+        blocks = [range(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
+        own = [block for block in blocks for _ in block]
+        weights = [
+            dict(zip(block, line, strict=True)) for part, block in zip(parts, blocks, strict=True) for line in part.added_mass
         ]
-        free = times(self.rows, unforced)
-        matrix = [
-            [(1.0 if i == k else 0.0) + sum(self.accelerance[i, j] * weight[j][k] for j in range(n)) for k in range(n)]
-            for i in range(n)
-        ]
+        reaction = [g for part in parts for g in part.reaction]
+        if self.mass is not None:
+            carrier = self._solve_in_coordinates(self.mass, unforced, weights, reaction)
+            return [[jnp.sum(self.rows[k] * carrier) for k in block] for block in blocks], carrier
+
+        def felt(i: int, k: int) -> Array | float:
+            """Acceleration of row i per acceleration of row k by the added mass, which acts within an exciter."""
+            return sum(self.accelerance[i, j] * weights[j][k] for j in own[k])
+
+        n, free = ends[-1], times(self.rows, unforced)
+        matrix = [[(1.0 if i == k else 0.0) + felt(i, k) for k in range(n)] for i in range(n)]
         right = tuple(free[i] - sum(self.accelerance[i, j] * reaction[j] for j in range(n)) for i in range(n))
         a = small_inverse(matrix)(right)
-        push = [-sum(weight[i][k] * a[k] for k in range(n)) - reaction[i] for i in range(n)]
+        push = [-sum(w * a[k] for k, w in weights[i].items()) - reaction[i] for i in range(n)]
         carrier = unforced + sum(self.input_matrix[:, i] * push[i] for i in range(n))
-        return [list(a[end - size : end]) for size, end in zip(sizes, ends, strict=True)], carrier
+        return [[a[k] for k in block] for block in blocks], carrier
+
+    def _solve_in_coordinates(
+        self, mass: Array, unforced: Array, weights: list[dict[int, Array | float]], reaction: list[Array | float]
+    ) -> Array:
+        """Return the accelerations of the carrier; each row has its added mass with others, and its reaction."""
+        force = times(mass, unforced)
+        for row, line, g in zip(self.rows, weights, reaction, strict=True):
+            felt = functools.reduce(operator.add, (w * self.rows[k] for k, w in line.items()))
+            mass = mass + row[:, None] * felt[None, :]
+            force = force - row * g
+        return solve_definite(mass, force)
 
 
 @validated
@@ -144,30 +173,33 @@ def vector_field(scene: Scene) -> Dynamics:
 
 def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_solve) -> Dynamics:
     """Return `vector_field` of a scene that is assembled already; `solve` gives x of a x = b, a the mass matrix."""
-    scene, carrier, mount, effects = model.scene, model.carrier, model.mount, model.scene.effects
-    moving = mount.rows if has_term(effects, RotorImbalance) else mount.rows[: len(mount.levers)]
+    scene, carrier, gyroscopic = model.scene, model.carrier, model.mounts[0].gyroscopic
+    exciters = tuple(map(_exciter_dynamics, scene.exciters, model.mounts, itertools.repeat(scene.effects)))
+    moving = [row for exciter, mount in zip(exciters, model.mounts, strict=True) for row in mount.rows[: exciter.row_count]]
     rows = moving[0] if len(moving) == 1 else jnp.concatenate(moving)
     parts = [carrier.stiffness, carrier.damping, rows.T, *(place.T for place in model.supports)]
-    if mount.gyroscopic is not None:
-        parts.append(mount.gyroscopic)
+    if gyroscopic is not None:
+        parts.append(gyroscopic)
     solved = solve(carrier.mass, jnp.concatenate(parts, axis=1))
     stiffness, damping, input_matrix, *rest = jnp.split(solved, np.cumsum([part.shape[1] for part in parts])[:-1], axis=1)
-    exciter = Exciter(
-        levers=mount.levers,
-        rotor_levers=mount.rotor_levers,
-        loads=scene.loads,
-        drive=scene.drive,
-        effects=tuple(effect.prepare(scene.loads) for effect in effects),
-        axes=mount.axes,
-        row_count=len(moving),
-    )
     return Dynamics(
         stiffness=stiffness,
         damping=damping,
-        gyroscopic=None if mount.gyroscopic is None else rest[-1],
+        gyroscopic=None if gyroscopic is None else rest[-1],
         input_matrix=input_matrix,
         accelerance=rows @ input_matrix,
         rows=rows,
-        exciters=(exciter,),
+        mass=carrier.mass if rows.shape[0] > rows.shape[1] else None,
+        exciters=exciters,
         supports=tuple(map(_Support, model.supports, rest)),
     )
+
+
+def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]) -> RotorDynamics:
+    """Return the dynamics of an exciter under its effects and those that it shares with others."""
+    effects, loads = (*shared, *exciter.effects), exciter.loads
+    rotor = (mount.levers, mount.rotor_levers, exciter.turning_drive, exciter.unbalance)
+    row_count = len(mount.rows) if has_term(effects, RotorImbalance) else len(mount.levers)
+    if loads is None:
+        return RotorDynamics(*rotor, effects, mount.axes, row_count)
+    return ExciterDynamics(*rotor, tuple(effect.prepare(loads) for effect in effects), mount.axes, row_count, loads)

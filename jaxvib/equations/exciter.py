@@ -27,7 +27,7 @@ from jaxvib.equations.sliding import (
     slip_rates,
     total,
 )
-from jaxvib.equations.state import Spin, State
+from jaxvib.equations.state import ExciterState, Spin
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of, total_gravity
@@ -45,7 +45,7 @@ from jaxvib.machine.loads import DrillingSpin, Loads
 from jaxvib.machine.mount import scaled
 from jaxvib.numerics.linalg import small_inverse
 
-__all__ = ["Eliminated", "Exciter", "ExciterRates", "Motion"]
+__all__ = ["Eliminated", "ExciterDynamics", "Motion", "RotorDynamics"]
 
 Axes = dict[int, Array]
 """A vector (count,) for each axis, 0 across and 1 up."""
@@ -54,15 +54,17 @@ Axes = dict[int, Array]
 class Motion(NamedTuple):
     """Motion of an exciter as far as it is known before the accelerations.
 
-    **Attributes**: `state`; the rotor's `speed`; `kinematics` of the loads; `imbalance` of the rotor, see `Exciter._imbalance`;
-    `drag` (count,), the torque of the rotor; `rolling`, the forces on loads that all roll.
+    **Attributes**: `state`; the rotor's `speed`; `imbalance` of the rotor, see `RotorDynamics._imbalance`; `kinematics` of the
+    loads; `drag` (count,), the torque of the rotor on them; `weight`, the torque of gravity on the unbalance, None without one;
+    `rolling`, the forces on loads that all roll.
     """
 
-    state: State
+    state: ExciterState
     speed: Array
-    kinematics: Kinematics
     imbalance: tuple[list[Array], list[Array]] | None
+    kinematics: Kinematics
     drag: Array
+    weight: Array | None
     rolling: ContactSolution
 
 
@@ -87,26 +89,18 @@ class Eliminated(NamedTuple):
         )
 
 
-class ExciterRates(NamedTuple):
-    """Time derivative of the exciter's part of a `State`, in the order of its fields."""
+class RotorDynamics(eqx.Module):
+    """Rotor of an exciter without loads.
 
-    angle: tuple[Array, ...]
-    rate: tuple[Array, ...]
-    rotor: tuple[Array, Array] | None
-    spin: Spin | None
-
-
-class Exciter(eqx.Module):
-    """Loads, drive and effects of one exciter.
-
-    **Attributes**: `levers` of the loads and `rotor_levers`, see `Mount`; `effects`, prepared for the loads; `axes` of the
-    mount; `row_count`, the number of entries of the mount's rows that move loads or an unbalanced rotor.
+    **Attributes**: `levers` of the loads and `rotor_levers`, see `Mount`; `drive` in the direction of the exciter; `unbalance`
+    about the axis, kg m, or None; `effects`, prepared for the loads; `axes` of the mount; `row_count`, the number of entries of
+    the mount's rows that move loads or an unbalanced rotor.
     """
 
     levers: tuple[Array | None, ...]
     rotor_levers: tuple[Array | None, ...]
-    loads: Loads
     drive: Drive
+    unbalance: Array | None
     effects: tuple[Effect, ...]
     axes: tuple[int, ...] = eqx.field(static=True)
     row_count: int = eqx.field(static=True)
@@ -114,9 +108,119 @@ class Exciter(eqx.Module):
     @property
     def can_slide(self) -> bool:
         """True if an effect lets loads slide."""
+        return False
+
+    def motion(self, t: Array, state: ExciterState, speed: Array) -> Motion:
+        """Return everything that is known before the accelerations, the rotor turning at `speed`."""
+        no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
+        drag, weight = jnp.zeros_like(speed), self.weight(t, state)
+        return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact)
+
+    def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
+        """Solve for the own accelerations of the exciter. The friction of `contact` is linear in the accelerations."""
+        n = self.row_count * len(self.axes)
+        added_mass: list[list[Array | float]] = [[0.0] * n for _ in range(n)]
+        return Eliminated((), {}, *self._add_rotor(motion, added_mass, [0.0] * n, motion.drag, {}))
+
+    def at_loads(self, a: Sequence[Array]) -> Axes:
+        """Return the accelerations of the points that carry the loads, from those of the mount's rows."""
+        return {}
+
+    def slide(self, motion: Motion, contact: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ContactSolution:
+        """Decide which loads slide, by the forces that their contacts need in the motion in which all of them roll."""
+        return contact
+
+    def rates(self, motion: Motion, rolling: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ExciterState:
+        """Return the time derivative of the exciter's state, from the accelerations of the mount's rows.
+
+        `rolling`, the forces on loads that all roll, says how the slip of each load changes.
+        """
+        return ExciterState(rotor=self._rotor_rates(motion, part, a))
+
+    def _rotor_rates(self, motion: Motion, part: Eliminated, a: Sequence[Array]) -> tuple[Array, Array] | None:
+        return None if part.rotor is None else (motion.speed, part.rotor[0] - dot(part.rotor[1], a))
+
+    def _add_rotor(
+        self,
+        motion: Motion,
+        added_mass: list[list[Array | float]],
+        reaction: list[Array | float],
+        drag: Array,
+        coupling: Axes,
+    ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
+        """Return added mass and reaction with the rotor's imbalance, and the rotor's own acceleration as in `Eliminated`."""
+        motor = self.drive.torque_and_inertia(motion.speed)
+        if motor is None:
+            if motion.imbalance is not None:
+                reaction = [g + b for g, b in zip(reaction, motion.imbalance[1], strict=True)]
+            return added_mass, reaction, None
+        torque, inertia = motor
+        free = torque - self._total(drag)
+        free = (free if motion.weight is None else free - motion.weight) / inertia
+        row = [jnp.zeros_like(free)] * len(reaction)
+        if coupling:
+            by_loads = [self._total(coupling[i], lever) / inertia for lever in self.levers for i in self.axes]
+            row = by_loads + row[len(by_loads) :]
+        if motion.imbalance is None:
+            return added_mass, reaction, (free, row)
+        along, bend = motion.imbalance
+        row = [r + d / inertia for r, d in zip(row, along, strict=True)]
+        added_mass = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(added_mass, along, strict=True)]
+        reaction = [g + b + d * free for g, b, d in zip(reaction, bend, along, strict=True)]
+        return added_mass, reaction, (free, row)
+
+    def _imbalance(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
+        """Return d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2: d(theta) is the imbalance on each row."""
+        terms = terms_of(self.effects, RotorImbalance)
+        if not terms and self.unbalance is None:
+            return None
+        turn, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
+
+        def imbalance(angle: Array) -> tuple[Array, ...]:
+            found = [term.at(angle) for term in terms]
+            own = [] if self.unbalance is None else [(self.unbalance * jnp.cos(angle), self.unbalance * jnp.sin(angle))]
+            static = tuple(total(each[axis] for each in [*(each.static for each in found), *own]) for axis in self.axes)
+            if self.row_count == 1:
+                return static
+            moments = [[each.moment[axis] for each in found] for axis in self.axes]
+            for lever in self.rotor_levers[1:]:
+                for each, axis in zip(moments, self.axes, strict=True):
+                    each.append(scaled(lever, total(imbalance.static[axis] for imbalance in found)))
+            return (*static, *(total(each) if each else jnp.zeros_like(angle) for each in moments))
+
+        def slope(angle: Array) -> tuple[Array, ...]:
+            return jax.jvp(imbalance, (angle,), (jnp.ones_like(angle),))[1]
+
+        along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
+        push = [b * rate**2 for b in bend]
+        change = self.drive.rotor_acceleration(t)
+        if change is not None:
+            push = [p + d * change for p, d in zip(push, along, strict=True)]
+        return list(along), push
+
+    def weight(self, t: Array, state: ExciterState) -> Array | None:
+        """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's angle."""
+        g = total_gravity(self.effects)
+        if self.unbalance is None or 1 not in g:
+            return None
+        return self.unbalance * g[1] * jnp.cos(self.drive.rotor_angle(t, state.rotor))
+
+    def _total(self, values: Array, *levers: Array | None) -> Array:
+        """Return the sum over all loads."""
+        return values
+
+
+class ExciterDynamics(RotorDynamics):
+    """Rotor of an exciter with its `loads`."""
+
+    loads: Loads
+
+    @property
+    def can_slide(self) -> bool:
+        """True if an effect lets loads slide."""
         return has_term(self.effects, SlipRelease)
 
-    def motion(self, t: Array, state: State, speed: Array) -> Motion:
+    def motion(self, t: Array, state: ExciterState, speed: Array) -> Motion:
         """Return everything that is known before the accelerations, the rotor turning at `speed`."""
         imbalance = self._imbalance(t, state)
         found = kinematics(self.loads, state.angle, state.rate)
@@ -125,7 +229,8 @@ class Exciter(eqx.Module):
         terms = terms_of(self.effects, ContactFriction)
         rubbing = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
         friction = [each.signed({}) if each.normal is None else each for each in rubbing]
-        return Motion(state, speed, found, imbalance, drag, ContactSolution(self.loads.inertia_factor(), force, friction))
+        contact = ContactSolution(self.loads.inertia_factor(), force, friction)
+        return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Solve loads and rotor for their own accelerations. The friction of `contact` is linear in the accelerations."""
@@ -167,26 +272,23 @@ class Exciter(eqx.Module):
             self.loads, motion.kinematics, slip, limit, normal_force, at_loads, needed, contact.force, centre, contact.friction
         )
 
-    def rates(self, motion: Motion, rolling: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ExciterRates:
-        """Return the time derivative of the exciter's state, from the accelerations of the mount's rows.
-
-        `rolling`, the forces on loads that all roll, says how the slip of each load changes.
-        """
+    def rates(self, motion: Motion, rolling: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ExciterState:
+        """Return the time derivative of the exciter's state."""
         state, speed = motion.state, motion.speed
-        rotor = None if part.rotor is None else (speed, part.rotor[0] - dot(part.rotor[1], a))
+        rotor = self._rotor_rates(motion, part, a)
         at_loads = self.at_loads(a)
         change = part.change(at_loads)
         slip = self._slip(state)
         slip_change = None if slip is None else self._slip_change(motion, slip, rolling, change, at_loads)
         drilling = self._drilling_spin(state, speed)
         spin = None if drilling is None and slip is None else Spin(None if drilling is None else drilling.rate, slip_change)
-        return ExciterRates(state.rate, change, rotor, spin)
+        return ExciterState(state.rate, change, rotor, spin)
 
-    def centre_forces(self, state: State, speed: Array) -> list[Array]:
+    def centre_forces(self, state: ExciterState, speed: Array) -> list[Array]:
         """Return the generalised forces at the centres of the loads, without those of their contacts, N m of an angle."""
         return self._forces(state, speed, rotation=False)[1]
 
-    def _forces(self, state: State, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
+    def _forces(self, state: ExciterState, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
         """Return the torque of the drag, and the generalised forces on the loads except friction.
 
         Without `rotation` the forces that turn a load about its own centre are left out.
@@ -238,61 +340,6 @@ class Exciter(eqx.Module):
         push = {i: m * (dot(across[i], free) + found.curvature[i]) for i in axes}
         return added_mass, [self._total(push[i], levers[row]) if row < len(levers) else 0.0 for row, i in rows]
 
-    def _add_rotor(
-        self,
-        motion: Motion,
-        added_mass: list[list[Array | float]],
-        reaction: list[Array | float],
-        drag: Array,
-        coupling: Axes,
-    ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
-        """Return added mass and reaction with the rotor's imbalance, and the rotor's own acceleration as in `Eliminated`."""
-        motor = self.drive.torque_and_inertia(motion.speed)
-        if motor is None:
-            if motion.imbalance is not None:
-                reaction = [g + b for g, b in zip(reaction, motion.imbalance[1], strict=True)]
-            return added_mass, reaction, None
-        torque, inertia = motor
-        free = (torque - self._total(drag)) / inertia
-        row = [jnp.zeros_like(free)] * len(reaction)
-        if coupling:
-            by_loads = [self._total(coupling[i], lever) / inertia for lever in self.levers for i in self.axes]
-            row = by_loads + row[len(by_loads) :]
-        if motion.imbalance is None:
-            return added_mass, reaction, (free, row)
-        along, bend = motion.imbalance
-        row = [r + d / inertia for r, d in zip(row, along, strict=True)]
-        added_mass = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(added_mass, along, strict=True)]
-        reaction = [g + b + d * free for g, b, d in zip(reaction, bend, along, strict=True)]
-        return added_mass, reaction, (free, row)
-
-    def _imbalance(self, t: Array, state: State) -> tuple[list[Array], list[Array]] | None:
-        """Return d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2: d(theta) is the imbalance on each row."""
-        terms = terms_of(self.effects, RotorImbalance)
-        if not terms:
-            return None
-        turn, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
-
-        def imbalance(angle: Array) -> tuple[Array, ...]:
-            found = [term.at(angle) for term in terms]
-            static = tuple(total(each.static[axis] for each in found) for axis in self.axes)
-            if self.row_count == 1:
-                return static
-            moment = tuple(total(each.moment[axis] for each in found) for axis in self.axes)
-            for lever in self.rotor_levers[1:]:
-                moment = tuple(x + scaled(lever, y) for x, y in zip(moment, static, strict=True))
-            return (*static, *moment)
-
-        def slope(angle: Array) -> tuple[Array, ...]:
-            return jax.jvp(imbalance, (angle,), (jnp.ones_like(angle),))[1]
-
-        along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
-        push = [b * rate**2 for b in bend]
-        change = self.drive.rotor_acceleration(t)
-        if change is not None:
-            push = [p + d * change for p, d in zip(push, along, strict=True)]
-        return list(along), push
-
     def _slip_change(
         self, motion: Motion, slip: tuple[Array, ...], rolling: ContactSolution, change: tuple[Array, ...], at_loads: Axes
     ) -> tuple[Array, ...]:
@@ -305,14 +352,14 @@ class Exciter(eqx.Module):
         inertia = (rolling.kappa - 1.0) * loads.mass
         return slip_rates(loads, state.angle, state.rate, slip, [f / inertia for f in lacking])
 
-    def _slip(self, state: State) -> tuple[Array, ...] | None:
+    def _slip(self, state: ExciterState) -> tuple[Array, ...] | None:
         if not self.can_slide:
             return None
         if state.spin is None or state.spin.slip is None:
             raise InputError("state.spin", "has no slip, which an effect of the scene releases; see with_spin(scene, state)")
         return state.spin.slip
 
-    def _drilling_spin(self, state: State, speed: Array) -> DrillingSpin | None:
+    def _drilling_spin(self, state: ExciterState, speed: Array) -> DrillingSpin | None:
         if not has_term(self.effects, DrillingSpinRelease):
             return None
         if state.spin is None or state.spin.drilling is None:

@@ -12,12 +12,12 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import dynamics_of
-from jaxvib.equations.exciter import Exciter
-from jaxvib.equations.model import Model, assemble
+from jaxvib.equations.exciter import ExciterDynamics
+from jaxvib.equations.model import assemble
 from jaxvib.equations.sliding import contact_force, dot, kinematics
-from jaxvib.equations.state import State
+from jaxvib.equations.state import ExciterState, State
 from jaxvib.errors import InputError
-from jaxvib.machine.effects.base import terms_of, total_gravity
+from jaxvib.machine.effects.base import Effect, terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
     ContactFriction,
     LoadInteraction,
@@ -26,7 +26,9 @@ from jaxvib.machine.effects.terms import (
     RotorImbalance,
     SupportForce,
 )
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.loads import Loads
+from jaxvib.machine.mount import Mount
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.runtime.programs import cached
 
 __all__ = ["energy", "foundation_force", "normal_force", "power"]
@@ -94,35 +96,49 @@ def _at_time(t: Array | float, state: State) -> Any:
 
 @cached
 def _energy(scene: Scene, state: State, t: Array) -> Array:
-    model, loads = assemble(scene), scene.loads
+    model = assemble(scene)
     q, v = state.displacement, state.velocity
-    p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
-    at_load = model.mount.load_rates(v)
-    total = [rate + at_load.get(axis, 0.0) for axis, rate in enumerate(p_rate)]
-    own = loads.inertia_factor() - 1.0
-    parts = [
-        0.5 * (v @ model.carrier.mass @ v + q @ model.carrier.stiffness @ q),
-        jnp.sum(0.5 * loads.mass * (sum(w**2 for w in total) + own * sum(w**2 for w in p_rate))),
-    ]
-    for term in terms_of(scene.effects, LoadPotential, LoadInteraction):
-        parts.append(jnp.sum(jnp.broadcast_to(term.energy(loads, state.angle), (loads.count,))))
+    parts = [0.5 * (v @ model.carrier.mass @ v + q @ model.carrier.stiffness @ q)]
+    t = jnp.asarray(t, q.dtype)
+    for exciter, mount, own in zip(scene.exciters, model.mounts, state.exciters, strict=True):
+        drive = exciter.turning_drive
+        turn, rate = drive.rotor_angle(t, own.rotor), drive.rotor_speed(t, own.rotor)
+        effects = (*scene.effects, *exciter.effects)
+        parts += _load_energies(exciter.loads, mount, effects, v, own, rate)
+        parts.append(rate * _imbalance_rate(exciter, mount, turn) @ v)
+        weight = total_gravity(effects).get(1)
+        if exciter.unbalance is not None and weight is not None:
+            parts.append(exciter.unbalance * weight * jnp.sin(turn))
+        motor = drive.torque_and_inertia(rate)
+        if motor is not None:
+            parts.append(0.5 * motor[1] * rate**2)
     supports = zip(terms_of(scene.effects, SupportForce), model.supports, strict=True)
     parts += [term.energy(rows @ q) for term, rows in supports]
-    t = jnp.asarray(t, q.dtype)
-    turn, rate = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
+    return sum(parts[1:], parts[0])
+
+
+def _load_energies(
+    loads: Loads | None, mount: Mount, effects: tuple[Effect, ...], velocity: Array, state: ExciterState, speed: Array
+) -> list[Array]:
+    """Kinetic and potential energy of the loads of an exciter, and of their spin, J."""
+    if loads is None:
+        return []
+    p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
+    at_load = mount.load_rates(velocity)
+    total = [rate + at_load.get(axis, 0.0) for axis, rate in enumerate(p_rate)]
+    own = loads.inertia_factor() - 1.0
+    parts = [jnp.sum(0.5 * loads.mass * (sum(w**2 for w in total) + own * sum(w**2 for w in p_rate)))]
+    for term in terms_of(effects, LoadPotential, LoadInteraction):
+        parts.append(jnp.sum(jnp.broadcast_to(term.energy(loads, state.angle), (loads.count,))))
     if state.spin is not None and state.spin.slip is not None:
         found = kinematics(loads, state.angle, state.rate)
         pairs = zip(state.spin.slip, found.columns, found.sizes, strict=True)
         parts += [jnp.sum(own * loads.mass * c * (0.5 * c - dot(column, p_rate) / size)) for c, column, size in pairs]
     if state.spin is not None and state.spin.drilling is not None:
-        drilling = loads.drilling_spin(state.angle, state.rate, rate)
+        drilling = loads.drilling_spin(state.angle, state.rate, speed)
         assert drilling is not None
         parts.append(jnp.sum(0.5 * drilling.inertia * state.spin.drilling**2))
-    parts.append(rate * _imbalance_rate(model, turn) @ v)
-    motor = scene.drive.torque_and_inertia(rate)
-    if motor is not None:
-        parts.append(0.5 * motor[1] * rate**2)
-    return sum(parts[1:], parts[0])
+    return parts
 
 
 @validated
@@ -157,37 +173,56 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
 
 @cached
 def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
-    model, loads = assemble(scene), scene.loads
-    turn, speed = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
+    model = assemble(scene)
     field = dynamics_of(model)
     change = field(t, state)
-    acceleration = change.velocity
-    at_load = model.mount.load_rates(acceleration)
-    taken = loads.resistance(state.angle, state.rate, speed)
-    g = total_gravity(scene.effects)
-    lost = [state.velocity @ model.carrier.damping @ state.velocity]
-    sliding, spun = _spin_power(field.exciters[0], state, change, at_load, speed)
-    for term in terms_of(scene.effects, ContactFriction):
-        rubbing = term.friction(loads, state.angle, state.rate, speed, g).forces(at_load)
-        taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
-        lost += [jnp.sum(f * w) for f, w in zip(rubbing, sliding, strict=False)]
-    for term in terms_of(scene.effects, LoadResistance, LoadInteraction):
-        if term.resistance is not None:
-            resistance = term.resistance(loads, state.angle, state.rate)
-            lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
+    given, lost = [], [state.velocity @ model.carrier.damping @ state.velocity]
+    for exciter, dynamics, mount, own, own_change in zip(
+        scene.exciters, field.exciters, model.mounts, state.exciters, change.exciters, strict=True
+    ):
+        turn, speed = dynamics.drive.rotor_angle(t, own.rotor), dynamics.drive.rotor_speed(t, own.rotor)
+        braking = jnp.zeros_like(speed)
+        if isinstance(dynamics, ExciterDynamics):
+            braking, spun, losses = _load_power(dynamics, own, own_change, mount.load_rates(change.velocity), speed)
+            given.append(spun)
+            lost += losses
+        motor = dynamics.drive.torque_and_inertia(speed)
+        if motor is not None:
+            given.append(speed * motor[0])
+            continue
+        torque = braking + _imbalance_rate(exciter, mount, turn) @ change.velocity
+        weight = dynamics.weight(t, own)
+        given.append(speed * (torque if weight is None else torque + weight))
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         x, v = rows @ state.displacement, rows @ state.velocity
         if term.resistance is not None:
             lost.append(term.resistance(x, v) @ v)
+    return sum(given[1:], given[0]), sum(lost[1:], lost[0])
+
+
+def _load_power(
+    exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
+) -> tuple[Array, Array, list[Array]]:
+    """Torque of the rotor on the loads, N m; power of the rotor that spins and slides them; powers that they lose, W."""
+    loads, g = exciter.loads, total_gravity(exciter.effects)
+    taken = loads.resistance(state.angle, state.rate, speed)
+    sliding, (supplied, lost_in_contact) = _spin_power(exciter, state, change, at_load, speed)
+    lost = [lost_in_contact]
+    for term in terms_of(exciter.effects, ContactFriction):
+        rubbing = term.friction(loads, state.angle, state.rate, speed, g).forces(at_load)
+        taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
+        lost += [jnp.sum(f * w) for f, w in zip(rubbing, sliding, strict=False)]
+    for term in terms_of(exciter.effects, LoadResistance, LoadInteraction):
+        if term.resistance is not None:
+            resistance = term.resistance(loads, state.angle, state.rate)
+            lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
     braking = jnp.sum(taken[0])
     lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(taken, state.rate, strict=True))]
-    motor = scene.drive.torque_and_inertia(speed)
-    torque = braking + _imbalance_rate(model, turn) @ acceleration if motor is None else motor[0]
-    return speed * torque + spun[0], sum(lost[1:], lost[0]) + spun[1]
+    return braking, supplied, lost
 
 
 def _spin_power(
-    exciter: Exciter, state: State, change: State, at_load: Mapping[int, Array], speed: Array
+    exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
     """The rates of the coordinates that a load's slip makes up for; what the rotor puts into loads that spin and slide, and
     what sliding takes, W, but for the friction of rolling."""
@@ -217,7 +252,7 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
         N = m (centrifugal force of u' - n . (acceleration of the load's carrier + gravity upward)),    see `Loads.normal_force`
 
-    The equations keep a load on its track all the same. Friction that follows the normal force is then 0. n is the direction in
+    The equations then keep a load on its track. Friction of the normal force is then 0. n is the direction in
     which the load presses.
 
     **Arguments**
@@ -244,23 +279,30 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
 @cached
 def _normal_force(scene: Scene, t: Array, state: State) -> Array:
-    normal_force = scene.loads.normal_force(state.angle, state.rate, total_gravity(scene.effects))
-    if normal_force is None:
-        problem = f"is {scene.loads.kind!r}; nothing says how they press on their track (Loads.normal_force)"
-        raise InputError("loads.kind", problem)
     model = assemble(scene)
     acceleration = dynamics_of(model)(jnp.asarray(t, state.displacement.dtype), state).velocity
-    return normal_force.at(model.mount.load_rates(acceleration))
+    forces = []
+    for exciter, mount, own in zip(scene.exciters, model.mounts, state.exciters, strict=True):
+        if exciter.loads is None:
+            continue
+        found = exciter.loads.normal_force(own.angle, own.rate, total_gravity(scene.effects))
+        if found is None:
+            problem = f"is {exciter.loads.kind!r}; nothing says how they press on their track (Loads.normal_force)"
+            raise InputError("loads.kind", problem)
+        forces.append(found.at(mount.load_rates(acceleration)))
+    return forces[0] if len(forces) == 1 else jnp.concatenate([jnp.zeros(0, acceleration.dtype), *forces])
 
 
-def _imbalance_rate(model: Model, turn: Array) -> Array:
+def _imbalance_rate(exciter: Exciter, mount: Mount, turn: Array) -> Array:
     """d'(theta).P (nd,) of the rotor's imbalance: the carrier's share of its momentum per speed of the rotor."""
-    mount = model.mount
     static, moment = mount.rotor_rows(), mount.tilt
     row = jnp.zeros_like(static[0])
-    for term in terms_of(model.scene.effects, RotorImbalance):
+    for term in terms_of(exciter.effects, RotorImbalance):
         rate = jax.jvp(term.at, (turn,), (jnp.ones_like(turn),))[1]
         row = row + jnp.stack([rate.static[axis] for axis in mount.axes]) @ static
         if moment is not None:
             row = row + jnp.stack([rate.moment[axis] for axis in mount.axes]) @ moment
+    if exciter.unbalance is not None:
+        along = -jnp.sin(turn), jnp.cos(turn)
+        row = row + exciter.unbalance * jnp.stack([along[axis] for axis in mount.axes]) @ mount.rows[0]
     return row

@@ -130,14 +130,17 @@ class LinearModel(Model):
 def linear_model(scene: Scene) -> LinearModel:
     """Return the model of a scene with the loads on it, see `LinearModel`."""
     model = assemble(scene)
-    carrier, mount = model.carrier, model.mount
-    each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
-    if mount.at_one_point:
-        mass = carrier.mass + jnp.sum(each) * mount.rows[0].T @ mount.rows[0]
-    else:
-        rows = mount.load_rows(scene.loads.count)
-        mass = carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
-    return LinearModel(scene, carrier, mount, model.supports, mass)
+    mass = model.carrier.mass
+    for exciter, mount in zip(scene.exciters, model.mounts, strict=True):
+        if exciter.loads is None:
+            continue
+        each = jnp.broadcast_to(exciter.loads.mass, (exciter.loads.count,))
+        if mount.at_one_point:
+            mass = mass + jnp.sum(each) * mount.rows[0].T @ mount.rows[0]
+        else:
+            rows = mount.load_rows(exciter.loads.count)
+            mass = mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
+    return LinearModel(scene, model.carrier, model.mounts, model.supports, mass)
 
 
 class JammedModel(LinearModel):
@@ -209,7 +212,7 @@ def _real_times(matrix: Array, vector: Array) -> Array:
 def jammed_model(scene: Scene) -> JammedModel:
     """The scene's carrier with jammed loads on it, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
     loads, model = jammed_loads(scene), linear_model(scene)
-    linear = model.scene, model.carrier, model.mount, model.supports, model.mass
+    linear = model.scene, model.carrier, model.mounts, model.supports, model.mass
     return JammedModel(*linear, loads.unbalance(), loads.drag_sum(), model.direction)
 
 
@@ -318,7 +321,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 def require_one_point(scene: Scene) -> None:
     """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
-    if not scene.machine.mounting().at_one_point:
+    if not scene.mounting().at_one_point:
         problem = (
             "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
         )
@@ -342,7 +345,7 @@ def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS
             "drive.kind",
             f"is {quoted(drive.kind)}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
         )
-    require_terms(scene.effects, included)
+    require_terms(scene.all_effects, included)
     return cast(CircularLoads, loads)
 
 

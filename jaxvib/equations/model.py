@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
@@ -19,29 +21,36 @@ __all__ = ["Model", "assemble"]
 class Model(eqx.Module):
     """A scene with its numbers as matrices.
 
-    **Attributes**: `scene`; `carrier`, see `Carrier`; `mount` of its exciter, see `Mount`; `supports`, rows (k, nd) of the
-    place of each `SupportForce` of the scene's effects.
+    **Attributes**: `scene`; `carrier`, see `Carrier`; `mounts` of its exciters, see `Mount`, and `mount`, that of the only one;
+    `supports`, rows (k, nd) of the place of each `SupportForce` of the scene's effects.
     """
 
     scene: Scene
     carrier: Carrier
-    mount: Mount
+    mounts: tuple[Mount, ...]
     supports: tuple[Array, ...]
+
+    @property
+    def mount(self) -> Mount:
+        """Mount of the exciter of a scene that has one. **Raises** `InputError` if it has several."""
+        _, mount = self.scene.exciter, self.mounts[0]
+        return mount
 
     def foundation_force(self, displacement: Array, velocity: Array) -> Array:
         """Return the force of all supports on the foundation, gravity excluded, (nb,) N."""
         force = self.carrier.foundation_force(displacement, velocity)
-        for term, rows in zip(terms_of(self.scene.effects, SupportForce), self.supports, strict=True):
+        for term, rows in zip(terms_of(self.scene.all_effects, SupportForce), self.supports, strict=True):
             force = force + term.force(rows @ displacement, rows @ velocity)
         return force
 
     def natural_force(self, unit: State) -> Array:
         """Return S n^2, N: the unbalance of the loads turns at the speed n of the rotor; `unit`, the scene's natural units."""
-        (speed,) = unit.rate
+        speeds = [each.rate[0] for each in unit.exciters if each.rate] or [unit.velocity / unit.displacement]
+        speed = functools.reduce(jnp.maximum, speeds)
         return jnp.mean(jnp.diagonal(self.carrier.mass)) * unit.displacement * speed**2
 
 
 def assemble(scene: Scene) -> Model:
     """Return the model of a scene."""
-    carrier, mount = scene.machine.carrier(), scene.machine.mount()
-    return Model(scene, carrier, mount, tuple(term.rows(scene.machine) for term in terms_of(scene.effects, SupportForce)))
+    carrier, mounts = scene.machine.carrier(), tuple(scene.machine.mount(exciter.at) for exciter in scene.exciters)
+    return Model(scene, carrier, mounts, tuple(term.rows(scene.machine) for term in terms_of(scene.all_effects, SupportForce)))

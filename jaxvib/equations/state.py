@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 from jax import Array
 
-__all__ = ["Spin", "State"]
+from jaxvib.errors import InputError
+from jaxvib.results.fields import in_unit, part
+
+__all__ = ["ExciterState", "Spin", "State"]
 
 
 class Spin(eqx.Module):
@@ -27,15 +32,15 @@ class Spin(eqx.Module):
     slip: tuple[Array, ...] | None = None
 
 
-class State(eqx.Module):
-    """Positions and velocities of all parts; also the time derivative of such a state.
+class ExciterState(eqx.Module):
+    """Positions and velocities of one exciter; also the time derivative of them.
+
+    All angles are anticlockwise.
 
     **Attributes**
 
-    - `displacement` q (nd,), m, and `velocity` q' (nd,), m/s, of the carrier's coordinates; tilts in rad and rad/s; typical:
-      0.1 to 10 mm
     - `angle` and `rate`: a tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),)
-      in rad and rad/s
+      in rad and rad/s; () without loads
     - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it; None under an ideal drive
     - `spin` of the loads if effects release it, see `Spin` and `with_spin`; otherwise None
 
@@ -45,12 +50,69 @@ class State(eqx.Module):
     ((2,), None)
     """
 
-    displacement: Array
-    velocity: Array
-    angle: tuple[Array, ...]
-    rate: tuple[Array, ...]
+    angle: tuple[Array, ...] = eqx.field(metadata=in_unit("rad", "load"), default=())
+    rate: tuple[Array, ...] = eqx.field(metadata=in_unit("rad/s", "load"), default=())
     rotor: tuple[Array, Array] | None = None
     spin: Spin | None = None
+
+
+class State(eqx.Module):
+    """Positions and velocities of all parts; also the time derivative of such a state.
+
+    **Arguments**
+
+    - `displacement` q (nd,), m, and `velocity` q' (nd,), m/s, of the carrier's coordinates; tilts in rad and rad/s; typical:
+      0.1 to 10 mm
+    - `angle`, `rate`, `rotor`, `spin` of the exciter of a scene with one exciter, see `ExciterState`
+    - `exciters`: instead of these, an `ExciterState` for each exciter
+
+    **Attributes**: `displacement`, `velocity` and `exciters`. Those of the only exciter are `angle`, `rate`, `rotor`, `spin`.
+    """
+
+    displacement: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))
+    velocity: Array = eqx.field(metadata=in_unit("m/s or rad/s", "coordinate"))
+    exciters: tuple[ExciterState, ...] = eqx.field(metadata=part())
+
+    def __init__(
+        self,
+        displacement: Array,
+        velocity: Array,
+        angle: tuple[Array, ...] = (),
+        rate: tuple[Array, ...] = (),
+        rotor: tuple[Array, Array] | None = None,
+        spin: Spin | None = None,
+        *,
+        exciters: Sequence[ExciterState] | None = None,
+    ):
+        self.displacement, self.velocity = displacement, velocity
+        self.exciters = (ExciterState(angle, rate, rotor, spin),) if exciters is None else tuple(exciters)
+
+    @property
+    def exciter(self) -> ExciterState:
+        """State of the exciter of a scene that has one. **Raises** `InputError` if it has several."""
+        if len(self.exciters) != 1:
+            raise InputError("state", f"has {len(self.exciters)} exciters; read state.exciters[0].angle and so on")
+        return self.exciters[0]
+
+    @property
+    def angle(self) -> tuple[Array, ...]:
+        """Coordinates of the loads of the only exciter."""
+        return self.exciter.angle
+
+    @property
+    def rate(self) -> tuple[Array, ...]:
+        """Rates of the coordinates of the loads of the only exciter."""
+        return self.exciter.rate
+
+    @property
+    def rotor(self) -> tuple[Array, Array] | None:
+        """Angle and speed of the rotor of the only exciter, if a motor drives it."""
+        return self.exciter.rotor
+
+    @property
+    def spin(self) -> Spin | None:
+        """Rotation of the loads of the only exciter, if effects make it free."""
+        return self.exciter.spin
 
     @property
     def azimuth(self) -> Array:

@@ -146,8 +146,8 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
     def rates(scene: Scene, t: Array, states: States, given: Inputs) -> tuple[States, Outputs]:
         state, angle = states
         turned = _driven(scene.drive, angle, given, by_input)
-        forced = eqx.tree_at(lambda s: (s.drive, s.effects), scene, (turned, (*scene.effects, _AppliedForce(given.force))))
-        field = dynamics_of(assemble(forced), solve_definite)
+        effects = (*scene.all_effects, _AppliedForce(given.force))
+        field = dynamics_of(assemble(scene.replace(drive=turned, effects=effects)), solve_definite)
         force = assemble(scene).foundation_force(state.displacement, state.velocity)
         known = (turned.rotor_angle(t, None), turned.rotor_speed(t, None)) if ideal and not by_input else None
         return States(field(t, state), given.speed if angle is not None else None), Outputs(force, known)
@@ -202,8 +202,7 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
 
 def has_events(scene: Scene) -> bool:
     """True if the equations have branches: forces that are not smooth, or a drive whose acceleration jumps."""
-    parts = jax.tree.leaves(scene, is_leaf=lambda part: isinstance(part, Effect))
-    smooth = all(term.is_smooth for part in parts if isinstance(part, Effect) for term in part.terms())
+    smooth = all(term.is_smooth for effect in scene.all_effects for term in effect.terms())
     return not smooth or bool(scene.drive.jump_ts())
 
 

@@ -171,7 +171,7 @@ def state_space(
 
 def _at_rest(scene: Scene, speed: Array) -> StateSpace:
     a, b, c, d = map(np.asarray, _rest_matrices(scene, speed))
-    carrier, mounting = scene.machine.structure(), scene.machine.mounting()
+    carrier, mounting = scene.machine.structure(), scene.mounting()
     states = (*coordinate_signals(carrier, "displacement", 0), *coordinate_signals(carrier, "velocity", 1))
     at_exciter = signals_of([f"exciter.{('across', 'up')[axis]}" for axis in mounting.axes], "N")
     outputs = (*states, *coordinate_signals(carrier, "acceleration", 2), *foundation_forces(carrier))
@@ -205,7 +205,7 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
 def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
     if not np.ndim(jam.omega) == 0 or not np.isfinite(jam.omega):
         raise InputError("at", f"is no single jam that exists ({jam.message}); take one that does, with select(mode)")
-    scene = eqx.tree_at(lambda s: s.drive, scene, ConstantSpeed(jam.rotor_speed))
+    scene = scene.replace(drive=ConstantSpeed(jam.rotor_speed))
     phase = jam.phase if isinstance(jam, PhaseJam) else jnp.zeros(scene.loads.count)
     if phase.shape != (scene.loads.count,) or jam.displacement.shape != scene.machine.structure().mass.shape[:1]:
         raise InputError(

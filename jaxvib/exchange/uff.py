@@ -150,7 +150,7 @@ def export_uff(
 
 def _nodes(scene: Scene) -> list[_Node]:
     """Return the nodes of a machine."""
-    machine, mount = scene.machine, scene.machine.mount()
+    machine, mount = scene.machine, scene.mount()
     if machine.places == "platform":
         places = [(k + 1, float(k)) for k in range(machine.structure().mass.shape[0])]
     elif machine.places == "shaft":
@@ -164,7 +164,7 @@ def _nodes(scene: Scene) -> list[_Node]:
 
 def _directions(scene: Scene) -> list[int]:
     """Return the directions of the rows of a node: +Y across, +Z up."""
-    return [2 + axis for axis in scene.machine.mounting().axes]
+    return [2 + axis for axis in scene.mounting().axes]
 
 
 def _head(scene: Scene, path: Path) -> list[dict[str, Any]]:
@@ -220,7 +220,7 @@ def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_s
     model = state_space(scene, rotor_speed=rotor_speed)
     nd, start = len(model.A) // 2, list(_ORDERS).index(quantity)
     found = model.frequency_response(2.0 * np.pi * x)[:, start * nd : (start + 1) * nd, nd:]
-    mounted = np.asarray(scene.machine.mount().rows[0])
+    mounted = np.asarray(scene.mount().rows[0])
     exciter = next((node.number for node in nodes if np.array_equal(node.rows, mounted)), 0)
     return [
         _function(

@@ -132,7 +132,7 @@ def _draw_all(scene: Scene) -> None:
 
 def has_branches(scene: Scene) -> bool:
     """True if jams of the scene lie on branches over the rotor speed, that is if its machine moves up and down only."""
-    return scene.machine.mounting().axes == (1,)
+    return scene.mounting().axes == (1,)
 
 
 def heading(scene: Scene) -> str:

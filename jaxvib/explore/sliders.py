@@ -102,7 +102,7 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
     if loads.count == scene.loads.count:
         return scene
     more = dataclasses.replace(scene.loads, count=loads.count)
-    return Scene(scene.machine, rebuild_part(more, "loads"), scene.drive, scene.effects)
+    return scene.replace(loads=rebuild_part(more, "loads"))
 
 
 def _has(scene: Scene, name: str) -> bool:
@@ -115,7 +115,7 @@ def _has(scene: Scene, name: str) -> bool:
 
 def _shared(scene: Scene) -> bool:
     """True if an additional load is like the others: all share every number, and none has a station of its own."""
-    return scene.machine.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
+    return scene.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 
 def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Slider:

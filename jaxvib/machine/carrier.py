@@ -118,8 +118,11 @@ class Machine(Part):
         """Return the linear structure, see `Carrier`."""
 
     @abc.abstractmethod
-    def mount(self) -> Mount:
-        """Return the mount of the exciter, see `Mount`."""
+    def mount(self, at: Place = None) -> Mount:
+        """Return the mount of an exciter, see `Mount`.
+
+        **Arguments**: `at`, the place of the exciter; None for the default.
+        """
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the rows (np, nd) of a point: it moves by rows q. Exciters, supports, stops and drawings use this method.
@@ -154,14 +157,15 @@ class Machine(Part):
         """Names, directions and shapes of the carrier, without its numbers."""
         return _shapes(self)[0]
 
-    def mounting(self) -> Mount:
-        """Directions and shapes of the exciter's mount, without its numbers."""
-        return _shapes(self)[1]
+    def mounting(self, at: Place = None) -> Mount:
+        """Directions and shapes of an exciter's mount, without its numbers."""
+        return _shapes(self, at)[1]
 
 
-def _shapes(machine: Machine) -> tuple[Carrier, Mount]:
-    leaves, rest = jax.tree.flatten(machine)
-    return _structure(rest, tuple(map(_kind, leaves)), jnp.result_type(float))
+def _shapes(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
+    platform, position = (at, None) if isinstance(at, int) else (None, at)
+    leaves, rest = jax.tree.flatten((machine, position))
+    return _structure(rest, tuple(map(_kind, leaves)), jnp.result_type(float), platform)
 
 
 def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
@@ -172,8 +176,12 @@ def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
 
 @functools.lru_cache(maxsize=128)
 def _structure(
-    rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype
+    rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype, platform: int | None
 ) -> tuple[Carrier, Mount]:
     """Trace once for all machines of a structure and the current `precision`: a trace takes longer than many runs."""
-    machine = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
-    return eqx.filter_eval_shape(lambda machine: (machine.carrier(), machine.mount()), machine)
+    machine, position = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
+
+    def shapes(machine: Machine, position: Array | None) -> tuple[Carrier, Mount]:
+        return machine.carrier(), machine.mount(position if platform is None else platform)
+
+    return eqx.filter_eval_shape(shapes, machine, position)

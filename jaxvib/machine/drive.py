@@ -12,7 +12,7 @@ from jax import Array
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = ["ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
+__all__ = ["Clockwise", "ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
 
 
 _SPEED = unit("rad/s", low=0.0, open_low=True, words="rotor speed")
@@ -75,6 +75,43 @@ class Drive(Part):
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times at which the acceleration jumps, which must be ends of steps."""
         return ()
+
+
+class Clockwise(Drive):
+    """Drive that turns its rotor clockwise: angles, speeds and torques are those of `drive` with the opposite sign."""
+
+    drive: Drive
+    speed: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, drive: Drive):
+        self.drive, self.speed, self.kind = drive, drive.speed, drive.kind
+
+    def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
+        """Return the speed of the drive, negative."""
+        return -self.drive.rotor_speed(t, _mirrored(rotor))
+
+    def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
+        """Return the angle of the drive, negative."""
+        return -self.drive.rotor_angle(t, _mirrored(rotor))
+
+    def rotor_acceleration(self, t: Array) -> Array | None:
+        """Return the acceleration of the drive with the opposite sign."""
+        acceleration = self.drive.rotor_acceleration(t)
+        return None if acceleration is None else -acceleration
+
+    def torque_and_inertia(self, speed: Array) -> tuple[Array, Array] | None:
+        """Return the torque of the drive at the opposite speed with the opposite sign, and its inertia."""
+        motor = self.drive.torque_and_inertia(-speed)
+        return None if motor is None else (-motor[0], motor[1])
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        """Return the times of the drive."""
+        return self.drive.jump_ts()
+
+
+def _mirrored(rotor: Rotor) -> Rotor:
+    return None if rotor is None else (-rotor[0], -rotor[1])
 
 
 class IdealDrive(Drive):

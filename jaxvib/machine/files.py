@@ -13,15 +13,16 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.errors import CONTROL, InputError, quoted, read_text, written
+from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, written
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
+from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import TEMPLATES as ROTORS
 from jaxvib.machine.rotor import planar_rotor, rotor
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units.known import require_known, when_known
@@ -111,7 +112,7 @@ def _require_plain(value: object, name: str) -> None:
 
 
 _MARKS = {
-    "scene": (*SECTIONS, "effects"),
+    "scene": (*SECTIONS, "effects", "exciters"),
     "design": ("free", "choices", "objective", "search"),
     "study": ("axes", "measure"),
     "measurement": ("record", "pendulum", "identify"),
@@ -215,17 +216,40 @@ def scene_from_toml(text: str) -> Scene:
 def scene_from_tables(tables: Tables) -> Scene:
     """Return the scene of the tables of a scene file, see `scene_from_toml`."""
     for name in tables:
-        if name not in (*SECTIONS, "effects"):
-            raise misplaced_name(name, tables, "scene", [*SECTIONS, "effects"])
+        if name not in (*SECTIONS, "effects", "exciters"):
+            raise misplaced_name(name, tables, "scene", [*SECTIONS, "effects", "exciters"])
+    several = "exciters" in tables
     parts = {}
-    for name, kinds in SECTIONS.items():
+    for name in ("machine",) if several else SECTIONS:
         if name not in tables:
             raise InputError(name, f"is missing; a scene file needs the table [{name}]")
-        parts[name] = _built(tables[name], name, kinds)
-    effects = []
-    chosen = tables.get("effects", {})
+        parts[name] = _built(tables[name], name, SECTIONS[name])
+    for name in ("loads", "drive") if several else ():
+        if name in tables:
+            raise InputError(name, f"stands beside [[exciters]]; write [exciters.{name}] below each [[exciters]]")
+    effects = _built_effects(tables.get("effects", {}))
+    if not several:
+        return Scene(**parts, effects=effects)
+    exciters = tables["exciters"]
+    if not isinstance(exciters, list) or not exciters:
+        raise InputError("exciters", "is not a list of tables; write [[exciters]] for each")
+    return Scene(**parts, effects=effects, exciters=[_built_exciter(table, k) for k, table in enumerate(exciters)])
+
+
+def _built_exciter(table: object, k: int) -> Exciter:
+    if not isinstance(table, Mapping):
+        raise InputError(f"exciters[{k}]", f"is {quoted(table)}; it must be a table, write [[exciters]]")
+    with within(f"exciters[{k}]."):
+        values = {name: value for name, value in table.items() if name not in ("loads", "drive", "effects")}
+        parts = {name: _built(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
+        effects = _built_effects(table.get("effects", {}))
+        return build_part(Exciter, {**values, **parts, "effects": effects}, "")
+
+
+def _built_effects(chosen: object) -> tuple[Effect, ...]:
     if not isinstance(chosen, Mapping):
         raise InputError("effects", "is not a table; write [effects] and below it, for example, gravity = true")
+    effects = []
     for name, value in chosen.items():
         if name not in EFFECTS:
             raise InputError(f"effects.{name}", f"is no effect; {suggest_name(name, list(EFFECTS))}")
@@ -237,7 +261,7 @@ def scene_from_tables(tables: Tables) -> Scene:
             effects.append(build_part(EFFECTS[name], {}, f"effects.{name}"))
         elif value is not False:
             raise InputError(f"effects.{name}", f"is {quoted(value)}; write true, false or a table of its arguments")
-    return Scene(**parts, effects=tuple(effects))
+    return tuple(effects)
 
 
 def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
@@ -254,12 +278,13 @@ def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
     """Return `build(**values)`. **Raises** `InputError` for unknown and missing names, as fields of `section`."""
     parameters = inspect.signature(build).parameters
+    prefix = f"{section}." if section else ""
     for name in values:
         if name not in parameters:
-            raise InputError(f"{section}.{name}", f"is no field here; {suggest_name(name, list(parameters))}")
+            raise InputError(prefix + name, f"is no field here; {suggest_name(name, list(parameters))}")
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
-            raise InputError(f"{section}.{name}", f"is missing; needed here: {', '.join(_needed(parameters))}")
+            raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
     return build(**values)
 
 
@@ -292,18 +317,36 @@ def scene_to_toml(scene: Scene) -> str:
     import tomli_w  # slow import
 
     require_known(scene, "scene", "scene_to_toml", "write the scene outside")
-    tables: dict[str, Tables] = {}
-    for name, kinds in SECTIONS.items():
-        part = getattr(scene, name)
-        tables[name] = {"kind": part.kind, **_fields(part, kinds[part.kind])}
-    tables["effects"] = {}
-    for effect in scene.effects:
+    tables: Tables = {"machine": _part_table("machine", scene.machine)}
+    if len(scene.exciters) == 1 and scene.exciters[0].is_plain and scene.exciters[0].at is None:
+        tables |= {"loads": _part_table("loads", scene.loads), "drive": _part_table("drive", scene.drive)}
+        return tomli_w.dumps({**tables, "effects": _effect_tables(scene.all_effects)})
+    tables["exciters"] = list(map(_exciter_table, scene.exciters))
+    return tomli_w.dumps({**tables, "effects": _effect_tables(scene.effects)})
+
+
+def _part_table(section: str, part: Any) -> Tables:
+    return {"kind": part.kind, **_fields(part, SECTIONS[section][part.kind])}
+
+
+def _exciter_table(exciter: Exciter) -> Tables:
+    at = exciter.position if exciter.platform is None else exciter.platform
+    own = {"at": at, "unbalance": exciter.unbalance}
+    table = {name: np.asarray(value).item() for name, value in own.items() if value is not None}
+    parts = {name: part for name in ("loads", "drive") if (part := getattr(exciter, name)) is not None}
+    table |= {"direction": exciter.direction, **{name: _part_table(name, part) for name, part in parts.items()}}
+    return {**table, "effects": _effect_tables(exciter.effects)} if exciter.effects else table
+
+
+def _effect_tables(effects: tuple[Effect, ...]) -> Tables:
+    tables: Tables = {}
+    for effect in effects:
         fields = _fields(effect, EFFECTS[effect.kind])
         if effect.repeatable:
-            tables["effects"].setdefault(effect.kind, []).append(fields)
+            tables.setdefault(effect.kind, []).append(fields)
         else:
-            tables["effects"][effect.kind] = fields
-    return tomli_w.dumps(tables)
+            tables[effect.kind] = fields
+    return tables
 
 
 def _fields(part: object, build: Callable[..., object]) -> Tables:

@@ -67,9 +67,9 @@ class Platforms(Machine):
             coordinates=tuple(f"y{i + 1}" for i in range(n)),
         )
 
-    def mount(self) -> Mount:
-        """Return the vertical motion of the exciter's platform."""
-        return Mount(rows=(self.rows_at(self.exciter),), axes=(1,))
+    def mount(self, at: Place = None) -> Mount:
+        """Return the vertical motion of the exciter's platform, `at` its number."""
+        return Mount(rows=(self.rows_at(self.exciter if at is None else at, "at"),), axes=(1,))
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the row of a platform's coordinate; of the first platform for None."""

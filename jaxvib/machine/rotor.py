@@ -83,16 +83,17 @@ class Rotor(Machine):
             coordinate_units=("m", "m", "rad", "rad"),
         )
 
-    def mount(self) -> Mount:
-        """Return the common station of the loads, or the mass centre with a lever for each load, and the tilt of the axis."""
+    def mount(self, at: Place = None) -> Mount:
+        """Return the station of the exciter, or the mass centre with a lever for each load, and the tilt of the axis."""
         skew = np.zeros((4, 4))
         skew[2, 3], skew[3, 2] = 1.0, -1.0
-        shared = self.stations.ndim == 0
+        station = self.stations if at is None else jnp.asarray(at)
+        shared = at is not None or self.stations.ndim == 0
         return Mount(
-            rows=(self.rows_at(None), self._directions()[1]),
+            rows=(self.rows_at(at, "at"), self._directions()[1]),
             axes=(0, 1),
             levers=(None,) if shared else (None, self.stations),
-            rotor_levers=(None, -self.stations) if shared else (None,),
+            rotor_levers=(None, -station) if shared else (None,),
             gyroscopic=self.polar_inertia * jnp.asarray(skew, dtype=self.mass.dtype),
         )
 
@@ -245,8 +246,10 @@ class PlanarRotor(Machine):
             coordinates=("y", "z"),
         )
 
-    def mount(self) -> Mount:
-        """Return the motion of the rotor across and up."""
+    def mount(self, at: Place = None) -> Mount:
+        """Return the motion of the rotor across and up. **Raises** `InputError` for a place."""
+        if at is not None:
+            self.rows_at(at, "at")
         return Mount(rows=(jnp.eye(2, dtype=self.mass.dtype),), axes=(0, 1))
 
 

@@ -1,24 +1,108 @@
-"""Scene: a machine with its loads, drive and effects."""
+"""Scene: a machine with its exciters and effects."""
 
 from __future__ import annotations
 
-from functools import partial
+import functools
+from collections.abc import Sequence
+from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import Drive
-from jaxvib.machine.effects.base import Effect, has_term
-from jaxvib.machine.effects.terms import DrillingSpinRelease, SlipRelease
+from jaxvib.machine.drive import Clockwise, Drive
+from jaxvib.machine.effects.base import Effect, has_term, terms_of
+from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
 from jaxvib.machine.loads import Loads
-from jaxvib.machine.numbers import Part
+from jaxvib.machine.mount import Mount, Place
+from jaxvib.machine.numbers import Part, read_numbers, unit
+from jaxvib.units import Number, number
 from jaxvib.units.known import when_known
 
-__all__ = ["Scene", "require_comparable"]
+__all__ = ["Exciter", "Scene", "read_effects", "require_comparable"]
 
 _MIN_RATIO = 1e-15
 """Ratio of two numbers below which double precision loses the smaller one in a sum."""
+
+
+class Exciter(Part):
+    """Exciter of a machine: a rotor with its drive, its loads, its unbalance, or both.
+
+    **Arguments**
+
+    - `loads` from `balls`, `rollers`, `pendulums`; None without loads
+    - `drive`, a `Motor` or an `IdealDrive`; the inertia of a motor includes the unbalance
+    - `unbalance` S, kg m: static moment m r about the exciter's axis of a mass that turns with the rotor, greater than 0. The
+      mass m is part of the machine's mass. Typical values are 0.1 to 10 kg m
+    - `at`: place on the machine, a platform number or the distance along a rotor's axis from its mass centre, m (a float or
+      text); None for the default of the machine
+    - `direction` of rotation: +1 anticlockwise, -1 clockwise. Angles and speeds of a state are anticlockwise in both cases
+    - `effects` of the rotor and its loads such as `StaticImbalance` or `DryFriction`
+
+    **Attributes**: the arguments, `at` as `platform` or `position`; `carries`: names of what turns, "loads" and "unbalance".
+
+    **Raises** `InputError` for a part of the wrong type, an effect that acts on the whole machine, a direction other than +1 or
+    -1, and an exciter with neither loads nor an unbalance.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.DCMotor("1500 rpm", stall_torque=20.0, inertia=0.05)
+    >>> jv.Exciter(drive=motor, unbalance="0.2 kg m", at=2, direction=-1).at
+    2
+    """
+
+    loads: Loads | None
+    drive: Drive
+    effects: tuple[Effect, ...]
+    unbalance: Array | None = eqx.field(metadata=unit("kg m", low=0.0, open_low=True, words="unbalance of the rotor"))
+    position: Array | None = eqx.field(metadata=unit("m", words="position of the exciter", typical=0.1))
+    platform: int | None = eqx.field(static=True)
+    direction: int = eqx.field(static=True)
+    carries: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        loads: Loads | None = None,
+        drive: Drive | None = None,
+        *,
+        unbalance: Number | None = None,
+        at: int | Number | None = None,
+        direction: int = 1,
+        effects: Effect | Sequence[Effect] = (),
+    ):
+        if loads is not None or unbalance is None:
+            _require_part("loads", loads, Loads, "balls(...)" if unbalance is not None else "balls(...), or give an unbalance")
+        if not isinstance(drive, Drive):
+            raise InputError("drive", f'is {quoted(drive)}; it must be a Drive, for example ConstantSpeed("1500 rpm")')
+        if isinstance(direction, bool) or direction not in (1, -1):
+            raise InputError("direction", f"is {quoted(direction)}; it must be 1 (anticlockwise) or -1 (clockwise)")
+        effects = read_effects(effects)
+        for effect in effects:
+            if _acts_on_machine(effect):
+                problem = "acts on the whole machine; give it to the scene, Scene(effects=...)"
+                raise InputError(f"effects.{effect.kind}", problem)
+        self.loads, self.drive, self.effects, self.direction = loads, drive, effects, int(direction)
+        self.unbalance = None if unbalance is None else read_numbers(Exciter, "", unbalance=unbalance)["unbalance"]
+        self.carries = ("loads",) * (loads is not None) + ("unbalance",) * (unbalance is not None)
+        self.platform = at if isinstance(at, int) else None
+        self.position = None if at is None or isinstance(at, int) else number(at, "m", "at")
+
+    @property
+    def is_plain(self) -> bool:
+        """True for loads on a balanced rotor that turns anticlockwise."""
+        return self.carries == ("loads",) and self.direction == 1
+
+    @property
+    def turning_drive(self) -> Drive:
+        """Drive that turns the rotor in its direction."""
+        return self.drive if self.direction == 1 else Clockwise(self.drive)
+
+    @property
+    def at(self) -> Place:
+        """Place on the machine: a platform number, or a distance along the axis of a rotor, m; None for the default."""
+        return self.position if self.platform is None else self.platform
 
 
 class Scene(Part):
@@ -32,12 +116,17 @@ class Scene(Part):
     - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; typical: 0.1 % to 5 % of the machine's mass
     - `drive` such as `ConstantSpeed`; typical: 600 to 3000 rpm
     - `effects` such as `Gravity`, each once; `CubicSupport` and `Stop` once for each such support. typical: none
+    - `exciters`: instead of `loads` and `drive`, a list of `Exciter`
+
+    **Attributes**: `machine`; `exciters`; `effects` that act on the whole machine. Those of a rotor and its loads are in
+    `Exciter.effects`; `all_effects` are both. `loads` and `drive` are those of a scene with one exciter.
 
     **Raises** `InputError` for
 
     - a part of the wrong type
     - an effect that occurs twice and may occur once
     - a number of stations other than that of the loads
+    - an exciter at a place that the machine does not have
     - an effect that cannot act on this machine or these loads
 
     >>> import jaxvib as jv
@@ -48,44 +137,178 @@ class Scene(Part):
     """
 
     machine: Machine
-    loads: Loads
-    drive: Drive
+    exciters: tuple[Exciter, ...]
     effects: tuple[Effect, ...]
 
-    def __init__(self, machine: Machine, loads: Loads, drive: Drive, effects: tuple[Effect, ...] = ()):
-        parts = (("machine", machine, Machine, "two_mass(...)"), ("loads", loads, Loads, "balls(...)"))
-        parts += (("drive", drive, Drive, 'ConstantSpeed("1500 rpm")'),)
-        for name, part, kind, example in parts:
-            if not isinstance(part, kind):
-                raise InputError(name, f"is {quoted(part)}; it must be a {kind.__name__}, for example {example}")
-        if isinstance(effects, Effect):
-            effects = (effects,)
-        if not isinstance(effects, (tuple, list)):
-            raise InputError("effects", f"is {quoted(effects)}; it must be a tuple of effects, for example (Gravity(),)")
-        effects = tuple(effects)
-        for index, effect in enumerate(effects):
-            if not isinstance(effect, Effect):
-                raise InputError(f"effects[{index}]", f"is {quoted(effect)}; it must be an Effect, for example Gravity()")
-        kinds = [effect.kind for effect in effects if not effect.repeatable]
-        for kind in kinds:
-            if kinds.count(kind) > 1:
-                raise InputError("effects", f"names {kind} {kinds.count(kind)} times; once is allowed")
-        for levers in machine.mounting().levers:
-            if levers is not None and levers.shape != (loads.count,):
-                problem = f"has {levers.shape[0]} values; one for all loads or {loads.count} are needed"
-                raise InputError("machine.stations", problem)
-        for effect in effects:
+    def __init__(
+        self,
+        machine: Machine,
+        loads: Loads | None = None,
+        drive: Drive | None = None,
+        effects: Effect | Sequence[Effect] = (),
+        *,
+        exciters: Sequence[Exciter] | None = None,
+    ):
+        _require_part("machine", machine, Machine, "two_mass(...)")
+        effects = read_effects(effects)
+        shared = tuple(effect for effect in effects if _acts_on_machine(effect))
+        rotating = tuple(effect for effect in effects if not _acts_on_machine(effect))
+        if exciters is None:
+            _require_part("loads", loads, Loads, "balls(...)")
+            exciters = (Exciter(loads, drive, effects=rotating),)
+        else:
+            exciters = _read_exciters(exciters, loads, drive, rotating)
+        self.machine, self.exciters, self.effects = machine, exciters, shared
+        for term in terms_of(self.all_effects, SupportForce):
+            term.rows(machine)  # a place that the machine does not have is an error
+        for k, exciter in enumerate(exciters):
+            if exciter.loads is not None:
+                for effect in shared:
+                    effect.validate(machine, exciter.loads)
+            _require_stations(machine, exciter)
+            with within(self.place_of(k)):
+                _require_fit(machine, exciter)
+
+    @property
+    def all_effects(self) -> tuple[Effect, ...]:
+        """Effects on the whole machine and on every rotor."""
+        groups = self.effects, *(exciter.effects for exciter in self.exciters)
+        # Within `equinox.tree_at` an empty tuple is a leaf.
+        return tuple(effect for group in groups if isinstance(group, tuple) for effect in group)
+
+    @property
+    def top_speed(self) -> Array:
+        """Largest working speed of a drive, rad/s."""
+        return functools.reduce(jnp.maximum, (exciter.drive.speed for exciter in self.exciters))
+
+    @property
+    def exciter(self) -> Exciter:
+        """Exciter of a scene that has one. **Raises** `InputError` if it has several."""
+        if len(self.exciters) != 1:
+            problem = f"has {len(self.exciters)} exciters; this is for a scene with one, simulate follows several"
+            raise InputError("scene", f"{problem} (their parts are scene.exciters[0].drive and so on)")
+        return self.exciters[0]
+
+    @property
+    def is_plain(self) -> bool:
+        """True for one exciter of loads on a balanced rotor that turns anticlockwise, the scenes of all theories."""
+        return len(self.exciters) == 1 and self.exciters[0].is_plain
+
+    @property
+    def loads(self) -> Loads:
+        """Loads of a scene with one exciter that turns anticlockwise and has no `unbalance`: theories that read this know no
+        others. **Raises** `InputError` otherwise."""
+        exciter = self._anticlockwise()
+        if exciter.loads is None or not exciter.is_plain:
+            problem = "has an unbalance; this is for loads on a balanced rotor, simulate others"
+            raise InputError("scene.exciters[0]", problem)
+        return exciter.loads
+
+    @property
+    def drive(self) -> Drive:
+        """Drive of a scene with one exciter that turns anticlockwise. **Raises** `InputError` otherwise."""
+        return self._anticlockwise().drive
+
+    def _anticlockwise(self) -> Exciter:
+        if self.exciter.direction != 1:
+            raise InputError("scene.exciters[0].direction", "is -1; this is for anticlockwise rotors, simulate others")
+        return self.exciter
+
+    def mount(self, at: Place = None) -> Mount:
+        """Return the mount of the only exciter."""
+        return self.machine.mount(self.exciter.at)
+
+    def mounting(self) -> Mount:
+        """Directions and shapes of the only exciter's mount, without its numbers."""
+        return self.machine.mounting(self.exciter.at)
+
+    def replace(self, **parts: Any) -> Scene:
+        """Return the scene with another `machine`, or with other `loads`, `drive` or `effects` of its only exciter.
+
+        >>> import jaxvib as jv
+        >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+        ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+        >>> scene.replace(effects=(jv.Gravity(),)).all_effects[0].kind
+        'gravity'
+        """
+        one = self.exciter
+        known = {"machine": self.machine, "loads": one.loads, "drive": one.drive, "effects": self.all_effects} | parts
+        placed = {"unbalance": one.unbalance, "at": one.at, "direction": one.direction}
+        exciter = Exciter(known.pop("loads"), known.pop("drive"), **placed)
+        return Scene(**known, exciters=[exciter])
+
+    def place_of(self, k: int) -> str:
+        """Return the place of exciter `k` before the names of its parts: "exciters[1]." or, for the only one, ""."""
+        return f"exciters[{k}]." if len(self.exciters) > 1 else ""
+
+
+def _require_stations(machine: Machine, exciter: Exciter) -> None:
+    """**Raises** `InputError` for a place that the machine does not have, and for another number of stations than of loads."""
+    loads = exciter.loads
+    for levers in machine.mounting(exciter.at).levers:
+        if levers is not None and (loads is None or levers.shape != (loads.count,)):
+            needed = "an unbalance needs a place" if loads is None else f"one for all loads or {loads.count} are needed"
+            raise InputError("machine.stations", f"has {levers.shape[0]} values; {needed}")
+
+
+def _require_fit(machine: Machine, exciter: Exciter) -> None:
+    """**Raises** `InputError` for loads or effects that do not fit the machine."""
+    loads = exciter.loads
+    for effect in exciter.effects:
+        if loads is not None:
             effect.validate(machine, loads)
-            if not drive.ideal and has_term([effect], DrillingSpinRelease, SlipRelease):
-                problem = f"needs a drive of given speed (property ideal), not {drive.kind!r}; use ConstantSpeed"
-                raise InputError(f"effects.{effect.kind}", problem)
-        require_comparable(machine, loads, drive)
-        self.machine = machine
-        self.loads = loads
-        self.drive = drive
-        # The order has no meaning; it is that of scene files.
-        first = {effect.kind: index for index, effect in reversed(list(enumerate(effects)))}
-        self.effects = tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
+        elif not all(isinstance(term, RotorImbalance) for term in effect.terms()):
+            raise InputError(f"effects.{effect.kind}", "acts on loads, which this exciter does not have; leave it out")
+        if not exciter.drive.ideal and has_term([effect], DrillingSpinRelease, SlipRelease):
+            problem = f"needs a drive of given speed (property ideal), not {exciter.drive.kind!r}; use ConstantSpeed"
+            raise InputError(f"effects.{effect.kind}", problem)
+    if loads is not None:
+        require_comparable(machine, loads, exciter.drive)
+
+
+def _acts_on_machine(effect: Effect) -> bool:
+    """True if an effect acts on the whole machine, otherwise it acts on one rotor and its loads."""
+    return has_term([effect], GravityField, SupportForce)
+
+
+def _require_part(name: str, part: object, kind: type, example: str) -> None:
+    if not isinstance(part, kind):
+        raise InputError(name, f"is {quoted(part)}; it must be a {kind.__name__}, for example {example}")
+
+
+def _read_exciters(
+    exciters: Sequence[Exciter], loads: Loads | None, drive: Drive | None, effects: tuple[Effect, ...]
+) -> tuple[Exciter, ...]:
+    """Return the exciters of a scene. `effects` of the rotor are those of the only one."""
+    if loads is not None or drive is not None:
+        raise InputError("exciters", "are given beside loads or drive; give these to an Exciter")
+    if not isinstance(exciters, (tuple, list)) or len(exciters) == 0:
+        raise InputError("exciters", f"is {quoted(exciters)}; it must be a list of exciters, for example [Exciter(...)]")
+    for k, each in enumerate(exciters):
+        _require_part(f"exciters[{k}]", each, Exciter, "Exciter(balls(...), ConstantSpeed(100.0))")
+    if not effects:
+        return tuple(exciters)
+    if len(exciters) > 1:
+        raise InputError(f"effects.{effects[0].kind}", "acts on one rotor; give it to an exciter, Exciter(effects=...)")
+    one, own = exciters[0], read_effects((*exciters[0].effects, *effects))
+    return (Exciter(one.loads, one.drive, unbalance=one.unbalance, at=one.at, direction=one.direction, effects=own),)
+
+
+def read_effects(effects: object) -> tuple[Effect, ...]:
+    """Return effects in the order of scene files. **Raises** `InputError` for others and for effects that occur twice."""
+    if isinstance(effects, Effect):
+        effects = (effects,)
+    if not isinstance(effects, (tuple, list)):
+        raise InputError("effects", f"is {quoted(effects)}; it must be a tuple of effects, for example (Gravity(),)")
+    for index, effect in enumerate(effects):
+        if not isinstance(effect, Effect):
+            raise InputError(f"effects[{index}]", f"is {quoted(effect)}; it must be an Effect, for example Gravity()")
+    kinds = [effect.kind for effect in effects if not effect.repeatable]
+    for kind in kinds:
+        if kinds.count(kind) > 1:
+            raise InputError("effects", f"names {kind} {kinds.count(kind)} times; once is allowed")
+    first = {effect.kind: index for index, effect in reversed(list(enumerate(effects)))}
+    return tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
 
 
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
@@ -94,7 +317,7 @@ def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
     This happens for loads too heavy or too light for the machine, and for drag too weak for their inertia.
     """
     parts = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None), drive.speed
-    when_known(partial(_require_comparable, loads.count), *parts)
+    when_known(functools.partial(_require_comparable, loads.count), *parts)
 
 
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")  # shares of the largest and least numbers there are

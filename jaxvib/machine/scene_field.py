@@ -13,8 +13,11 @@ __all__ = ["SCENE"]
 
 
 def _labels(scene: Scene) -> dict[str, Sequence[Any]]:
-    structure = scene.machine.structure()
-    return {"coordinate": structure.coordinates, "unit": structure.units, "load": range(1, scene.loads.count + 1)}
+    structure, counts = scene.machine.structure(), [0 if e.loads is None else e.loads.count for e in scene.exciters]
+    loads = range(1, counts[0] + 1)
+    if len(counts) > 1:
+        loads = [name for k, n in enumerate(counts, 1) for name in ([f"{k}.{j + 1}" for j in range(n)] or [f"{k}"])]
+    return {"coordinate": structure.coordinates, "unit": structure.units, "load": loads}
 
 
 SCENE = as_text(scene_to_toml, scene_from_toml, _labels)

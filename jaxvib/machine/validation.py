@@ -13,9 +13,10 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import call_user
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.files import rebuild_part
-from jaxvib.machine.scene import Scene, require_comparable
+from jaxvib.machine.numbers import read_numbers
+from jaxvib.machine.scene import Exciter, Scene, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
@@ -44,7 +45,8 @@ def validate_scene(scene: Scene) -> Scene:
     if _VALID_SCENES.get(id(scene)) is scene:
         return scene
     leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
-    arrays = [_number(f"scene{jax.tree_util.keystr(path)}", leaf) for path, leaf in leaves]
+    one = ".exciters[0]" if len(scene.exciters) == 1 else "-"
+    arrays = [_number(f"scene{jax.tree_util.keystr(path).removeprefix(one)}", leaf) for path, leaf in leaves]
     if any(new is not old for new, (_, old) in zip(arrays, leaves, strict=True)):
         scene = jax.tree.unflatten(structure, arrays)
     if is_known(arrays):
@@ -90,10 +92,23 @@ def _allowed_value(scene: Scene) -> Array | None:
     return None
 
 
+_CARRIED = ("loads", "unbalance")
+
+
 def _rebuild(scene: Scene) -> None:
     """Build each part of a scene once more. **Raises** `InputError` for a known number that is not allowed."""
-    for section in ("machine", "loads", "drive"):
-        rebuild_part(getattr(scene, section), section)
+    rebuild_part(scene.machine, "machine")
+    for k, exciter in enumerate(scene.exciters):
+        with within(scene.place_of(k)):
+            if exciter.loads is not None:
+                rebuild_part(exciter.loads, "loads")
+            rebuild_part(exciter.drive, "drive")
+            if (exciter.loads is not None, exciter.unbalance is not None) != tuple(x in exciter.carries for x in _CARRIED):
+                raise InputError("carries", f"is {exciter.carries}, not what the exciter has; make a new Exciter")
+            if exciter.unbalance is not None:
+                read_numbers(Exciter, "", unbalance=exciter.unbalance)
+            for effect in exciter.effects:
+                rebuild_part(effect, f"effects.{effect.kind}")
     for effect in scene.effects:
         rebuild_part(effect, f"effects.{effect.kind}")
 
@@ -111,7 +126,10 @@ def _require_valid(key: _SceneKey) -> None:
     """**Raises** `InputError` for a number that is not allowed."""
     scene = key.scene
     _rebuild(scene)
-    require_comparable(scene.machine, scene.loads, scene.drive)
+    for k, exciter in enumerate(scene.exciters):
+        if exciter.loads is not None:
+            with within(scene.place_of(k)):
+                require_comparable(scene.machine, exciter.loads, exciter.drive)
 
 
 def make_scene(make: Callable[..., Scene], *values: object) -> Scene:

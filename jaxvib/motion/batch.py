@@ -14,7 +14,7 @@ from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured, Trajectory, measure, trajectory
+from jaxvib.motion.analysis.measure import Measured, Trajectory, measure, trajectory, turning_angles
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import is_finite, wrap_angles
@@ -148,7 +148,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     held, parts = jax.lax.scan(part, held, (begins, lengths))
     _, later = jax.lax.scan(sample, held, jnp.arange(plan.samples - 1, dtype=dtype))
     before = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)
-    azimuth = motion.unpack(before).azimuth
+    azimuth, _ = turning_angles(scene, lambda: length * jnp.arange(PARTS + 1, dtype=dtype), motion.unpack(before))
     states = motion.unpack(jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), held, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)

@@ -20,7 +20,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import STATE
+from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import BATCH_SIZE, advance, pack_batch, stretches
 from jaxvib.motion.integrate import is_finite, wrap_angles
@@ -89,7 +89,7 @@ class Ensemble(Result):
     - `seconds` that all runs took, compilation included if a program was new; NaN under a JAX transformation
     """
 
-    state: State = eqx.field(metadata=part("run", fields=STATE))
+    state: State = eqx.field(metadata=part("run"))
     load_speed: Array = eqx.field(metadata=in_unit("rad/s", "run", "load"))
     error: Array = eqx.field(metadata=in_unit("", "run"))
     allowed: Array = eqx.field(metadata=in_unit("", "run"))
@@ -235,11 +235,12 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     there, whether it stayed finite, which loads did not press on their track, the steps it took.
     """
     single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
-    watched = scene.loads.one_sided
-    field = field_of(equations, scene)
-    field = _FieldWithDetachment(field, scene) if watched else field
-    state = _with_detachment(state, jnp.zeros_like(state.azimuth)) if watched else state
-    motion = pack_batch(field, state, single, has_common_turns, implicit=implicit)
+    watched = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
+    field, start = field_of(equations, scene), state
+    if watched:
+        pulls = [jnp.zeros_like(own.angle[0]) if own.angle else jnp.zeros(1) for own in state.exciters]
+        field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _joined(pulls))
+    motion = pack_batch(field, start, single, has_common_turns, implicit=implicit)
     length = end / ENSEMBLE_PARTS
 
     def part(held: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
@@ -247,17 +248,19 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
         return held, (held, taken)
 
     def whole(steps: Array) -> tuple[Y, Array]:
-        held, begins, lengths = stretches(motion, motion.pack(state), length, length / steps, ENSEMBLE_PARTS, implicit=implicit)
+        held, begins, lengths = stretches(motion, motion.pack(start), length, length / steps, ENSEMBLE_PARTS, implicit=implicit)
         _, (helds, taken) = jax.lax.scan(lambda held, at: part(held, at, length / steps), held, (begins, lengths))
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 
     helds, taken = jax.lax.map(whole, counts)
     # Wrapped angles are counted from the first of the requested states.
     ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
-    angle = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds)).azimuth
+    pair = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds))
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
-    detached = last.missing != 0.0 if isinstance(last, _StateWithDetachment) else jnp.zeros(last.azimuth.shape, dtype=bool)
-    last, other = (_plain(state) for state in (last, other))
+    is_watched = isinstance(last, _StateWithDetachment)
+    detached = last.missing != 0.0 if is_watched else jnp.zeros(turning_directions(scene).shape, dtype=bool)
+    last, other = (State(each.displacement, each.velocity, exciters=each.exciters) for each in (last, other))
+    angle, _ = turning_angles(scene, lambda: length * jnp.arange(ENSEMBLE_PARTS - 1, ENSEMBLE_PARTS + 1), pair)
     finite, apart = is_finite(last), scaled_error(last, other, error_scale(last, natural_units(scene)))
     # A run whose coarser one did not stay finite has an error that nobody knows.
     apart = jnp.where(finite & ~is_finite(other), jnp.inf, apart)
@@ -265,12 +268,16 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
 
 
 class _StateWithDetachment(State):
-    """A state, and for each load what its track would have had to pull it with so far, summed over time, (count,) N s.
+    """A state, and for each load the pull of its track that is missing so far, integrated over time, (loads,) N s.
 
-    It is exactly 0 where N was nowhere negative, whatever the weights of the method's stages.
+    It is exactly 0 if N was nowhere negative, whatever the weights of the method's stages.
     """
 
-    missing: Array = eqx.field(kw_only=True)
+    missing: Array
+
+    def __init__(self, state: State, missing: Array):
+        super().__init__(state.displacement, state.velocity, exciters=state.exciters)
+        self.missing = missing
 
 
 class _FieldWithDetachment(eqx.Module):
@@ -279,19 +286,19 @@ class _FieldWithDetachment(eqx.Module):
     equations: Callable[[Array, State], State]
     scene: Scene
 
-    def __call__(self, t: Array, state: State) -> State:
-        scene, change = self.scene, self.equations(t, _plain(state))
-        normal_force = scene.loads.normal_force(state.angle, state.rate, total_gravity(scene.effects))
-        assert normal_force is not None
-        force = normal_force.at(scene.machine.mount().load_rates(change.velocity))
-        return _with_detachment(change, jnp.maximum(-force, 0.0))
+    def __call__(self, t: Array, state: State) -> _StateWithDetachment:
+        plain = State(state.displacement, state.velocity, exciters=state.exciters)
+        scene, change, pulls = self.scene, self.equations(t, plain), []
+        for exciter, own in zip(scene.exciters, state.exciters, strict=True):
+            if exciter.loads is None or not exciter.loads.one_sided:
+                pulls.append(jnp.zeros_like(own.angle[0]) if own.angle else jnp.zeros(1))
+                continue
+            normal_force = exciter.loads.normal_force(own.angle, own.rate, total_gravity(scene.effects))
+            assert normal_force is not None
+            force = normal_force.at(scene.machine.mount(exciter.at).load_rates(change.velocity))
+            pulls.append(jnp.maximum(-force, 0.0))
+        return _StateWithDetachment(change, _joined(pulls))
 
 
-def _with_detachment(state: State, missing: Array) -> _StateWithDetachment:
-    return _StateWithDetachment(
-        state.displacement, state.velocity, state.angle, state.rate, state.rotor, state.spin, missing=missing
-    )
-
-
-def _plain(state: State) -> State:
-    return State(state.displacement, state.velocity, state.angle, state.rate, state.rotor, state.spin)
+def _joined(arrays: list[Array]) -> Array:
+    return arrays[0] if len(arrays) == 1 else jnp.concatenate(arrays)

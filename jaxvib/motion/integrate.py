@@ -16,7 +16,7 @@ from jax import Array
 from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.model import assemble
-from jaxvib.equations.state import Spin, State
+from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction
@@ -59,10 +59,15 @@ class StepControl(eqx.Module):
     max_steps: Array | np.ndarray | None = None
 
 
-def repeat_per_coordinate(unit: State, number: int) -> State:
-    """Natural units with one for each of so many coordinates of a load."""
-    spin = unit.spin if unit.spin is None or unit.spin.slip is None else Spin(unit.spin.drilling, unit.spin.slip * number)
-    return State(unit.displacement, unit.velocity, unit.angle * number, unit.rate * number, unit.rotor, spin)
+def repeat_per_coordinate(unit: State, state: State) -> State:
+    """Return natural units with one for each coordinate of a load in the state."""
+
+    def repeated(unit: ExciterState, own: ExciterState) -> ExciterState:
+        number, spin = len(own.angle), unit.spin
+        spin = spin if spin is None or spin.slip is None else Spin(spin.drilling, spin.slip * number)
+        return ExciterState(unit.angle * number, unit.rate * number, unit.rotor, spin)
+
+    return State(unit.displacement, unit.velocity, exciters=tuple(map(repeated, unit.exciters, state.exciters)))
 
 
 def _controller(motion: PackedSystem, state: State, natural: State, control: StepControl) -> diffrax.AbstractStepSizeController:
@@ -70,12 +75,14 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
         return diffrax.ConstantStepSize()
     assert control.tolerance is not None
     # The error of an angle is absolute: relative to its ever-growing value, it would let a long run lose its phase.
-    rotor = None if state.rotor is None else (jnp.zeros(()), jnp.ones(()))
-    one, number = jnp.ones(()), len(state.angle)
-    spin = jax.tree.map(jnp.ones_like, state.spin)
-    relative = State(one, one, (jnp.zeros(()),) * number, (one,) * number, rotor, spin)
-    unit = repeat_per_coordinate(natural, number)
-    dtype = state.displacement.dtype
+    one, zero, dtype = jnp.ones(()), jnp.zeros(()), state.displacement.dtype
+
+    def relative_of(own: ExciterState) -> ExciterState:
+        rotor, spin = None if own.rotor is None else (zero, one), jax.tree.map(jnp.ones_like, own.spin)
+        return ExciterState((zero,) * len(own.angle), (one,) * len(own.rate), rotor, spin)
+
+    relative = State(one, one, exciters=tuple(map(relative_of, state.exciters)))
+    unit = repeat_per_coordinate(natural, state)
 
     def spread(tree: State) -> State:
         return jax.tree.map(lambda value, leaf: jnp.broadcast_to(jnp.asarray(value, dtype), leaf.shape), tree, state)
@@ -89,7 +96,7 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
 
 def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
     """The controller, made to step onto the times at which the drive's acceleration jumps; fixed steps are left alone."""
-    jump_ts = scene.drive.jump_ts()
+    jump_ts = [t for exciter in scene.exciters for t in exciter.drive.jump_ts()]
     if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
         return controller
     return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(jump_ts)))
@@ -97,9 +104,12 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
 
 def effects_rate(scene: Scene) -> Array:
     """The fastest that effects add to the loads' motion, see `Effect.fastest_rate`; 0 where there is none."""
-    rates = (effect.fastest_rate(scene.loads, scene.drive.speed) for effect in scene.effects)
-    found = [jnp.max(rate) for rate in rates if rate is not None]
-    return functools.reduce(jnp.maximum, found, jnp.zeros_like(scene.drive.speed))
+    found, zero = [], jnp.zeros_like(scene.exciters[0].drive.speed)
+    for exciter in scene.exciters:
+        if exciter.loads is not None:
+            rates = [each.fastest_rate(exciter.loads, exciter.drive.speed) for each in (*scene.effects, *exciter.effects)]
+            found += [jnp.max(rate) for rate in rates if rate is not None]
+    return functools.reduce(jnp.maximum, found, zero)
 
 
 @cached
@@ -109,10 +119,11 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
     Among the greatest are the loads' own frequency, where they have one, and what effects add to it.
     """
     scene = jax.lax.stop_gradient(scene)
-    frequencies, speed = estimated_frequencies(scene), scene.drive.speed
-    own = scene.loads.natural_frequency(speed)
+    frequencies, speed = estimated_frequencies(scene), scene.top_speed
     fastest = jnp.maximum(speed, jnp.max(frequencies))
-    fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
+    for exciter in scene.exciters:
+        own = None if exciter.loads is None else exciter.loads.natural_frequency(exciter.drive.speed)
+        fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
     fastest = jnp.maximum(fastest, effects_rate(scene))
     return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
@@ -120,7 +131,7 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
     """True if angles are kept within a turn, and True if all loads' are so by the same turns: single precision, loads that
     touch."""
-    return jnp.dtype(dtype).itemsize < 8, has_term(scene.effects, LoadInteraction)
+    return jnp.dtype(dtype).itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 
 class IntegrationPlan(NamedTuple):
@@ -178,7 +189,9 @@ def integrate(
     if is_measured is None:
         numbers = measure(model, field, times, states, unit)
     else:  # the window of a run with larger steps is compared only
-        numbers = jax.lax.cond(is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(states))
+        numbers = jax.lax.cond(
+            is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(model, states)
+        )
     numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not end has no window; the state where it stopped says whether it was on its way to infinity.
@@ -197,14 +210,15 @@ def integrate(
         evaluations=steps * _stages(solver),
         seconds=unknown,
         scene=scene,
-        coincident=_is_coincident(state.azimuth[None]) & _is_coincident(states.azimuth),
+        coincident=_is_coincident([own.angle[0][None] for own in state.exciters if own.angle])
+        & _is_coincident([own.angle[0] for own in states.exciters if own.angle]),
         engine="scalar" if motion.is_scalarized else "array",
     )
 
 
 def _saves(scene: Scene, end: Array, slowest: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:
     """Times of the states that are kept: the measuring window, the end, and those evenly spaced over the whole run."""
-    longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
+    longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.top_speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.turns / slowest, longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW)), diffrax.SubSaveAt(t1=True)]
     if plan.samples:
@@ -232,10 +246,14 @@ def _steps(
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
 
 
-def _is_coincident(angle: Array) -> Array:
-    """True if several loads have one angle (..., count) all the time, up to the growth of rounding errors."""
-    apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
-    return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
+def _is_coincident(angles: list[Array]) -> Array:
+    """True if several loads of an exciter have one angle (..., count) all the time, up to the growth of rounding errors."""
+
+    def one_angle(angle: Array) -> Array:
+        apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
+        return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
+
+    return functools.reduce(jnp.logical_or, map(one_angle, angles)) if angles else jnp.zeros((), bool)
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:

@@ -133,7 +133,13 @@ def plan_run(
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
     kept, most = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
     # Time loses its digits in single precision.
-    is_cut = known and state.displacement.dtype.itemsize < 8 and save == "window" and scene.drive.constant
+    is_cut = (
+        known
+        and state.displacement.dtype.itemsize < 8
+        and save == "window"
+        and len(scene.exciters) == 1
+        and scene.drive.constant
+    )
     return RunPlan(
         asked=asked,
         scene=scene,
@@ -186,15 +192,17 @@ def _enough_samples(scene: Scene, end: Array) -> int:
     def samples_of(end: float, speed: float) -> int:
         return _FEW_SAMPLES if PER_TURN * end * speed / (2.0 * math.pi) <= _FEW_SAMPLES else _MANY_SAMPLES
 
-    samples = when_known(samples_of, end, scene.drive.speed)
+    samples = when_known(samples_of, end, scene.top_speed)
     return _UNKNOWN_SAMPLES if samples is None else samples
 
 
 def _sample_size(scene: Scene) -> float:
     """Bytes of a kept state with its forces, held three times while it is computed."""
-    structure, coordinates = scene.machine.structure(), len(scene.loads.rest())
-    numbers = 2 * structure.mass.shape[0] + 2 * coordinates * scene.loads.count + structure.foundation_stiffness.shape[0] + 5
-    return 3.0 * scene.drive.speed.dtype.itemsize * numbers
+    structure = scene.machine.structure()
+    numbers = 2 * structure.mass.shape[0] + structure.foundation_stiffness.shape[0] + 1
+    for exciter in scene.exciters:
+        numbers += 4 if exciter.loads is None else 4 + 2 * len(exciter.loads.rest()) * exciter.loads.count
+    return 3.0 * scene.top_speed.dtype.itemsize * numbers
 
 
 def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> Control:
@@ -273,7 +281,7 @@ def plan_ensemble(
     scenes, states, allowed = _made(make, values)
     if (is_positive := unknown_is_positive(known_end)) is not None:
         allowed = allowed & is_positive
-    require_start(scenes, states.angle)
+    require_start(scenes, states)
     known = is_known(scenes, states, end)
     require(steps, EqualSteps)
     if steps is None and not known:

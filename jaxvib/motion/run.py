@@ -93,7 +93,7 @@ class Run(AbstractMeasured, Result):
 
     - It is the part of the difference to a run with larger steps that may remain with smaller ones, and twice of it if an
       effect is not `smooth`; rounding counts too
-    - A motion that forgets its phase has a large error and may have exact amplitudes all the same
+    - A motion that forgets its phase has a large error, but may have exact amplitudes
     """
 
     status: RunStatus
@@ -122,6 +122,8 @@ class Run(AbstractMeasured, Result):
         """Return the outcome of the run as text; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
+        rotors = ", ".join(f"{float(w[-1]):.6g}" for w in self.window.rotor_speeds)
+        rotor = "rotor" if len(self.window.rotor_speeds) == 1 else "rotors"
         state = "settled" if bool(self.settled) else "not settled: run longer"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
@@ -136,10 +138,9 @@ class Run(AbstractMeasured, Result):
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
-                f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
-                f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
+                f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), {rotor} at {rotors} rad/s",
                 f"  {self.extent(self.scene)}",
-                f"  {self.regime.summary()}",
+                *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
                 *self._detachment(),
             ]
@@ -159,14 +160,17 @@ class Run(AbstractMeasured, Result):
 
     @property
     def detached(self) -> Array:
-        """Time at which each load first did not press on a track that only pushes, (count,) s, among the kept states.
+        """Time at which each load first did not press on a track that only pushes, (loads,) s, among the kept states.
 
         NaN for a load that pressed throughout, and for loads that are held from both sides. The equations continue as if the
         load stayed on its track, so the computed motion after this time is not that of a real load.
         """
-        if not self.scene.loads.one_sided:
-            return jnp.asarray(np.full(self.scene.loads.count, np.nan), self.window.time.dtype)
-        return _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
+        loads = [exciter.loads for exciter in self.scene.exciters if exciter.loads is not None]
+        is_pushed = np.repeat([each.one_sided for each in loads], [each.count for each in loads])
+        if not np.any(is_pushed):
+            return jnp.asarray(np.full(is_pushed.size, np.nan), self.window.time.dtype)
+        found = _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
+        return found if np.all(is_pushed) else jnp.where(is_pushed, found, np.nan)
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
@@ -216,7 +220,7 @@ class Run(AbstractMeasured, Result):
         from jaxvib.draw.motion.spectra import path_chart
 
         machine = self.scene.machine
-        mount, kind = machine.mount(), machine.kind
+        mount, kind = self.scene.mount(), machine.kind
         if mount.axes != (0, 1):
             raise InputError(
                 "machine.kind", f"is {quoted(kind)}, which moves up and down only; a path needs a rotor such as rotor(...)"

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.state import State
+from jaxvib.equations.state import ExciterState, State
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
@@ -252,7 +252,7 @@ _ATTEMPTS = 6
 def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
     """Return the run of the smallest tolerance needed for an estimated error of `accuracy`; status `not_accurate` if none
     is small enough."""
-    control, dtype = plan.integration.control, plan.scene.drive.speed.dtype
+    control, dtype = plan.integration.control, plan.scene.top_speed.dtype
     assert isinstance(control, StepControl)
     floor, coarser = 10.0 * float(jnp.finfo(dtype).eps), _coarser(control)
     before = run = _run(plan, coarser)
@@ -329,9 +329,14 @@ def last_state(scene: Scene, run: Run) -> State:
     digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, has_common_turns = wrap_angles(scene, last.displacement.dtype)
-    first = np.ravel(last.azimuth)[0]
-    inside = tuple(x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in last.angle)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), eqx.tree_at(lambda y: y.angle, last, inside))
+
+    def inside(own: ExciterState) -> list[Array]:
+        first = np.ravel(own.angle[0])[0] if own.angle else 0.0
+        return [x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in own.angle]
+
+    angles = [angle for own in last.exciters for angle in inside(own)]
+    last = eqx.tree_at(lambda y: [angle for own in y.exciters for angle in own.angle], last, angles)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), last)
 
 
 _FAILURES = ("max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start")

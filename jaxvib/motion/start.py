@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import equinox as eqx
 import jax
@@ -13,12 +13,13 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.sliding import dot, kinematics
-from jaxvib.equations.state import Spin, State
-from jaxvib.errors import InputError, quoted
+from jaxvib.equations.state import ExciterState, Spin, State
+from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, LoadInteraction, SlipRelease
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.loads import Loads
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
@@ -90,23 +91,29 @@ def initial_state(
     if start != "jam" and mode is not None:
         raise InputError("mode", f"is {quoted(mode)}, for start='jam' only; leave it out or start in a jam")
     scene = validate_scene(scene)
-    n = scene.loads.count
     mass = scene.machine.structure().mass
-    zero = np.zeros(mass.shape[:1], mass.dtype)
+    zero = cast(Array, np.zeros(mass.shape[:1], mass.dtype))
+    if angles is not None and len(scene.exciters) > 1:
+        raise InputError("angles", "are those of the loads of one exciter; give a State, which has those of each exciter")
 
-    def phases(rest: float | Array) -> Array:
-        middle = known(rest if angles is None else numbers(angles, "rad", "angles", n))
+    def phases(exciter: Exciter, loads: Loads, rest: float | Array) -> Array:
+        middle = known(rest if angles is None else numbers(angles, "rad", "angles", loads.count))
         one_each = angles is not None and not isinstance(angles, str) and np.ndim(angles) > 0  # pyright: ignore[reportArgumentType]
-        return middle + _places(scene, start, separation, one_each=one_each)
+        return middle + _places(exciter, loads, start, separation, one_each=one_each)
+
+    def at_rest(exciter: Exciter) -> ExciterState:
+        rotor = None if exciter.drive.ideal else (zero[0], zero[0])
+        if exciter.loads is None:
+            return ExciterState(rotor=rotor)
+        first, *others = exciter.loads.rest()
+        angle = (phases(exciter, exciter.loads, first), *others)
+        still = cast(Array, np.zeros(exciter.loads.count, mass.dtype))
+        return ExciterState(angle, (still,) * len(angle), rotor)
 
     if start != "jam":
-        rotor = None if scene.drive.ideal else (zero[0], zero[0])
-        first, *others = scene.loads.rest()
-        angle = (phases(first), *others)
-        require_start(scene, angle)
-        still = tuple(np.zeros(n, zero.dtype) for _ in angle)
-        zero, angle, still, rotor = on_device((zero, angle, still, rotor))
-        return with_spin(scene, State(zero, zero, angle, still, rotor))
+        state = State(zero, zero, exciters=tuple(map(at_rest, scene.exciters)))
+        require_start(scene, state)
+        return with_spin(scene, on_device(state))
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
     if not scene.drive.constant:
@@ -120,24 +127,24 @@ def initial_state(
         if "simulate" not in advice:  # which is who asks
             raise
         raise InputError("start", f"is 'jam', but {error.field} {why}; start at 'rest', or from a State") from error
-    row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(0.0)
-    require_start(scene, (angle,))
+    row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(scene.exciter, scene.loads, 0.0)
+    require_start(scene, State(zero, zero, (angle,)))
     return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
 
 
-def _places(scene: Scene, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:
+def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:
     """Return the loads' angles relative to their middle, (count,) rad; `one_each`: each load has its own angle already."""
-    n = scene.loads.count
-    touching = has_term(scene.effects, LoadInteraction)
-    wide = getattr(scene.loads, "ball_radius", None) is not None
+    n = loads.count
+    touching = has_term(exciter.effects, LoadInteraction)
+    wide = getattr(loads, "ball_radius", None) is not None
     usual = separation is None and start != "jam"
     side_by_side = not one_each and (touching or (usual and wide))
     if separation is not None:
         gap = known_number(separation, "rad", "separation", low=0.0)
     else:
         gap = min(START_SEPARATION, math.pi / n) if usual and not (wide or one_each) else 0.0
-    evenly = gap * (np.arange(n) - 0.5 * (n - 1)).astype(scene.drive.speed.dtype)
-    return evenly + known(scene.loads.offsets()) if side_by_side else evenly
+    evenly = gap * (np.arange(n) - 0.5 * (n - 1)).astype(exciter.drive.speed.dtype)
+    return evenly + known(loads.offsets()) if side_by_side else evenly
 
 
 @cached
@@ -173,14 +180,24 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
     """
     if turning not in get_args(Turning):
         raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
-    has_drilling = has_term(scene.effects, DrillingSpinRelease)
-    has_slip = has_term(scene.effects, SlipRelease)
-    if not (has_drilling or has_slip):
+    exciters = []
+    for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
+        with within(scene.place_of(k)):
+            exciters.append(_exciter_with_spin(exciter, own, turning))
+    return State(state.displacement, state.velocity, exciters=exciters)
+
+
+def _exciter_with_spin(exciter: Exciter, state: ExciterState, turning: Turning) -> ExciterState:
+    """Return the state of an exciter with the rotation of its loads, see `with_spin`."""
+    loads = exciter.loads
+    has_drilling = has_term(exciter.effects, DrillingSpinRelease)
+    has_slip = has_term(exciter.effects, SlipRelease)
+    if loads is None or not (has_drilling or has_slip):
         if state.spin is not None:
             raise InputError("start.spin", "is given, but no effect of the scene makes it free; leave it out, or add FreeSpin")
         return state
     if state.spin is not None:
-        n = (scene.loads.count,)
+        n = (loads.count,)
         needed = (n if has_drilling else None, (n,) * len(state.angle) if has_slip else None)
         drilling, slip = state.spin.drilling, state.spin.slip
         found = (None if drilling is None else jnp.shape(drilling), None if slip is None else tuple(map(jnp.shape, slip)))
@@ -188,10 +205,10 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
             problem = f"has shapes {found} of drilling and slip; this scene needs {needed} (None where no effect frees it)"
             raise InputError("start.spin", problem)
         return state
-    zero = jnp.zeros_like(state.azimuth)
+    zero = jnp.zeros_like(state.angle[0])
     drilling, slip = zero, tuple(zero for _ in state.angle)
     if turning == "still":
-        loads, u, rate, w = scene.loads, state.angle, state.rate, scene.drive.rotor_speed(jnp.zeros(()), state.rotor)
+        u, rate, w = state.angle, state.rate, exciter.turning_drive.rotor_speed(jnp.zeros(()), state.rotor)
         spin, normal_force = loads.drilling_spin(u, rate, w), loads.normal_force(u, rate, {})
         drilling = zero if spin is None else spin.still
         if has_slip:
@@ -202,12 +219,8 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
             relative = (along[0] + w * up, along[1] - w * across, *along[2:])
             found = kinematics(loads, u, rate)
             slip = tuple(dot(column, relative) / size for column, size in zip(found.columns, found.sizes, strict=True))
-    return eqx.tree_at(
-        lambda s: s.spin,
-        state,
-        Spin(drilling if has_drilling else None, slip if has_slip else None),
-        is_leaf=lambda leaf: leaf is None,
-    )
+    spin = Spin(drilling if has_drilling else None, slip if has_slip else None)
+    return ExciterState(state.angle, state.rate, state.rotor, spin)
 
 
 def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
@@ -219,11 +232,13 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
         if spin_up is not None:
             raise InputError("spin_up", "is for start='spin_up' only; leave it out or start with 'spin_up'")
         return scene
-    if not scene.drive.constant:
-        raise InputError("start", f"is 'spin_up', but the drive is {quoted(scene.drive.kind)} already; start at 'rest'")
-    drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
-    when_known(_require_shorter, drive.duration, end)
-    return eqx.tree_at(lambda s: s.drive, scene, drive)
+    drives = []
+    for exciter in scene.exciters:
+        if not exciter.drive.constant:
+            raise InputError("start", f"is 'spin_up', but the drive is {quoted(exciter.drive.kind)} already; start at 'rest'")
+        drives.append(SpinUp(exciter.drive.speed, end / 2.0 if spin_up is None else spin_up))
+    when_known(_require_shorter, drives[0].duration, end)
+    return eqx.tree_at(lambda s: [exciter.drive for exciter in s.exciters], scene, drives)
 
 
 def _require_shorter(duration: float, end: float) -> None:
@@ -240,24 +255,36 @@ def validate_state(scene: Scene, state: State, mode: int | None, separation: Num
         raise InputError("separation", f"is {quoted(separation)}, for named starts only; put the angles into the State")
     if mode is not None:
         raise InputError("mode", f"is {quoted(mode)}, for start='jam' only; leave it out if the start is a State")
-    nd, n = scene.machine.structure().mass.shape[0], scene.loads.count
-    if scene.drive.ideal != (state.rotor is None):
-        needed = (
-            "(angle, speed), the motor's rotor is a state" if state.rotor is None else "None, the drive alone turns the rotor"
-        )
-        raise InputError(
-            "start.rotor", f"is {quoted(state.rotor)}; under the drive {quoted(scene.drive.kind)} it must be {needed}"
-        )
-    for name, length in (("displacement", nd), ("velocity", nd), ("angle", n), ("rate", n)):
-        shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
-        if any(shape != (length,) for shape in shapes):
-            raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
-    require_start(scene, state.angle)
+    if len(state.exciters) != len(scene.exciters):
+        raise InputError("start.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")
+    nd = scene.machine.structure().mass.shape[0]
+    _require_shapes(state, displacement=nd, velocity=nd)
+    for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
+        with within(scene.place_of(k)):
+            if exciter.drive.ideal != (own.rotor is None):
+                motor, ideal = "(angle, speed), the motor's rotor is a state", "None, the drive alone turns the rotor"
+                problem = f"under the drive {quoted(exciter.drive.kind)} it must be {motor if own.rotor is None else ideal}"
+                raise InputError("start.rotor", f"is {quoted(own.rotor)}; {problem}")
+            if exciter.loads is not None:
+                _require_shapes(own, angle=exciter.loads.count, rate=exciter.loads.count)
+            elif own.angle or own.rate:
+                raise InputError("start.angle", "is given; this exciter has no loads, leave angle and rate out")
+    require_start(scene, state)
     return with_spin(scene, state)
 
 
-def require_start(scene: Scene, u: tuple[Array, ...]) -> None:
-    """**Raises** `InputError` if loads that touch cannot start from the coordinates `u` (..., count), if these are known."""
-    for term in terms_of(scene.effects, LoadInteraction):
-        if term.validate_start is not None:
-            when_known(lambda *u, term=term: term.validate_start(scene.loads, u), *u)
+def _require_shapes(state: State | ExciterState, **lengths: int) -> None:
+    """**Raises** `InputError` if arrays of a state do not have these lengths."""
+    for name, length in lengths.items():
+        shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
+        if not shapes or any(shape != (length,) for shape in shapes):
+            raise InputError(f"start.{name}", f"has shape {shapes[0] if shapes else ()}; this scene needs ({length},)")
+
+
+def require_start(scene: Scene, state: State) -> None:
+    """**Raises** `InputError` if loads that touch cannot start from their angles (..., count), if these are known."""
+    for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
+        for term in terms_of(exciter.effects, LoadInteraction):
+            if term.validate_start is not None and exciter.loads is not None:
+                with within(scene.place_of(k)):
+                    when_known(lambda *u, term=term, loads=exciter.loads: term.validate_start(loads, u), *own.angle)

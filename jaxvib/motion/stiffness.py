@@ -12,6 +12,7 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.sliding import kinematics
 from jaxvib.equations.state import State
+from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.numerics.linalg import hermitian_modes, relative_to
@@ -43,7 +44,18 @@ def fastest_decay(scene: Scene) -> Array:
     the loads and so lessens their inertia. Explicit steps must resolve this rate, however slow the motion is.
     """
     scene = jax.lax.stop_gradient(scene)
-    linear, loads, speed = linear_model(scene), scene.loads, scene.drive.speed
+    linear = linear_model(scene)
+    damping, inverse = relative_to(linear.mass, linear.carrier.damping)
+    rates = [
+        _load_decay(exciter.loads, exciter.drive.speed, jnp.sum((mount.rows[0] @ inverse.T) ** 2))
+        for exciter, mount in zip(scene.exciters, linear.mounts, strict=True)
+        if exciter.loads is not None
+    ]
+    return functools.reduce(jnp.maximum, [*rates, jnp.max(hermitian_modes(damping)[0])])
+
+
+def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
+    """Return the fastest rate of decay of the loads of an exciter, 1/s; `accelerance` mu of its place."""
     angle = tuple(jnp.broadcast_to(jnp.asarray(x, speed.dtype), (loads.count,)) for x in loads.rest())
     turning = tuple(jnp.full_like(x, speed) if i == 0 else jnp.zeros_like(x) for i, x in enumerate(angle))
     kappa, metric = loads.inertia_factor(), kinematics(loads, angle, turning).metric
@@ -53,11 +65,8 @@ def fastest_decay(scene: Scene) -> Array:
         slope = jax.jvp(lambda *rate: loads.resistance(angle, rate, speed)[i], turning, along)[1]
         return jnp.max(-slope / (kappa * loads.mass * metric[i][i]))
 
-    damping, inverse = relative_to(linear.mass, linear.carrier.damping)
-    accelerance = jnp.sum((linear.mount.rows[0] @ inverse.T) ** 2)
     share = accelerance * jnp.sum(jnp.broadcast_to(loads.mass / kappa, (loads.count,)))
-    rate = functools.reduce(jnp.maximum, (own(i) for i in range(len(angle)))) / jnp.maximum(1.0 - share, 0.1)
-    return jnp.maximum(rate, jnp.max(hermitian_modes(damping)[0]))
+    return functools.reduce(jnp.maximum, (own(i) for i in range(len(angle)))) / jnp.maximum(1.0 - share, 0.1)
 
 
 def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:

@@ -123,25 +123,30 @@ class PackedSystem(eqx.Module):
     def _wrap(self, held: Held) -> Held:
         """Takes whole turns out of the angles and counts them."""
         y, turns = held
-        angles, loads = self._angles()
-        first = y[int(np.argmax(angles))]
+        is_angle, leader = self._angles()
+        lead = tuple(y[k] for k in leader) if self.is_on_scalars else y[leader]
 
-        def whole(x: Array, is_angle: np.ndarray, is_load: np.ndarray) -> Array:
-            return jnp.where(is_angle, jnp.round(jnp.where(is_load & self.has_common_turns, first, x) / _TURN), 0.0)
+        def whole(x: Array, is_angle: np.ndarray) -> Array:
+            return jnp.where(is_angle, jnp.round(x / _TURN), 0.0)
 
-        masks = (tuple(angles), tuple(loads)) if self.is_on_scalars else (angles, loads)
-        done = jax.tree.map(whole, y, *masks)
+        done = jax.tree.map(whole, lead, tuple(is_angle) if self.is_on_scalars else is_angle)
         return _turned(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
 
     def _angles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Masks of the numbers that are angles, and of those that are angles of loads."""
+        """Mask of the numbers that are angles, and for each number the place of the one whose turns are taken out of it."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         places = jax.tree.unflatten(
             self.like, [np.arange(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
         )
-        loads = np.isin(np.arange(self.size), np.concatenate(places.angle))
-        rotor = [] if places.rotor is None else places.rotor[0]
-        return loads | np.isin(np.arange(self.size), rotor), loads
+        is_angle, leader = np.zeros(self.size, bool), np.arange(self.size)
+        for exciter in places.exciters:
+            loads = np.concatenate([*exciter.angle, np.zeros(0, int)])
+            is_angle[loads] = True
+            if self.has_common_turns and exciter.angle:
+                leader[loads] = loads[0]
+            if exciter.rotor is not None:
+                is_angle[exciter.rotor[0]] = True
+        return is_angle, leader
 
     def _state(self, y: Held) -> State:
         """States along a leading axis."""

@@ -9,7 +9,7 @@ from typing import TypeAlias, TypeGuard
 
 from jaxvib.machine.files import EFFECTS, scene_to_toml
 from jaxvib.machine.numbers import number_specs
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.results.fields import Plain
 
 __all__ = ["Units", "escaped", "parameters", "results", "worth"]
@@ -68,12 +68,21 @@ def parameters(scene: Scene) -> str:
     """The numbers of a scene with their units, a table for each of its parts."""
     tables = tomllib.loads(scene_to_toml(scene))
     parts = []
-    for section in ("machine", "loads", "drive"):
-        kind = str(tables[section].pop("kind"))
-        parts.append((f"{section}: {_words(kind)}", tables[section], _units(type(getattr(scene, section)))))
-    for name, value in tables["effects"].items():
-        for each in value if isinstance(value, list) else [value]:
-            parts.append((f"effect: {_words(name)}", each, _units(EFFECTS[name])))
+    owners = [("", tables, scene.exciters[0])]
+    if "exciters" in tables:
+        owners = [(f"exciter {k + 1}, ", t, e) for k, (t, e) in enumerate(zip(tables["exciters"], scene.exciters, strict=True))]
+    kind = str(tables["machine"].pop("kind"))
+    parts.append((f"machine: {_words(kind)}", tables["machine"], _units(type(scene.machine))))
+    for which, table, exciter in owners:
+        own = {name: table[name] for name in ("at", "direction", "unbalance") if name in table}
+        parts += [(which.removesuffix(", "), own, _units(Exciter))] if own else []
+        for section in [name for name in ("loads", "drive") if name in table]:
+            kind = str(table[section].pop("kind"))
+            parts.append((f"{which}{section}: {_words(kind)}", table[section], _units(type(getattr(exciter, section)))))
+    for which, table in [("", tables), *((which, table) for which, table, _ in owners if which)]:
+        for name, value in table.get("effects", {}).items():
+            for each in value if isinstance(value, list) else [value]:
+                parts.append((f"{which}effect: {_words(name)}", each, _units(EFFECTS[name])))
     return "".join(f"<h3>{escaped(title)}</h3>{_pairs(list(table.items()), units)}" for title, table, units in parts)
 
 

@@ -48,7 +48,6 @@ class Part(TypedDict):
 
     part: tuple[str, ...]
     prefix: str
-    fields: Mapping[str, InUnit] | None
 
 
 class AsText(TypedDict):
@@ -71,12 +70,12 @@ def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
     return {"unit": unit, "axes": axes, "name": name}
 
 
-def part(*axes: str, prefix: str = "", fields: Mapping[str, InUnit] | None = None) -> Part:
-    """Metadata of a field that holds another tree of numbers, each of them with these axes before its own.
+def part(*axes: str, prefix: str = "") -> Part:
+    """Metadata of a field that holds another tree of numbers, or a tuple of them, with these axes before their own.
 
-    **Arguments**: `prefix` of its names in labelled data; `fields` the metadata of its fields where its class has none.
+    **Arguments**: `prefix` of its names in labelled data. Several trees of a tuple are numbered, and each has its own "load".
     """
-    return {"part": axes, "prefix": prefix, "fields": fields}
+    return {"part": axes, "prefix": prefix}
 
 
 def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callable[[T], Labels]) -> AsText:
@@ -156,7 +155,7 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
 
 def columns(result: eqx.Module) -> Iterator[Column]:
     """Every array of a result: its name, the names of its axes, its values, its unit."""
-    return _columns(result, None, "", (), {})
+    return _columns(result, "", (), {})
 
 
 def is_single(result: eqx.Module) -> bool:
@@ -183,13 +182,11 @@ def _one_unit(unit: str, units: Sequence[str]) -> str:
     return choices[("m", "rad").index(units[0])] if alike else unit
 
 
-def _columns(
-    tree: eqx.Module, fields: Mapping[str, InUnit] | None, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]
-) -> Iterator[Column]:
+def _columns(tree: eqx.Module, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]) -> Iterator[Column]:
     """Every array of a tree: its name, its axes, its values, its unit."""
     outer_axes = getattr(tree, "outer_axes", ())
     for field in dataclasses.fields(tree):
-        value, metadata = getattr(tree, field.name), field.metadata if fields is None else fields.get(field.name, {})
+        value, metadata = getattr(tree, field.name), field.metadata
 
         def axes(own: tuple[str, ...]) -> tuple[str, ...]:
             every = [axis for name in own for axis in (outer_axes if name == EACH else (name,))]
@@ -198,12 +195,15 @@ def _columns(
         if value is None:
             continue
         if "part" in metadata:
-            before = prefix + metadata["prefix"]
-            inner = dict(renamed)
-            if metadata["prefix"]:
-                own = [each.name for each in dataclasses.fields(value) if each.metadata.get("axes") == (each.name,)]
-                inner |= {axis: before + axis for axis in own}
-            yield from _columns(value, metadata["fields"], before, axes(metadata["part"]), inner)
+            trees = value if isinstance(value, tuple) else (value,)
+            for k, each in enumerate(trees):
+                number = f"{field.name}_{k + 1}_" if len(trees) > 1 else ""
+                before = prefix + metadata["prefix"] + number
+                inner = dict(renamed) | ({"load": f"{before}load"} if number else {})
+                if metadata["prefix"]:
+                    own = [known.name for known in dataclasses.fields(each) if known.metadata.get("axes") == (known.name,)]
+                    inner |= {axis: before + axis for axis in own}
+                yield from _columns(each, before, axes(metadata["part"]), inner)
         elif "unit" in metadata:
             name = prefix + (metadata["name"] or field.name)
             yield from _column(name, axes(metadata["axes"]), value, metadata["unit"])

@@ -51,7 +51,7 @@ class View(abc.ABC):
 
     def __init__(self, scene: Scene):
         carrier = scene.machine.carrier()
-        self.scene, self.mount = scene, scene.machine.mount()
+        self.scene, self.mount = scene, scene.mount()
         self.mass, self.stiffness, self.damping = (
             np.asarray(x, float) for x in (carrier.mass, carrier.stiffness, carrier.damping)
         )

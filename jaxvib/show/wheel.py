@@ -84,8 +84,8 @@ def caption(scene: Scene) -> str:
         words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")
     speed = float(drive.speed)
     lines = [", ".join(words), f"{drive.kind.replace('_', ' ')}: {30.0 / np.pi * speed:.5g} rpm ({speed:.5g} rad/s)"]
-    if scene.effects:
-        lines.append("with " + ", ".join(effect.kind.replace("_", " ") for effect in scene.effects))
+    if scene.all_effects:
+        lines.append("with " + ", ".join(effect.kind.replace("_", " ") for effect in scene.all_effects))
     return "\n".join(lines)
 
 

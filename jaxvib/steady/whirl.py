@@ -142,7 +142,7 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = 
 
     - `scene` with a machine that moves in two directions
     - `rotor_speed`, rad/s, one or a list (default: the drive's); typical: 50 values from 0 to 500 for a Campbell diagram
-    - `loads`: "fixed" counts the loads' masses where they run (the default), "none" leaves them out
+    - `loads`: "fixed" counts the loads' masses at their track (the default), "none" leaves them out
 
     **Returns** `Whirl`. Gradients go through speeds and decays if no two are equal.
 

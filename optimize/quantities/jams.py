@@ -333,8 +333,8 @@ def _power(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     scene, loads, jam = evaluation.scene, jammed_loads(evaluation.scene), evaluation.jam(mode)
     n, omega = scene.drive.speed, jam.omega
     torque = loads.drag_sum() * (n - omega)
-    if has_term(scene.effects, ContactFriction):
-        torque = torque + light_friction(loads, scene.effects, omega, n)
+    if has_term(scene.all_effects, ContactFriction):
+        torque = torque + light_friction(loads, scene.all_effects, omega, n)
     # Strong drag leaves n - Omega few digits; what the carrier dissipates, which that torque equals, has all of them.
     close = n - omega < _SLIP * n
     taken = evaluation.jammed.dissipated(omega * jnp.where(close, jam.displacement, 0.0))

@@ -11,7 +11,7 @@ from scenes import loads, machines, published, scene
 from stored_jit import stored_jit
 
 import jaxvib as jv
-from jaxvib.equations.exciter import Exciter
+from jaxvib.equations.exciter import ExciterDynamics
 from jaxvib.equations.sliding import kinematics
 
 
@@ -155,11 +155,15 @@ def test_scene_without_effects_traces_as_if_there_were_none(monkeypatch):
         return str(jax.make_jaxpr(lambda t, y: jv.vector_field(s)(t, y))(0.0, state))
 
     whole = program()
-    monkeypatch.setattr(Exciter, "_add_friction", lambda self, drag, contact: (drag, contact.force, [{}]))
-    monkeypatch.setattr(Exciter, "_imbalance", lambda self, t, state: None)
-    monkeypatch.setattr(Exciter, "_add_rotor", lambda self, motion, mass, reaction, drag, coupling: (mass, reaction, None))
-    monkeypatch.setattr(Exciter, "at_loads", lambda self, a: dict(zip(self.axes, a, strict=True)))
-    monkeypatch.setattr(Exciter, "_total", lambda self, values, *arms: jnp.sum(jnp.broadcast_to(values, (s.loads.count,))))
+    monkeypatch.setattr(ExciterDynamics, "_add_friction", lambda self, drag, contact: (drag, contact.force, [{}]))
+    monkeypatch.setattr(ExciterDynamics, "_imbalance", lambda self, t, state: None)
+    monkeypatch.setattr(
+        ExciterDynamics, "_add_rotor", lambda self, motion, mass, reaction, drag, coupling: (mass, reaction, None)
+    )
+    monkeypatch.setattr(ExciterDynamics, "at_loads", lambda self, a: dict(zip(self.axes, a, strict=True)))
+    monkeypatch.setattr(
+        ExciterDynamics, "_total", lambda self, values, *arms: jnp.sum(jnp.broadcast_to(values, (s.loads.count,)))
+    )
     for module in ("dynamics", "exciter"):
         monkeypatch.setattr(f"jaxvib.equations.{module}.terms_of", lambda effects, *kinds: [])
     assert program() == whole
@@ -207,7 +211,7 @@ class Planar(jv.Machine):
         none = jnp.zeros((1, 3))
         return jv.Carrier(*self.matrices[:3], none, none, ("x", "y", "tilt"), ("m", "m", "rad"))
 
-    def mount(self):
+    def mount(self, at=None):
         return jv.Mount((self.matrices[4],), axes=(0, 1), gyroscopic=self.matrices[3])
 
 

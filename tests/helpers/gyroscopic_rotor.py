@@ -26,7 +26,7 @@ class Rotor(jv.Machine):
             coordinate_units=("m", "m", "rad", "rad"),
         )
 
-    def mount(self):
+    def mount(self, at=None):
         skew = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
         return jv.Mount(
             rows=(jnp.array([[1.0, 0.0, 0.2, 0.0], [0.0, 1.0, 0.0, 0.2]]),),

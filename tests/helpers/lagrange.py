@@ -20,7 +20,7 @@ def residual(s, t, state, field):
     m, r, drag = (float(getattr(s.loads, name)) for name in ("mass", "radius", "drag"))
     inertia = float(s.loads.inertia) if s.loads.kind == "pendulum" else 0.4 * m * r**2
     stations = np.zeros(n) if planar else np.broadcast_to(np.asarray(s.machine.stations), (n,))
-    kinds = {e.kind: e for e in s.effects}
+    kinds = {e.kind: e for e in s.all_effects}
     g = float(kinds["gravity"].g) if "gravity" in kinds else 0.0
     if motor:
         theta, spin, change = *state.rotor, field.rotor[1]
@@ -80,7 +80,7 @@ def residual(s, t, state, field):
         else:
             for k, at in zip(s.machine.stiffness, s.machine.position, strict=True):
                 total += 0.5 * k * jnp.sum(centre(x, at) ** 2)
-        for e in s.effects:
+        for e in s.all_effects:
             if e.kind in ("cubic_support", "stop"):
                 at = x[e.platform - 1] if vertical else jnp.sqrt(jnp.sum(centre(x, e.position) ** 2))
                 if e.kind == "cubic_support":
@@ -126,7 +126,7 @@ def residual(s, t, state, field):
             polar = s.machine.polar_inertia * v[-1]
             force = force.at[2].add(-polar * v[3]).at[3].add(polar * v[2])
         force -= jax.grad(dampers)(v) if not isinstance(dampers(v), float) else 0.0
-        for e in s.effects:
+        for e in s.all_effects:
             if e.kind == "stop":
                 radius = (
                     (lambda y, e=e: (-1.0 if e.side == "below" else 1.0) * y[e.platform - 1])

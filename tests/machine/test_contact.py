@@ -79,7 +79,7 @@ def test_contact_damping_follows_from_the_restitution():
 def test_restitution_is_read_from_files_and_checked():
     s = plane(0.7)
     again = jv.scene_from_toml(jv.scene_to_toml(s))
-    assert float(again.effects[0].restitution) == 0.7 and RADIUS > OWN
+    assert float(again.all_effects[0].restitution) == 0.7 and RADIUS > OWN
     for arguments, says in (
         (dict(restitution=1.2), "restitution is 1.2; it must be greater than 0 and at most 1"),
         (dict(restitution=0.0), "restitution is 0; it must be greater than 0"),
@@ -115,7 +115,7 @@ def test_steps_of_captures_and_ensembles_resolve_a_contact():
     """Ten steps of what takes pi sqrt(mu/k), by ensembles; six by captures."""
     s = on_equator(0.5)
     bare = jv.Scene(s.machine, s.loads, jv.ConstantSpeed(140.0))
-    touching = jv.Scene(s.machine, s.loads, jv.ConstantSpeed(140.0), s.effects)
+    touching = jv.Scene(s.machine, s.loads, jv.ConstantSpeed(140.0), s.all_effects)
     swing = np.sqrt(1e5 / (0.7 * float(s.loads.mass) / (1.0 - (OWN / 0.2025) ** 2)))
     np.testing.assert_allclose(frequency_bounds(touching)[0], swing, rtol=1e-12)
     np.testing.assert_allclose(steps_per_second(touching), 2.0 * swing, rtol=1e-12)

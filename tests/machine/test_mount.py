@@ -58,7 +58,7 @@ class Pair(jv.Machine):
         k = jnp.asarray([[3e4, -1e4], [-1e4, 2e4]])
         return jv.Carrier(jnp.diag(jnp.asarray([20.0, 30.0])), 1e-3 * k, k, k[:1], 1e-3 * k[:1], ("y1", "y2"))
 
-    def mount(self):
+    def mount(self, at=None):
         first, second = jnp.eye(2)[:1], jnp.eye(2)[1:]
         on = jnp.asarray([1.0, 0.0, 1.0])
         return jv.Mount((first, second), (1,), levers=(on, 1.0 - on))

@@ -150,7 +150,7 @@ def single_numbers(of):
 
 def free_numbers(of):
     """Without the damping of contacts that have a restitution in its place."""
-    replaced = any(getattr(effect, "restitution", None) is not None for effect in of.effects)
+    replaced = any(getattr(effect, "restitution", None) is not None for effect in of.all_effects)
     return [n for n in single_numbers(of) if not (replaced and n.name == "effects.load_contact.damping")]
 
 

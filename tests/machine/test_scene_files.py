@@ -42,7 +42,9 @@ def test_one_platform_one_load_and_no_links_survive_the_file():
 def test_template_of_a_torus_holds_what_it_calls_for():
     s = jv.scene_from_toml(TEMPLATES["torus"])
     assert (s.machine.kind, s.loads.kind, s.loads.count) == ("planar_rotor", "torus_ball", 2)
-    assert [e.kind for e in s.effects] == ["gravity", "static_imbalance", "rolling_friction"] and s.effects[0].along == "axis"
+    assert [e.kind for e in s.all_effects] == ["gravity", "static_imbalance", "rolling_friction"] and s.all_effects[
+        0
+    ].along == "axis"
     s = uneven(eqx.tree_at(lambda s: s.loads.drag, s, jnp.asarray(0.3)))
     same(jv.scene_from_toml(jv.scene_to_toml(s)), s)
 
@@ -52,10 +54,10 @@ def test_template_loads_and_jams(kind):
     s = jv.scene_from_toml(TEMPLATES[kind])
     assert s.machine.kind == kind
     if "rotor" in kind:
-        assert s.loads.count == 4 and [e.kind for e in s.effects] == ["gravity", "static_imbalance"]
+        assert s.loads.count == 4 and [e.kind for e in s.all_effects] == ["gravity", "static_imbalance"]
         np.testing.assert_allclose(s.loads.mass, 0.05)
     else:
-        assert s.loads.count == 3 and s.effects == ()
+        assert s.loads.count == 3 and s.all_effects == ()
         np.testing.assert_allclose(s.loads.mass, 0.8)
 
 
@@ -150,10 +152,10 @@ def test_wrong_scene_file_is_one_sentence(changed, sentence):
 
 
 def test_effects_are_called_for_by_name():
-    assert scene_from_tables(tables()).effects == ()
-    assert scene_from_tables(tables(effects={"gravity": False})).effects == ()
-    assert float(scene_from_tables(tables(effects={"gravity": True})).effects[0].g) == 9.81
-    assert float(scene_from_tables(tables(effects={"gravity": {"g": "1.62 m/s^2"}})).effects[0].g) == 1.62
+    assert scene_from_tables(tables()).all_effects == ()
+    assert scene_from_tables(tables(effects={"gravity": False})).all_effects == ()
+    assert float(scene_from_tables(tables(effects={"gravity": True})).all_effects[0].g) == 9.81
+    assert float(scene_from_tables(tables(effects={"gravity": {"g": "1.62 m/s^2"}})).all_effects[0].g) == 1.62
 
 
 def test_a_file_that_cannot_be_read_says_which(tmp_path):

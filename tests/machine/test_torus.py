@@ -82,7 +82,7 @@ def test_energy_only_falls_with_friction_and_no_drive():
     run = jv.simulate(s, 1.0, start=start, samples=400, stepsize_controller=jv.EqualSteps(4000), estimate=False)
     held = np.asarray(jax.vmap(lambda state: jv.energy(s, state))(run.trajectory.state))
     assert np.all(np.diff(held) < 0.0) and held[-1] < 0.97 * held[0]
-    bare = jv.Scene(jv.planar_rotor(mass=6.87, stiffness=1372.0, damping=0.0), s.loads, s.drive, s.effects[:1])
+    bare = jv.Scene(jv.planar_rotor(mass=6.87, stiffness=1372.0, damping=0.0), s.loads, s.drive, s.all_effects[:1])
     run = jv.simulate(bare, 1.0, start=start, samples=400, stepsize_controller=jv.EqualSteps(4000), estimate=False)
     held = np.asarray(jax.vmap(lambda state: jv.energy(bare, state))(run.trajectory.state))
     np.testing.assert_allclose(held, held[0], rtol=1e-9)
@@ -114,7 +114,7 @@ def test_a_run_says_when_balls_leave_their_wall():
     run = jv.simulate(s, 0.02, start=on, samples=50, estimate=False)
     assert np.all(np.isnan(run.detached)) and "detached" not in run.summary()
     # Without pressing there is no friction, and the rest of the motion is that without it.
-    bare = jv.Scene(s.machine, s.loads, s.drive, s.effects[:1])
+    bare = jv.Scene(s.machine, s.loads, s.drive, s.all_effects[:1])
     with_, without = (evaluate(each, jnp.asarray(0.0), inner) for each in (s, bare))
     np.testing.assert_allclose(with_.rate[1][1], without.rate[1][1], rtol=1e-3)
 

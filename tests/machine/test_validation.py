@@ -18,7 +18,7 @@ def changed(where, value, s=None):
 
 
 def rub(value):
-    return changed(lambda s: s.effects[0].torque, value, scene(effects=(SealFriction(0.1, 0.1),)))
+    return changed(lambda s: s.all_effects[0].torque, value, scene(effects=(SealFriction(0.1, 0.1),)))
 
 
 WRONG = {
@@ -33,7 +33,7 @@ WRONG = {
     "heavy loads": (lambda: changed(lambda s: s.loads.mass, 1e18), "loads.mass makes 3e+18 kg in all on a machine of 215 kg"),
     "weak drag": (lambda: changed(lambda s: s.loads.drag, 1e-300), "loads.drag takes 1.0e-302 of a load's speed"),
     "an effect": (
-        lambda: changed(lambda s: s.effects[0].g, -9.81, scene(effects=(jv.Gravity(),))),
+        lambda: changed(lambda s: s.all_effects[0].g, -9.81, scene(effects=(jv.Gravity(),))),
         "effects.gravity.g is -9.81 m/s^2; it must be at least 0",
     ),
     "an effect from outside": (lambda: rub(jnp.inf), "scene.effects[0].torque is inf; a finite number is needed"),

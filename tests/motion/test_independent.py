@@ -59,7 +59,7 @@ def test_motion_is_mujocos(gravity):
     for _ in range(20):
         mujoco.mj_step(model, data, nstep=1000)
         states.append(np.concatenate([data.qpos[:2] - sag, data.qpos[2:], data.qvel]))
-    run = small_run(s.effects, stepsize_controller=jv.Tolerance(1e-11))
+    run = small_run(s.all_effects, stepsize_controller=jv.Tolerance(1e-11))
     y = run.trajectory.state
     ours = np.concatenate([y.displacement, y.angle[0], y.velocity, y.rate[0]], axis=1)[1:]
     np.testing.assert_allclose(ours, states, atol=1e-6)

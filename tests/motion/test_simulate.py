@@ -53,7 +53,8 @@ def test_steps_resolve_what_effects_add_to_the_fastest_load():
     quick, none = (
         SimpleNamespace(fastest_rate=lambda loads, speed, rate=rate: rate) for rate in (jnp.array([9.0, 30.0, 20.0]), None)
     )
-    motion = SimpleNamespace(effects=(none, quick), loads=None, drive=jv.ConstantSpeed(5.0))
+    exciter = SimpleNamespace(effects=(), loads="any", drive=jv.ConstantSpeed(5.0))
+    motion = SimpleNamespace(effects=(none, quick), exciters=(exciter,))
     assert effects_rate(motion) == 30.0
     motion.effects = (none,)
     assert effects_rate(motion) == 0.0

@@ -28,12 +28,11 @@ class _Support(Effect):
     platform: eqx.AbstractVar[int | None]
     position: eqx.AbstractVar[Array | None]
 
-    def validate(self, machine: Machine, loads: Loads) -> None:
-        """**Raises** `InputError` for a place that the machine does not have."""
-        self.rows(machine)
-
     def rows(self, machine: Machine) -> Array:
-        """Return the row of the platform's coordinate on a `machine`, or the rows of the two directions of the axis."""
+        """Return the row of the platform's coordinate on a `machine`, or the rows of the two directions of the axis.
+
+        **Raises** `InputError` for a place that the machine does not have.
+        """
         if self.position is None:
             return machine.rows_at(self.platform, f"effects.{self.kind}.platform")
         return machine.rows_at(self.position, f"effects.{self.kind}.position")

@@ -89,7 +89,7 @@ def number_specs(part: type) -> Mapping[str, NumberSpec]:
 def read_numbers(part: type[eqx.Module], section: str, length: int | None = None, /, **values: Numbers) -> dict[str, Array]:
     """Arguments of a constructor as arrays in SI units, checked by the metadata of the fields of their names.
 
-    **Arguments**: `section`: the table of a scene file, for messages; `length` of arrays, None for any.
+    **Arguments**: `section`: the table of a scene file, for messages, or ""; `length` of arrays, None for any.
 
     **Raises** `InputError` for a wrong unit, a value out of bounds, and a list of another length.
 
@@ -100,7 +100,7 @@ def read_numbers(part: type[eqx.Module], section: str, length: int | None = None
     jaxvib.errors.InputError: drive.duration is 0 s; it must be greater than 0
     """
     specs = number_specs(part)
-    return {name: _read(specs[name], value, f"{section}.{name}", length) for name, value in values.items()}
+    return {name: _read(specs[name], value, f"{section}.{name}".lstrip("."), length) for name, value in values.items()}
 
 
 def _read(spec: NumberSpec, value: Any, field: str, length: int | None) -> Array:

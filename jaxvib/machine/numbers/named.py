@@ -23,13 +23,13 @@ from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.files import EFFECTS, suggest_name
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import PLAIN, NumberSpec, number_specs
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.units import Number, number
 
 __all__ = ["NamedNumber", "find_number", "numbers_of", "present_numbers", "put_numbers", "put_present", "read_value", "spec_of"]
 
 _Path = tuple[str | int, ...]
-_SECTIONS: dict[str, type[eqx.Module]] = {"machine": Machine, "loads": Loads, "drive": Drive}
+_SECTIONS: dict[str, type[eqx.Module]] = {"machine": Machine, "loads": Loads, "drive": Drive, "exciters": Exciter}
 
 
 class NamedNumber(NamedTuple):
@@ -83,8 +83,16 @@ class NamedNumber(NamedTuple):
 
     def words(self, scene: Scene) -> list[str]:
         """Name of each number for a designer, such as "stiffness of support 2"."""
-        leaf, load, each = self.leaf(scene), scene.loads.kind.rpartition("_")[2], self.spec.each
+        which = self.path[1] if self.path[0] == "exciters" else 0
+        exciter = scene.exciters[which if isinstance(which, int) else 0]
+        load = "load" if exciter.loads is None else exciter.loads.kind.rpartition("_")[2]
+        leaf, each = self.leaf(scene), self.spec.each
         words = self._numbered(scene, self.spec.words.format(load=load))
+        if self.path[0] == "exciters" and len(scene.exciters) > 1:
+            return [f"{word} (exciter {self.path[1]})" for word in self._words_of_entries(scene, words, leaf, load, each)]
+        return self._words_of_entries(scene, words, leaf, load, each)
+
+    def _words_of_entries(self, scene: Scene, words: str, leaf: Array, load: str, each: str) -> list[str]:
         which = range(self.size) if self.entry is None else (self.entry,)
         several = np.ndim(leaf) > 0
         if each == "load":
@@ -120,8 +128,8 @@ def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
     found: dict[str, NamedNumber] = {}
     for prefix, path, part in _parts(scene):
         for steps, leaf in jax.tree_util.tree_leaves_with_path(part):
-            if not _is_continuous(leaf) or not np.size(leaf):
-                continue
+            if not _is_continuous(leaf) or not np.size(leaf) or (isinstance(part, Exciter) and len(steps) > 1):
+                continue  # loads, drive and effects of an exciter are parts of their own
             inner, spec = _steps(part, steps)
             whole = NamedNumber(prefix + jax.tree_util.keystr(steps), (*path, *inner), None, np.size(leaf), spec)
             found |= {each.name: each for each in (whole.single(scene) if len(spec.units) > 1 else (whole,))}
@@ -136,12 +144,20 @@ def _is_continuous(value: object) -> bool:
 
 def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
     """The parts of a scene, with their names and paths; effects that may stand several times are counted, from 0."""
-    for section in _SECTIONS:
-        yield section, (section,), getattr(scene, section)
+    yield "machine", ("machine",), scene.machine
+    for k, exciter in enumerate(scene.exciters):
+        place, path = scene.place_of(k), ("exciters", k)
+        for section in ("loads", "drive"):
+            if (part := getattr(exciter, section)) is not None:
+                yield place + section, (*path, section), part
+        yield f"exciters[{k}]", path, exciter
     counted: collections.Counter[str] = collections.Counter()
     for k, effect in enumerate(scene.effects):
         yield f"effects.{effect.kind}" + (f"[{counted[effect.kind]}]" if effect.repeatable else ""), ("effects", k), effect
         counted[effect.kind] += 1
+    for k, exciter in enumerate(scene.exciters):
+        for j, effect in enumerate(exciter.effects):
+            yield f"{scene.place_of(k)}effects.{effect.kind}", ("exciters", k, "effects", j), effect
 
 
 def _steps(part: eqx.Module, steps: Sequence[Any]) -> tuple[_Path, NumberSpec]:
@@ -238,11 +254,12 @@ def read_value(name: str, value: Number) -> float:
 def spec_of(name: str) -> NumberSpec | None:
     """The meaning of a number by its name alone: that of the first kind of part that has it, None if no part has it."""
     part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
+    part = part.removeprefix("exciters.")
     if part.startswith("effects."):
         known = EFFECTS.get(part.removeprefix("effects."))
         kinds = [known] if known else [kind for kind in _subclasses(Effect) if kind not in EFFECTS.values()]
     else:
-        kinds = [kind for name, of in _SECTIONS.items() if name == part for kind in _subclasses(of)]
+        kinds = [kind for name, of in _SECTIONS.items() if name == part for kind in (of, *_subclasses(of))]
     return next((specs[last] for kind in kinds if last in (specs := number_specs(kind))), None)
 
 

@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
@@ -19,26 +21,19 @@ from jaxvib.runtime.programs import cached
 
 __all__ = [
     "LEAST",
-    "STATE",
     "AbstractMeasured",
     "Measured",
     "Trajectory",
     "mean_speeds",
     "measure",
+    "turning_angles",
+    "turning_directions",
     "unmeasured",
 ]
 
 LEAST = 1e-4
 """Changes are relative to no less than this share of the unbalance radius S/M, of forces to S n^2: a balanced rotor has next to
 no amplitude and force of its own."""
-
-STATE = {
-    "displacement": in_unit("m or rad", "coordinate"),
-    "velocity": in_unit("m/s or rad/s", "coordinate"),
-    "angle": in_unit("rad", "load"),
-    "rate": in_unit("rad/s", "load"),
-}
-"""Units and axes of the fields of a `State`; the rotor's angle and speed stand beside it where they count."""
 
 Field = Callable[[Array, State], State]
 """The equations of motion: the rates of a state at a time."""
@@ -52,14 +47,31 @@ class Trajectory(eqx.Module):
     - `time` (nt,), s
     - `state`: a `State` whose arrays have a leading axis over the times
     - `foundation_force` (nt, nb), N: force of the supports on the foundation in its nb directions
-    - `rotor_angle` (nt,), rad, without whole turns, and `rotor_speed` (nt,), rad/s
+    - `rotor_angles`, rad, without whole turns, and `rotor_speeds`, rad/s: an array (nt,) for each exciter; `rotor_angle` and
+      `rotor_speed` are those of the only one
     """
 
     time: Array = eqx.field(metadata=in_unit("s", "time"))
-    state: State = eqx.field(metadata=part("time", fields=STATE))
+    state: State = eqx.field(metadata=part("time"))
     foundation_force: Array = eqx.field(metadata=in_unit("N", "time", "direction"))
-    rotor_angle: Array = eqx.field(metadata=in_unit("rad", "time"))
-    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "time"))
+    rotor_angles: tuple[Array, ...] = eqx.field(metadata=in_unit("rad", "time", name="rotor_angle"))
+    rotor_speeds: tuple[Array, ...] = eqx.field(metadata=in_unit("rad/s", "time", name="rotor_speed"))
+
+    @property
+    def rotor_angle(self) -> Array:
+        """Angle of the rotor of a scene with one exciter, rad, without whole turns. **Raises** `InputError` for several."""
+        return _only(self.rotor_angles, "rotor_angles")
+
+    @property
+    def rotor_speed(self) -> Array:
+        """Speed of the rotor of a scene with one exciter, rad/s. **Raises** `InputError` for several."""
+        return _only(self.rotor_speeds, "rotor_speeds")
+
+
+def _only(values: tuple[Array, ...], name: str) -> Array:
+    if len(values) != 1:
+        raise InputError(name, f"are those of {len(values)} exciters; read {name}[0] and so on")
+    return values[0]
 
 
 class AbstractMeasured(eqx.Module):
@@ -107,9 +119,34 @@ class Measured(AbstractMeasured):
 def trajectory(model: Model, times: Array, states: State) -> Trajectory:
     """States at times, with the forces and rotor speeds that belong to them."""
     force = jax.vmap(model.foundation_force)(states.displacement, states.velocity)
-    angle = jax.vmap(lambda t, s: model.scene.drive.rotor_angle(t, s.rotor))(times, states)
-    speed = jax.vmap(lambda t, s: model.scene.drive.rotor_speed(t, s.rotor))(times, states)
-    return Trajectory(times, states, force, angle, speed)
+    pairs = [(exciter.turning_drive, own.rotor) for exciter, own in zip(model.scene.exciters, states.exciters, strict=True)]
+    angles = tuple(jax.vmap(drive.rotor_angle)(times, rotor) for drive, rotor in pairs)
+    speeds = tuple(jax.vmap(drive.rotor_speed)(times, rotor) for drive, rotor in pairs)
+    return Trajectory(times, states, force, angles, speeds)
+
+
+def turning_angles(scene: Scene, times: Callable[[], Array], states: State) -> tuple[Array, Array]:
+    """Return angles (nt, n), rad, and rates, rad/s, of all loads, and of the rotors of exciters without loads, in this order.
+
+    **Arguments**: `times` (nt,) s of the states, which only rotors need.
+    """
+    columns: list[tuple[Array, Array]] = []
+    for exciter, own in zip(scene.exciters, states.exciters, strict=True):
+        if own.angle:
+            columns.append((own.angle[0], own.rate[0]))
+        else:
+            drive, at = exciter.turning_drive, times()
+            angle, rate = jax.vmap(drive.rotor_angle)(at, own.rotor), jax.vmap(drive.rotor_speed)(at, own.rotor)
+            columns.append((angle[:, None], rate[:, None]))
+    if len(columns) == 1:
+        return columns[0]
+    angles, rates = zip(*columns, strict=True)
+    return jnp.concatenate(angles, axis=1), jnp.concatenate(rates, axis=1)
+
+
+def turning_directions(scene: Scene) -> np.ndarray:
+    """Return the direction, 1 or -1, of each column of `turning_angles`."""
+    return np.repeat([e.direction for e in scene.exciters], [1 if e.loads is None else e.loads.count for e in scene.exciters])
 
 
 def measure(model: Model, field: Field, times: Array, states: State, unit: State) -> Measured:
@@ -122,11 +159,12 @@ def measure(model: Model, field: Field, times: Array, states: State, unit: State
     early, late, whole = _spans(model, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
 
-    speeds, late_speeds = mean_speeds(times, states.azimuth, states.azimuth_rate, (0, half))
+    speeds, late_speeds = mean_speeds(times, *turning_angles(model.scene, lambda: times, states), (0, half))
     change = jnp.abs(late - early)
     drift = jnp.max(change[:nd]) / jnp.maximum(jnp.max(whole[:nd]), LEAST * unit.displacement)
     force_drift = jnp.max(change[nd:]) / jnp.maximum(jnp.max(whole[nd:]), LEAST * model.natural_force(unit))
-    omega = jnp.mean(speeds)
+    directions = turning_directions(model.scene)
+    omega = jnp.mean(speeds if np.all(directions == 1) else directions * speeds)
     speed_drift = jnp.max(jnp.abs(late_speeds - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
         omega=omega,
@@ -137,9 +175,9 @@ def measure(model: Model, field: Field, times: Array, states: State, unit: State
     )
 
 
-def unmeasured(states: State) -> Measured:
+def unmeasured(model: Model, states: State) -> Measured:
     """NaN in place of what `measure` reads off these states."""
-    nd, loads = states.displacement.shape[1], states.azimuth.shape[1]
+    nd, loads = states.displacement.shape[1], turning_directions(model.scene).size
     shapes = {"omega": (), "load_speed": (loads,), "amplitude": (nd,), "foundation_force": (), "drift": ()}
     return Measured(**{name: jnp.full(shape, jnp.nan, states.displacement.dtype) for name, shape in shapes.items()})
 

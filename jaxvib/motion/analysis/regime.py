@@ -259,10 +259,10 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     Of a rotor that tilts also what tilts it, about the loads' point: relative to the loads' own levers, or where they have
     none to the rotor's radius of gyration.
     """
-    mount, loads = scene.machine.mount(), scene.loads
+    mount, loads = scene.mount(), scene.loads
     each = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
-    thrown = [term.at(origin) for term in terms_of(scene.effects, RotorImbalance)]
+    thrown = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
     own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in thrown), jnp.zeros_like(each[0]))
     size = jnp.sum(jnp.abs(each))
     left = jnp.abs(jnp.sum(each) + own) / size
@@ -279,7 +279,7 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     """Natural frequencies that turning loads meet, ascending, rad/s; of a gyroscopic rotor the forward whirls at its speed."""
-    if scene.machine.mounting().gyroscopic is None:
+    if scene.mounting().gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
     return jnp.sort(jnp.where(found.forward[0] & jnp.isfinite(found.speed[0]), found.speed[0], jnp.inf))

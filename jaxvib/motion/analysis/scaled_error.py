@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.state import Spin, State
+from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, RotorImbalance, SlipRelease
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.runtime.devices import numpy_of
 from jaxvib.runtime.programs import cached
 
@@ -26,21 +26,32 @@ def natural_units(scene: Scene) -> State:
 
     S is the loads' unbalance, or the rotor's own where that is larger.
     """
-    carrier, loads = scene.machine.carrier(), scene.loads
-    across, up, *_ = loads.position(*loads.rest())
-    arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
-    unbalance = jnp.mean(loads.mass) * arm
-    unbalances = [loads.count * unbalance]
-    for term in terms_of(scene.effects, RotorImbalance):
-        unbalances.append(jnp.sqrt(sum(x**2 for x in term.at(jnp.zeros_like(unbalance)).static)))
+    carrier, pairs = scene.machine.carrier(), [_exciter_units(exciter) for exciter in scene.exciters]
+    unbalances = [unbalance for each, _ in pairs for unbalance in each]
     length = functools.reduce(jnp.maximum, unbalances) / jnp.mean(jnp.diagonal(carrier.mass))
-    speed = scene.drive.speed
+    exciters = tuple(unit for _, unit in pairs)
+    return jax.lax.stop_gradient(State(length, length * scene.top_speed, exciters=exciters))
+
+
+def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
+    """Unbalances of an exciter, kg m, and the natural units of its state."""
+    loads, speed, effects = exciter.loads, exciter.drive.speed, exciter.effects
+    unbalances = [] if exciter.unbalance is None else [exciter.unbalance]
+    arm = speed
+    if loads is not None:
+        across, up, *_ = loads.position(*loads.rest())
+        arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
+        unbalances.append(loads.count * (jnp.mean(loads.mass) * arm))
+    for term in terms_of(effects, RotorImbalance):
+        unbalances.append(jnp.sqrt(sum(x**2 for x in term.at(jnp.zeros_like(arm)).static)))
     one = jnp.ones_like(speed)
-    rotor = None if scene.drive.ideal else (one, speed)
-    drilling = speed if has_term(scene.effects, DrillingSpinRelease) else None
-    slip = (speed * arm,) if has_term(scene.effects, SlipRelease) else None
+    rotor = None if exciter.drive.ideal else (one, speed)
+    if loads is None:
+        return unbalances, ExciterState(rotor=rotor)
+    drilling = speed if has_term(effects, DrillingSpinRelease) else None
+    slip = (speed * arm,) if has_term(effects, SlipRelease) else None
     spin = None if drilling is None and slip is None else Spin(drilling, slip)
-    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor, spin))
+    return unbalances, ExciterState((one,), (speed,), rotor, spin)
 
 
 def error_scale(state: State, unit: State) -> State:
@@ -58,19 +69,24 @@ def error_scale(state: State, unit: State) -> State:
     def largest(x: Array, least: Array) -> Array:
         return xp.maximum(xp.max(xp.abs(xp.asarray(x))), xp.asarray(least))
 
-    spin = None
-    if unit.spin is not None and state.spin is not None:
-        drilling, slip = unit.spin.drilling, unit.spin.slip
-        slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in state.angle)
-        # A spin grows with nothing but chance to bound it.
-        spin = Spin(None if drilling is None or state.spin.drilling is None else largest(state.spin.drilling, drilling), slip)
+    def scale(own: ExciterState, unit: ExciterState) -> ExciterState:
+        spin = None
+        if unit.spin is not None and own.spin is not None:
+            drilling, slip = unit.spin.drilling, unit.spin.slip
+            slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in own.angle)
+            # A spin grows with nothing but chance to bound it.
+            spin = Spin(None if drilling is None or own.spin.drilling is None else largest(own.spin.drilling, drilling), slip)
+        return ExciterState(
+            tuple(xp.asarray(unit.angle[0]) for _ in own.angle),
+            tuple(xp.asarray(unit.rate[0]) for _ in own.rate),
+            None if unit.rotor is None else (xp.asarray(unit.rotor[0]), xp.asarray(unit.rotor[1])),
+            spin,
+        )
+
     return State(
         largest(state.displacement, unit.displacement),
         largest(state.velocity, unit.velocity),
-        tuple(xp.asarray(unit.angle[0]) for _ in state.angle),
-        tuple(xp.asarray(unit.rate[0]) for _ in state.rate),
-        None if unit.rotor is None else (xp.asarray(unit.rotor[0]), xp.asarray(unit.rotor[1])),
-        spin,
+        exciters=tuple(map(scale, state.exciters, unit.exciters)),
     )
 
 
@@ -117,8 +133,8 @@ def estimated_error(
 
     **Returns** a number, or an array of them.
     """
-    kept = share if all(term.is_smooth for effect in scene.effects for term in effect.terms()) else 2.0
-    return difference * kept + 2.0 * float(np.finfo(scene.drive.speed.dtype).eps) * (steps + radians)
+    kept = share if all(term.is_smooth for effect in scene.all_effects for term in effect.terms()) else 2.0
+    return difference * kept + 2.0 * float(np.finfo(scene.top_speed.dtype).eps) * (steps + radians)
 
 
 def turned(state: State, to: State) -> State:
@@ -136,7 +152,10 @@ def turned(state: State, to: State) -> State:
     def near(x: Array, y: Array) -> Array:
         return x + 2.0 * np.pi * xp.round((y - x) / (2.0 * np.pi))
 
-    rotor = None
-    if state.rotor is not None and to.rotor is not None:
-        rotor = (near(state.rotor[0], to.rotor[0]), state.rotor[1])
-    return State(state.displacement, state.velocity, tuple(map(near, state.angle, to.angle)), state.rate, rotor, state.spin)
+    def moved(own: ExciterState, to: ExciterState) -> ExciterState:
+        rotor = None
+        if own.rotor is not None and to.rotor is not None:
+            rotor = (near(own.rotor[0], to.rotor[0]), own.rotor[1])
+        return ExciterState(tuple(map(near, own.angle, to.angle)), own.rate, rotor, own.spin)
+
+    return State(state.displacement, state.velocity, exciters=tuple(map(moved, state.exciters, to.exciters)))

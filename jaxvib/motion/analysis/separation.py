@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import expm
 
 from jaxvib.equations.dynamics import vector_field
-from jaxvib.equations.state import State
+from jaxvib.equations.state import ExciterState, State
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.machine.scene import Scene
@@ -47,22 +47,22 @@ def is_nearly_one_angle(angle: np.ndarray) -> bool:
 
 def would_separate(scene: Scene, stretch: Trajectory) -> bool:
     """True if several loads have nearly one angle, and small differences of their angles grow."""
-    if not is_nearly_one_angle(np.asarray(stretch.state.azimuth)):
-        return False
     time = np.asarray(stretch.time)
-    return separation_rate(scene, stretch) * float(time[-1] - time[0]) > GROWTH
+    near = [k for k, own in enumerate(stretch.state.exciters) if own.angle and is_nearly_one_angle(np.asarray(own.angle[0]))]
+    return any(separation_rate(scene, stretch, k) * float(time[-1] - time[0]) > GROWTH for k in near)
 
 
-def separation_rate(scene: Scene, stretch: Trajectory) -> float:
+def separation_rate(scene: Scene, stretch: Trajectory, k: int = 0) -> float:
     """Growth rate of small differences between the angles of loads at nearly one angle, 1/s; negative if they decay.
 
-    **Arguments**: `stretch` an evenly sampled stretch of a run of `scene`, such as `run.window`.
+    **Arguments**: `stretch` an evenly sampled stretch of a run of `scene`, such as `run.window`; `k`, the number of the exciter
+    with the loads, from 0.
     """
-    phi = np.mean(np.asarray(stretch.state.azimuth), axis=1)
+    phi = np.mean(np.asarray(stretch.state.exciters[k].angle[0]), axis=1)
     turns = np.floor(abs(phi[-1] - phi[0]) / (2.0 * np.pi))
     covered = np.abs(phi[-1] - phi) <= 2.0 * np.pi * turns if turns else np.ones(phi.size, bool)
     first = phi.size - 1 - 2 * (np.count_nonzero(covered[:-1]) // 2)
-    transition, log_scale, duration = _transition(scene, stretch.time, stretch.state, np.asarray(first))
+    transition, log_scale, duration = _transition(scene, stretch.time, stretch.state, np.asarray(first), k)
     radius = float(np.max(np.abs(np.linalg.eigvals(np.asarray(transition)))))
     return float((np.log(max(radius, 1e-300)) + float(log_scale)) / float(duration))
 
@@ -71,18 +71,18 @@ def prepare_separation(scene: Scene, state: State, samples: int) -> None:
     """Begin to compile the program of `separation_rate` in a thread, for a stretch of so many states like `state`."""
     states = jax.tree.map(lambda leaf: np.zeros((samples, *leaf.shape), leaf.dtype), state)
     times = np.zeros(samples, state.displacement.dtype)
-    in_background(functools.partial(_transition.prepare, scene, times, states, np.asarray(0)))
+    in_background(functools.partial(_transition.prepare, scene, times, states, np.asarray(0), 0))
 
 
 @cached
 def _transition(
-    scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray
+    scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray, which: int
 ) -> tuple[Array, Array, Array]:
     """The transition matrix from sample `first` to the last one, the logarithm of its factor, and the time between them."""
     field = vector_field(scene)
     step = (times[-1] - times[0]) / (times.shape[0] - 1)
     begin = jax.tree.map(lambda leaf: leaf[0], states)
-    inserted, extracted, size = _basis(scene, begin)
+    inserted, extracted, size = _basis(scene, begin, which)
 
     def matrix(k: Array) -> Array:
         state = jax.tree.map(lambda leaf: leaf[k], states)
@@ -107,23 +107,30 @@ def _transition(
     return transition, log_scale, times[-1] - times[first]
 
 
-def _basis(scene: Scene, state: State) -> tuple[Callable[[Array], State], Callable[[State], Array], int]:
+def _basis(scene: Scene, state: State, which: int) -> tuple[Callable[[Array], State], Callable[[State], Array], int]:
     """Tangents of the state from numbers x, the numbers of such a tangent, and how many there are."""
-    touching = has_term(scene.effects, LoadInteraction)
-    shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(scene.loads))
-    if touching or not shared or not scene.machine.mounting().at_one_point:
+    exciter = scene.exciters[which]
+    touching = has_term(exciter.effects, LoadInteraction)
+    shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(exciter.loads))
+    if touching or not shared or not scene.machine.mounting(exciter.at).at_one_point:
         flat, restored = ravel_pytree(state)
         return restored, lambda tangent: ravel_pytree(tangent)[0], flat.size
     zero = jax.tree.map(jnp.zeros_like, state)
-    own = (state.angle, state.rate, state.spin)
+
+    def own_of(state: State) -> tuple:
+        return state.exciters[which].angle, state.exciters[which].rate, state.exciters[which].spin
+
+    own = own_of(state)
     treedef, size = jax.tree.structure(own), len(jax.tree.leaves(own))
-    difference = jnp.zeros_like(state.azimuth).at[0].set(1.0).at[1].set(-1.0)
+    difference = jnp.zeros_like(state.exciters[which].angle[0]).at[0].set(1.0).at[1].set(-1.0)
 
     def inserted(x: Array) -> State:
         angle, rate, spin = jax.tree.unflatten(treedef, [x[k] * difference for k in range(size)])
-        return State(zero.displacement, zero.velocity, angle, rate, zero.rotor, spin)
+        exciters = list(zero.exciters)
+        exciters[which] = ExciterState(angle, rate, exciters[which].rotor, spin)
+        return State(zero.displacement, zero.velocity, exciters=exciters)
 
     def extracted(tangent: State) -> Array:
-        return jnp.stack([leaf[0] for leaf in jax.tree.leaves((tangent.angle, tangent.rate, tangent.spin))])
+        return jnp.stack([leaf[0] for leaf in jax.tree.leaves(own_of(tangent))])
 
     return inserted, extracted, size

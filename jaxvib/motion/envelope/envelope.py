@@ -381,7 +381,7 @@ def _measure(model: Model, window: Envelopes) -> Measured:
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
     """True if potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
     and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
-    loads, potentials = scene.loads, terms_of(scene.effects, LoadPotential)
+    loads, potentials = scene.loads, terms_of(scene.all_effects, LoadPotential)
     if not potentials:
         return jnp.asarray(True)
 

@@ -121,7 +121,7 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
 
     Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
     """
-    direction = turning(scene.machine.mounting())
+    direction = turning(scene.mounting())
     size = circular_loads(scene).unbalance() if unbalance is None else unbalance
     receptance = jnp.sum(direction.conj() * (port_receptance(scene, omega) @ direction)).real
     return size**2 * omega**2 / 2.0 * receptance
@@ -168,7 +168,7 @@ def criterion(scene: Scene) -> Criterion:
     require_one_point(scene)
     if scene.loads.count < 2:
         raise InputError("loads.count", "is 1; the criterion, on the gathering of loads, needs 2 or more")
-    require_terms(scene.effects, CRITERION_TERMS, "acts|act on each load separately, which the criterion excludes")
+    require_terms(scene.all_effects, CRITERION_TERMS, "acts|act on each load separately, which the criterion excludes")
     return _judged(characteristic_speeds(scene))
 
 

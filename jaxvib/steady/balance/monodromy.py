@@ -41,7 +41,7 @@ def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
 
 def at_constant_speed(scene: Scene) -> Scene:
     """The scene with a rotor that is at its working speed from the start."""
-    return Scene(scene.machine, scene.loads, ConstantSpeed(scene.drive.speed), scene.effects)
+    return scene.replace(drive=ConstantSpeed(scene.drive.speed))
 
 
 def _steps_for(scene: Scene) -> Array:

@@ -206,7 +206,7 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
     if not np.any(port):
         problem = "moves with none of the coordinates; put the exciter where it can move, or its loads cannot act"
         raise InputError("machine.port", problem)
-    if scene.machine.mounting().gyroscopic is not None:
+    if scene.mounting().gyroscopic is not None:
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
         return

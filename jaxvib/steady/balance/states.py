@@ -206,10 +206,10 @@ def _sides(loads: CircularLoads) -> np.ndarray:
 
 def _imbalance(scene: Scene) -> complex:
     """The rotor's own, kg m, in its frame; refused where loads at one point cannot cancel it."""
-    thrown = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.effects, RotorImbalance)]
+    thrown = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
     static = [complex(*map(float, each.static)) for each in thrown]
     moment = [complex(*map(float, each.moment)) for each in thrown]
-    levers = scene.machine.mount().rotor_levers[1:] if static else ()
+    levers = scene.mount().rotor_levers[1:] if static else ()
     moment += [float(lever) * each for lever in levers if lever is not None for each in static]
     if abs(sum(moment)) > 1e-9 * max(map(abs, moment), default=0.0):
         problem = (

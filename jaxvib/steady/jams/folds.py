@@ -102,7 +102,7 @@ def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
     # The torque of the drag is opposite to that of the acceleration -w^2 Y.
     torque = mean_torque(model.unbalance, acceleration)
     free = omega + torque / model.drag
-    effects = model.scene.effects
+    effects = model.scene.all_effects
     if not has_term(effects, ContactFriction):
         return free
 

@@ -323,7 +323,7 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
     """
     loads, speeds = turning_loads(scene, JAM_TERMS), np.asarray(omega)
     known = np.isfinite(speeds)
-    if loads.ball_radius is not None or has_term(scene.effects, ContactFriction):
+    if loads.ball_radius is not None or has_term(scene.all_effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
     starts = np.where(known, speeds, float(scene.drive.speed))
     found = _growths_of_jams(scene, jnp.asarray(starts))

@@ -201,7 +201,7 @@ class _Solver:
 
 def _points(scene: Scene) -> list[int]:
     """Return numbers of collocation points to try in turn, on half a period if the motion has that symmetry."""
-    return [p if has_half_turn(scene.effects) else 2 * p + 1 for p in _COLLOCATION_POINTS]
+    return [p if has_half_turn(scene.all_effects) else 2 * p + 1 for p in _COLLOCATION_POINTS]
 
 
 def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -248,7 +248,7 @@ def _tests(growth: Floquet) -> Array:
 def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
     """Every sign change between neighbours that are both known, followed to its root."""
     kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
-    if not has_half_turn(solve.scene.effects):
+    if not has_half_turn(solve.scene.all_effects):
         kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
 
     def read(values: _Values) -> np.ndarray:

@@ -124,13 +124,13 @@ def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known
         bodies = 1 if loads.alike else loads.count
         size = _BYTES_PER_POINT * bodies**2 * float(points if isinstance(points, int) else 1)
         return (count(points, "points", low=2, each=size),)
-    tried = _COLLOCATION_POINTS if has_half_turn(scene.effects) else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
+    tried = _COLLOCATION_POINTS if has_half_turn(scene.all_effects) else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
     return tried if all_known else tried[:1]
 
 
 def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
     """Return whether the leading order has the jam mode, the sign of dn/dOmega there, and its load speed, rad/s."""
-    if scene.machine.mounting().gyroscopic is not None:
+    if scene.mounting().gyroscopic is not None:
         raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
     jams = jams_of(scene)
     light, speed = known(jams.omega)[jams.row(mode)], known(scene.drive.speed)

@@ -62,7 +62,7 @@ def usual_mode(scene: Scene) -> int:
 
 def collocation_points(scene: Scene, points: int) -> int:
     """Number of points on half a period, or with the same spacing on a whole one if that is needed."""
-    return points if has_half_turn(scene.effects) else 2 * points + 1
+    return points if has_half_turn(scene.all_effects) else 2 * points + 1
 
 
 def slow_period(scene: Scene) -> float:

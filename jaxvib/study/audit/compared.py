@@ -129,7 +129,7 @@ def field_operations(scene: Scene) -> int:
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
-    >>> heavier = jv.Scene(scene.machine, scene.loads, scene.drive, (jv.Gravity(),))
+    >>> heavier = scene.replace(effects=(jv.Gravity(),))
     >>> field_operations(heavier) > field_operations(scene)
     True
     """
@@ -162,7 +162,7 @@ def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, acc
     own, other = repeated.values(scene, tier), repeated.values(variant.scene, tier)
     new, old = (own, other) if variant.present else (other, own)
     changes = relative_changes(new, old, own, scene.machine.structure().units)
-    sizes = [(len(each.effects), len(without_excluded_effects(each).effects)) for each in (scene, variant.scene)]
+    sizes = [(len(each.all_effects), len(without_excluded_effects(each).all_effects)) for each in (scene, variant.scene)]
     if sizes[0][0] != sizes[1][0] and sizes[0][1] == sizes[1][1]:
         changes["fold"] = math.nan  # theories of jams leave the effect out of both
     # The uncertainties of both motions, relative to the motion of this scene.

@@ -172,8 +172,8 @@ class RunComparison(NamedTuple):
 
 def without_excluded_effects(scene: Scene) -> Scene:
     """Copy of the scene without the effects that theories of jams exclude, such as imbalance, which acts at another speed."""
-    kept = tuple(e for e in scene.effects if all(isinstance(term, COINCIDENT_TERMS) for term in e.terms()))
-    return scene if len(kept) == len(scene.effects) else Scene(scene.machine, scene.loads, scene.drive, kept)
+    kept = tuple(e for e in scene.all_effects if all(isinstance(term, COINCIDENT_TERMS) for term in e.terms()))
+    return scene if len(kept) == len(scene.all_effects) else scene.replace(effects=kept)
 
 
 def turning_state(scene: Scene) -> State:

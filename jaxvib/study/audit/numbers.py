@@ -89,7 +89,7 @@ def _ball_radius(scene: Scene) -> tuple[float, str] | None:
 
 
 def _gravity(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
-    if total_gravity(scene.effects):
+    if total_gravity(scene.all_effects):
         return None
     share = gravity_share(_arm(scene), values.omega)
     return _row("gravity: g/(R Omega^2)", share, accuracy, "its share in the force with which loads press on their track")
@@ -113,7 +113,7 @@ def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
 
 
 def _distance(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
-    if not np.isfinite(values.closest) or has_term(scene.effects, LoadInteraction):
+    if not np.isfinite(values.closest) or has_term(scene.all_effects, LoadInteraction):
         return None
     says = "diameter over the least distance of two loads: above 1 they pass through each other, and load_contact is called for"
     return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, says)
@@ -121,7 +121,7 @@ def _distance(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
 
 def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     drag = mean_torque(scene, values.omega)
-    if has_term(scene.effects, ContactFriction) or not drag > 0.0:
+    if has_term(scene.all_effects, ContactFriction) or not drag > 0.0:
         return None
     arm, n = _arm(scene), scene.loads.count
     pressed = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (n,)))) * arm * values.omega**2
@@ -137,7 +137,7 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
 
 
 def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
-    if scene.machine.mounting().tilt is not None:
+    if scene.mounting().tilt is not None:
         return None
     model = linear_model(scene)
     (port,) = model.mount.rows
@@ -150,7 +150,7 @@ def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRo
 
 def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     machine = scene.machine
-    if machine.mounting().axes != (1,) or has_term(scene.effects, SupportForce):
+    if scene.mounting().axes != (1,) or has_term(scene.all_effects, SupportForce):
         return None
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
     weight = _G * (float(jnp.trace(machine.carrier().mass)) + loads)

@@ -47,9 +47,9 @@ class WithoutGyroscopic(Machine):
         """The carrier of the machine."""
         return self.machine.carrier()
 
-    def mount(self) -> Mount:
+    def mount(self, at: Place = None) -> Mount:
         """The mount of the machine without its gyroscopic matrix."""
-        return eqx.tree_at(lambda mount: mount.gyroscopic, self.machine.mount(), None)
+        return eqx.tree_at(lambda mount: mount.gyroscopic, self.machine.mount(at), None)
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """The rows of the machine."""
@@ -59,12 +59,12 @@ class WithoutGyroscopic(Machine):
 def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
     """The scene without each effect that it has, without gyroscopic coupling, without the limit of its motor's power (the rotor
     then rises to the motor's speed over half the time `until`, s)."""
-    kinds = [effect.kind for effect in scene.effects]
-    for k, effect in enumerate(scene.effects):
+    kinds = [effect.kind for effect in scene.all_effects]
+    for k, effect in enumerate(scene.all_effects):
         number = f" {kinds[: k + 1].count(effect.kind)}" if kinds.count(effect.kind) > 1 else ""
-        rest = (*scene.effects[:k], *scene.effects[k + 1 :])
-        yield Variant(effect.kind + number, True, Scene(scene.machine, scene.loads, scene.drive, rest))
-    if scene.machine.mounting().gyroscopic is not None:
+        rest = (*scene.all_effects[:k], *scene.all_effects[k + 1 :])
+        yield Variant(effect.kind + number, True, scene.replace(effects=rest))
+    if scene.mounting().gyroscopic is not None:
         machine = WithoutGyroscopic(scene.machine)
         yield Variant("gyroscopic coupling", True, eqx.tree_at(lambda s: s.machine, scene, machine))
     if not scene.drive.ideal and until is not None:
@@ -75,21 +75,21 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
     """The scene with each effect that it has not and could have: the `given` ones, else those that the package knows, with
     usual numbers (`Effect.typical`); and with a drive that gives way, where its speed is given."""
-    there = {effect.kind for effect in scene.effects if not effect.repeatable}
+    there = {effect.kind for effect in scene.all_effects if not effect.repeatable}
     for effect in given or ():
         if effect.kind not in there:
-            more = Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, effect))
+            more = scene.replace(effects=(*scene.all_effects, effect))
             yield Variant(effect.kind, False, more, "as given")
     if given is not None:
         return
-    known = {effect.kind for effect in scene.effects}
+    known = {effect.kind for effect in scene.all_effects}
     for kind, effect in EFFECTS.items():
         if kind in known:
             continue
         with contextlib.suppress(InputError):  # it does not go with this machine or these loads
             usual = effect.typical(scene.machine, scene.loads, scene.drive.speed, jnp.asarray(amplitude))
             if usual is not None:
-                more = Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, usual.effect))
+                more = scene.replace(effects=(*scene.all_effects, usual.effect))
                 yield Variant(kind, False, more, usual.says)
     if scene.drive.constant:
         slower = ConstantSpeed(scene.drive.speed * (1.0 - _DROOP))

@@ -216,7 +216,7 @@ def capture(
         raise InputError("resolution", f"is {quoted(resolution)}; it must be between 0 and 1, such as 1e-3")
     if turning not in get_args(Turning):
         raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
-    if turning == "still" and not has_term(scene.effects, SlipRelease):
+    if turning == "still" and not has_term(scene.all_effects, SlipRelease):
         problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
         raise InputError("turning", problem)
     tried = np.linspace(-1.0, 0.0, _SCAN + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)

@@ -105,7 +105,7 @@ def threshold_curve(
     >>> from jaxvib.machine.files import TEMPLATES
     >>> scene = jv.scene_from_toml(TEMPLATES["torus"])
     >>> def at_speed(speed):
-    ...     return jv.Scene(scene.machine, scene.loads, jv.ConstantSpeed(speed), scene.effects)
+    ...     return scene.replace(drive=jv.ConstantSpeed(speed))
     >>> curve = jv.threshold_curve(at_speed, [140.0], [-1.0, -0.2], turns=60)
     >>> curve.threshold.tolist()
     [-0.6]

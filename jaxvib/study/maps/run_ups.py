@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction
@@ -182,12 +183,12 @@ def run_ups(
             raise InputError("angles", f"has shape {sets.shape}; (starts, {n}) finite numbers are needed")
     elif starts is not None:
         sets = random_numbers(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
-        if has_term(scene.effects, LoadInteraction):
+        if has_term(scene.all_effects, LoadInteraction):
             sets = np.sort(sets, axis=1)  # on one track in the order of their numbers
     else:
         sets = np.asarray(initial_state(scene, separation=separation).azimuth)[None]
     count(batch, "batch")
-    require_start(scene, (jnp.asarray(sets),))
+    require_start(scene, State(jnp.zeros(0), jnp.zeros(0), (jnp.asarray(sets),)))
 
     shape = (len(drags), len(sets))
     size = min(batch, shape[0] * shape[1])

@@ -105,7 +105,7 @@ def mirrored(scene):
             return eqx.tree_at(lambda e: e.g, effect, -effect.g)
         return eqx.tree_at(lambda e: e.angle, effect, effect.angle + np.pi) if effect.kind == "static_imbalance" else effect
 
-    return eqx.tree_at(lambda s: s.effects, scene, tuple(map(one, scene.effects)), is_leaf=lambda x: x is None)
+    return eqx.tree_at(lambda s: s.all_effects, scene, tuple(map(one, scene.all_effects)), is_leaf=lambda x: x is None)
 
 
 def half_turn(state, angle=np.pi):
@@ -117,7 +117,9 @@ def in_units(scene, length, mass, time):
     """The scene's numbers where the units of length, mass and time are so many times smaller."""
 
     def one(path, leaf):
-        owner = f"{scene.effects[path[1].idx].kind}." if path[0].name == "effects" else ""
+        names = [getattr(step, "name", "") for step in path]
+        holder = scene.exciters[0] if names[0] == "exciters" else scene
+        owner = f"{holder.effects[path[names.index('effects') + 1].idx].kind}." if "effects" in names else ""
         powers = DIMENSIONS.get(owner + path[-1].name, DIMENSIONS.get(path[-1].name))
         return leaf * length ** powers[0] * mass ** powers[1] * time ** powers[2]
 

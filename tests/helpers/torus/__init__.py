@@ -50,7 +50,7 @@ def lagrangian_accelerations(s, t, state, friction=0.0, gravity=0.0):
     n, m, gap = s.loads.count, s.loads.mass, s.loads.gap
     body, k, c = s.machine.mass, s.machine.stiffness, s.machine.damping
     w, b = s.drive.speed, s.loads.drag
-    static = [e.moment for e in s.effects if e.kind == "static_imbalance"]
+    static = [e.moment for e in s.all_effects if e.kind == "static_imbalance"]
     place = _point(gap)
 
     def ball(x, j):

@@ -27,7 +27,7 @@ def made(phase, speed, *, wobble=0.0, slow=0.0, effects=()):
     rate = speed[None] + (100.0 * wobble * jnp.cos(100.0 * TIME) + 2.0 * slow * TIME)[:, None]
     still = jnp.zeros((801, 4))
     return s, Trajectory(
-        TIME, jv.State(still, still, (angle,), (rate,)), jnp.zeros((801, 2)), 460.0 * TIME, jnp.full(801, 460.0)
+        TIME, jv.State(still, still, (angle,), (rate,)), jnp.zeros((801, 2)), (460.0 * TIME,), (jnp.full(801, 460.0),)
     )
 
 

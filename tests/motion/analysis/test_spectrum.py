@@ -20,7 +20,9 @@ def test_pieces_of_a_spectrum_share_their_halves(parts, size):
     """P pieces of n samples that share halves cover (P + 1)/2 of their length: each has 2 n / (P + 1) samples."""
     time = jnp.linspace(0.0, 40.0, 4000)
     wave = jnp.sin(28.0 * time)[:, None]
-    motion = Trajectory(time, jv.State(wave, wave, (wave,), (28.0 + 0.0 * wave,)), wave, 60.0 * time, jnp.full(4000, 60.0))
+    motion = Trajectory(
+        time, jv.State(wave, wave, (wave,), (28.0 + 0.0 * wave,)), wave, (60.0 * time,), (jnp.full(4000, 60.0),)
+    )
     found = spectrum_of(SCENE, motion, motion, parts)
     step = 40.0 / 3999.0
     starts = np.linspace(0.0, (4000 - size) * step, parts)

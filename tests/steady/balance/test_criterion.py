@@ -311,7 +311,7 @@ def test_exciter_that_cannot_move_is_refused():
         def carrier(self):
             return machines()["two_mass"].carrier()
 
-        def mount(self):
+        def mount(self, at=None):
             return jv.Mount((jnp.zeros((1, 2)),), axes=(1,))
 
     s = jv.Scene(Fixed(kind="fixed"), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))

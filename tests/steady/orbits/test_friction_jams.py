@@ -83,12 +83,12 @@ def test_orbits_with_friction_satisfy_the_full_equations(name):
     np.testing.assert_allclose(orbit.power, np.mean(given), rtol=1e-9)
     np.testing.assert_allclose(orbit.power, np.mean(taken), rtol=1e-9)
     # The friction is no small part of it.
-    without = eqx.tree_at(lambda s: s.effects[0].coefficient, scene, 0.0)
+    without = eqx.tree_at(lambda s: s.all_effects[0].coefficient, scene, 0.0)
     assert np.mean(jax.vmap(lambda x: jv.power(without, 0.0, jv.State(*orbit.at(x))))(theta)[0]) < 0.98 * np.mean(given)
 
 
 def test_dry_friction_keeps_the_half_turn_and_gravity_does_not():
-    assert has_half_turn(alike(dry()).effects) and not has_half_turn(alike(dry(), jv.Gravity()).effects)
+    assert has_half_turn(alike(dry()).all_effects) and not has_half_turn(alike(dry(), jv.Gravity()).all_effects)
     # On a whole period, where the symmetry is not put in, it comes out.
     model, grid = assembled(alike(dry())), grid_of(33, False)
 

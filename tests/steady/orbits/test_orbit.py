@@ -33,7 +33,7 @@ class Shaker(jv.Machine):
         damping = jnp.diag(jnp.asarray([30.0, 20.0]))
         return jv.Carrier(40.0 * jnp.eye(2), damping, k, k, zero + damping, ("x", "y"))
 
-    def mount(self):
+    def mount(self, at=None):
         return jv.Mount((jnp.eye(2),), axes=(0, 1))
 
 

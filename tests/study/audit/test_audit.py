@@ -139,13 +139,13 @@ class Silent(jv.Effect):
 
 @pytest.mark.parametrize("scene", [BARE, ROTOR], ids=["platform", "rotor"])
 def test_scene_without_an_effect_traces_the_same_program(scene):
-    silent = jv.Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, Silent()))
+    silent = jv.Scene(scene.machine, scene.loads, scene.drive, (*scene.all_effects, Silent()))
     assert program(silent) == program(scene)
     names = [variant.name for variant in present_variants(silent, None)]
     coupled = ["gyroscopic coupling"] if scene is ROTOR else []
     assert sorted(names) == sorted(["silent", *([*coupled, "static_imbalance", "stop 1", "stop 2"] if coupled else [])])
-    for effect, variant in zip(scene.effects, present_variants(scene, None), strict=False):
-        left = tuple(each for each in scene.effects if each is not effect)
+    for effect, variant in zip(scene.all_effects, present_variants(scene, None), strict=False):
+        left = tuple(each for each in scene.all_effects if each is not effect)
         assert program(variant.scene) == program(jv.Scene(scene.machine, scene.loads, scene.drive, left)) != program(scene)
 
 
@@ -187,10 +187,10 @@ def test_gyroscopic_coupling_is_taken_out():
 def test_what_a_scene_could_have_is_put_in_with_usual_numbers():
     put_in = {variant.name: variant for variant in possible_variants(SCENE, (2e-3,), None)}
     assert set(put_in) == {"static_imbalance", "cubic_support", "drive that gives way"}  # no bearing, no size, no tilt
-    (cubic,) = [effect for effect in put_in["cubic_support"].scene.effects if effect.kind == "cubic_support"]
+    (cubic,) = [effect for effect in put_in["cubic_support"].scene.all_effects if effect.kind == "cubic_support"]
     # Its force k3 a^3 cos^3 has the fundamental (3/4) k3 a^3: 1 % of k a.
     np.testing.assert_allclose(0.75 * cubic.stiffness * 2e-3**2, 0.01 * SCENE.machine.stiffness[0], rtol=1e-12)
-    (imbalance,) = [effect for effect in put_in["static_imbalance"].scene.effects if has_term([effect], RotorImbalance)]
+    (imbalance,) = [effect for effect in put_in["static_imbalance"].scene.all_effects if has_term([effect], RotorImbalance)]
     np.testing.assert_allclose(imbalance.moment, 50.0 * 6.3e-3 / 60.0, rtol=1e-12)
     put_in = {variant.name: variant for variant in possible_variants(ROTOR, (1e-3, 1e-3, 1e-3, 1e-3), None)}
     assert set(put_in) == {"gravity", "moment_imbalance", "dry_friction", "cubic_support"}
@@ -217,7 +217,7 @@ class Answers:
         return True
 
     def exact(self, scene):
-        return self.by_kind["with_" if scene.effects else "without"]
+        return self.by_kind["with_" if scene.all_effects else "without"]
 
 
 @pytest.mark.parametrize(
@@ -315,7 +315,7 @@ def test_bearing_friction_is_that_of_the_effect():
 def test_a_run_is_asked_for_where_there_is_no_jam():
     question = RunComparison.of_arguments(ROTOR, None, None)
     assert question.start == "rest" and question.until > 2.0 * 460.0 / 230.0
-    assert not question.has_exact_orbit(ROTOR) and without_excluded_effects(ROTOR).effects == ()
+    assert not question.has_exact_orbit(ROTOR) and without_excluded_effects(ROTOR).all_effects == ()
     slower = eqx.tree_at(lambda s: s.drive.speed, BARE, 20.0)
     assert np.all(np.isnan(JamComparison(3).state(slower).displacement))  # no jam there, and no error
     turning = RunComparison.of_arguments(SCENE, 3.0, None)

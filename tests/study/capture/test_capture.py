@@ -67,7 +67,7 @@ def test_a_threshold_curve_is_captures_beside_each_other():
 @pytest.mark.slow
 def test_captures_of_balls_that_are_thrown_without_turning():
     base = published_torus(3.5)
-    scene = jv.Scene(base.machine, base.loads, base.drive, (*base.effects, jv.Sliding(0.1)))
+    scene = jv.Scene(base.machine, base.loads, base.drive, (*base.all_effects, jv.Sliding(0.1)))
     rolled, slid = (jv.capture(scene, [-0.7, -0.1], turns=20, turning=how) for how in ("rolling", "still"))
     assert np.all(rolled.finite) and np.all(slid.finite) and not np.any(rolled.captured[0])
     start = jv.with_spin(scene, thrown_state(scene, -0.7), "still")

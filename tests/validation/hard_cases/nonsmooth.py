@@ -29,7 +29,7 @@ def stop_law(until: float, start: Start) -> Callable[[Scene], Reference]:
     """A stop above the only platform: it presses where the platform is beyond the gap and k x + c x' does not pull."""
 
     def reference(scene: Scene) -> Reference:
-        p, stop = reference_model(scene), next(e for e in scene.effects if e.kind == "stop")
+        p, stop = reference_model(scene), next(e for e in scene.all_effects if e.kind == "stop")
         k, c, gap = (number_of(stop, name) for name in ("stiffness", "damping", "gap"))
 
         def beyond(t: float, y: np.ndarray) -> float:
@@ -61,7 +61,7 @@ def _contact(until: float, start: Start) -> Callable[[Scene], Reference]:
     """Two balls on one track: they press where their centres are nearer than 2 r and k d - c s' does not pull."""
 
     def reference(scene: Scene) -> Reference:
-        p, effect = reference_model(scene), next(e for e in scene.effects if e.kind == "load_contact")
+        p, effect = reference_model(scene), next(e for e in scene.all_effects if e.kind == "load_contact")
         own, radius = (number_of(scene.loads, name) for name in ("ball_radius", "radius"))
         k, c = number_of(effect, "stiffness"), number_of(effect, "damping")
 
@@ -110,7 +110,7 @@ def _dry(until: float, start: Start) -> Callable[[Scene], Reference]:
     """
 
     def reference(scene: Scene) -> Reference:
-        p, effect = reference_model(scene), next(e for e in scene.effects if e.kind == "dry_friction")
+        p, effect = reference_model(scene), next(e for e in scene.all_effects if e.kind == "dry_friction")
         lever = 0.5 * number_of(effect, "coefficient") * number_of(effect, "diameter")
         g = number_of(p.effects["gravity"], "g") if "gravity" in p.effects else 0.0
         m, radius = float(p.m[0]), float(p.radius[0])

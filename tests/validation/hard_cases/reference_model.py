@@ -153,7 +153,7 @@ def reference_model(scene: Scene) -> ReferenceModel:
     kappa = np.full(loads.count, {"ball": 1.4, "roller": 1.5}.get(loads.kind, 1.0))
     if loads.inertia is not None:
         kappa = 1.0 + get(loads.inertia) / (m * radius**2)
-    effects = {effect.kind: effect for effect in scene.effects}
+    effects = {effect.kind: effect for effect in scene.all_effects}
     return ReferenceModel(
         np.diag(mass), damping, stiffness, k, c, machine.exciter - 1, m, radius, drag, kappa, scene.drive, effects
     )

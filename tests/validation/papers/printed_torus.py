@@ -143,7 +143,7 @@ def printed_torus(scene: Scene) -> PrintedTorus:
 
     `ensemble` and `capture` take this function as their `equations`; see `PrintedTorus`.
     """
-    gravity, imbalance, rolling = scene.effects
+    gravity, imbalance, rolling = scene.all_effects
     assert isinstance(gravity, Gravity) and isinstance(imbalance, StaticImbalance) and isinstance(rolling, RollingFriction)
     machine, loads = cast(PlanarRotor, scene.machine), in_torus(scene.loads, "the paper")
     one = jnp.ones_like(loads.gap)

@@ -40,7 +40,7 @@ def _state(displacement: tuple[float, float] = (0.0, 0.0), climb: tuple[float, f
 
 
 def _without(scene: Scene, kind: type) -> Scene:
-    return Scene(scene.machine, scene.loads, scene.drive, tuple(e for e in scene.effects if not isinstance(e, kind)))
+    return Scene(scene.machine, scene.loads, scene.drive, tuple(e for e in scene.all_effects if not isinstance(e, kind)))
 
 
 def _up(field: Dynamics | PrintedTorus) -> float:
@@ -70,7 +70,7 @@ def _own_pull() -> float:
 
 
 def _friction_ratio() -> float:
-    friction = next(e for e in _SCENE.effects if isinstance(e, RollingFriction))
+    friction = next(e for e in _SCENE.all_effects if isinstance(e, RollingFriction))
     return float(friction.coefficient) / float(ball_radius(_SCENE.loads))
 
 

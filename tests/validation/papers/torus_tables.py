@@ -61,12 +61,12 @@ def _touching(run: _Runs) -> tuple[Scene, State]:
     ratio = loads.ball_radius / loads.radius
     apart = 2.0 * (jnp.arcsin(ratio) - jnp.arctan(ratio))
     state = eqx.tree_at(lambda s: s.angle[0], state, state.angle[0] + jnp.asarray([0.0, 1.0]) * apart)
-    return Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, CONTACT)), state
+    return Scene(scene.machine, scene.loads, scene.drive, (*scene.all_effects, CONTACT)), state
 
 
 def _spinning(run: _Runs) -> tuple[Scene, State]:
     scene, state = _alone(run)
-    return Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, SPIN)), state
+    return Scene(scene.machine, scene.loads, scene.drive, (*scene.all_effects, SPIN)), state
 
 
 class _Model(NamedTuple):

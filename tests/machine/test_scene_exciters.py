@@ -1,0 +1,153 @@
+"""Exciters of a scene: both forms of the constructor, singular properties, names, files, bad input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+from scenes import machines
+
+import jaxvib as jv
+from jaxvib.machine.numbers.named import find_number, numbers_of, put_numbers
+
+LOADS, DRIVE = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0)
+MOTOR = jv.DCMotor(100.0, stall_torque=5.0, inertia=0.1)
+TWO = machines()["two_mass"]
+
+
+def two(**changes):
+    clockwise = {"drive": MOTOR, "unbalance": 0.2, "at": 1, "direction": -1, "effects": jv.StaticImbalance(0.1)} | changes
+    return jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE), jv.Exciter(**clockwise)], effects=jv.Gravity())
+
+
+def test_one_exciter_is_the_short_form():
+    effects = jv.StaticImbalance(0.1), jv.Gravity(), jv.Stop(1e5, gap=1e-3)
+    short = jv.Scene(TWO, LOADS, DRIVE, effects)
+    assert eqx.tree_equal(short, jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE)], effects=effects))
+    assert eqx.tree_equal(short, jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE, effects=effects[:1])], effects=effects[1:]))
+    assert [effect.kind for effect in short.all_effects] == ["stop", "gravity", "static_imbalance"]
+    assert [effect.kind for effect in short.effects] == ["stop", "gravity"]
+
+
+@pytest.mark.parametrize(
+    "where", [lambda s: s.loads.drag, lambda s: s.drive.speed, lambda s: s.drive, lambda s: s.machine.mass]
+)
+def test_tree_at_replaces_parts_through_singular_properties(where):
+    scene = jv.Scene(TWO, LOADS, DRIVE)
+    new = jax.tree.map(lambda x: 2.0 * x, where(scene))
+    assert eqx.tree_equal(where(eqx.tree_at(where, scene, new)), new)
+    state = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(2),), (jnp.zeros(2),))
+    ones = jnp.ones(2)
+    assert eqx.tree_at(lambda s: s.angle[0], state, ones).exciters[0].angle[0] is ones
+
+
+def test_leaves_of_one_exciter_keep_their_order():
+    state = jv.State(0, 1, (2, 3), (4, 5), (6, 7), jv.Spin(8, (9,)))
+    assert jax.tree.leaves(state) == list(range(10))
+    scene = jv.Scene(TWO, LOADS, DRIVE)
+    parts = jax.tree.leaves((scene.machine, scene.loads, scene.drive))
+    assert all(a is b for a, b in zip(jax.tree.leaves(scene), parts, strict=True))
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        jv.jam_modes,
+        jv.branches,
+        jv.phase_jams,
+        jv.balanced_states,
+        jv.criterion,
+        jv.envelope,
+        jv.audit,
+        lambda s: jv.jam_orbit(s, omega=9.0),
+        lambda s: jv.whirl(s, [9.0]),
+        lambda s: jv.growth(s, 9.0),
+        lambda s: jv.initial_state(s, "jam", mode=1),
+    ],
+)
+def test_theories_refuse_several_exciters(ask):
+    with pytest.raises(jv.InputError, match=r"has 2 exciters; this is for a scene with one, simulate"):
+        ask(two()) if ask is not jv.envelope else ask(two(), 1.0)
+
+
+@pytest.mark.parametrize("change", [{"unbalance": 0.1}, {"direction": -1}])
+def test_theories_refuse_other_exciters(change):
+    scene = jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE, **change)])
+    with pytest.raises(jv.InputError, match=r"scene.exciters\[0\].* simulate"):
+        jv.jam_modes(scene)
+
+
+def test_states_of_several_exciters_are_read_one_by_one():
+    with pytest.raises(jv.InputError, match=r"has 2 exciters; read state.exciters\[0\].angle"):
+        jv.initial_state(two()).angle  # noqa: B018
+
+
+def test_place_of_one_exciter_moves_its_mount():
+    first, second = (jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE, at=at)]) for at in (1, 2))
+    assert first.mount().rows[0].tolist() == [[1.0, 0.0]] and second.mount().rows[0].tolist() == [[0.0, 1.0]]
+    other = jv.Scene(jv.two_mass(**{**PARTS, "exciter": 1}), LOADS, DRIVE)
+    assert jnp.allclose(jv.jam_modes(first).omega, jv.jam_modes(other).omega, equal_nan=True, rtol=1e-14)
+
+
+PARTS = {name: getattr(TWO, name) for name in ("mass", "stiffness", "damping")}
+PARTS |= {name: getattr(TWO, name)[0] for name in ("link_stiffness", "link_damping")}
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        two(),
+        jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE, at=1)]),
+        jv.Scene(jv.planar_rotor(mass=9.0, stiffness=2e4, damping=9.0), exciters=[jv.Exciter(drive=MOTOR, unbalance=0.1)] * 2),
+    ],
+)
+def test_scenes_with_exciters_are_read_back_from_files(scene):
+    assert eqx.tree_equal(jv.scene_from_toml(jv.scene_to_toml(scene)), scene)
+
+
+def test_numbers_of_several_exciters_have_names():
+    scene = two()
+    names = numbers_of(scene)
+    assert {"exciters[0].loads.mass", "exciters[1].drive.stall_torque", "exciters[1].unbalance"} < set(names)
+    assert {"exciters[1].effects.static_imbalance.moment", "effects.gravity.g", "machine.mass"} < set(names)
+    found = find_number(scene, "exciters[1].unbalance", "axes")
+    assert found.words(scene) == ["unbalance of the rotor (exciter 1)"] and found.unit == "kg m"
+    assert put_numbers(scene, [found], jnp.asarray([0.7])).exciters[1].unbalance == 0.7
+    assert "loads.mass" in numbers_of(jv.Scene(TWO, LOADS, DRIVE))
+
+
+BAD = {
+    "direction": (lambda: two(direction=0), r"direction is 0; it must be 1 \(anticlockwise\) or -1"),
+    "negative unbalance": (lambda: two(unbalance=-0.2), r"unbalance is -0.2 kg m; it must be greater than 0"),
+    "neither": (lambda: two(unbalance=None), r"loads is None; .* or give an unbalance"),
+    "no drive": (lambda: two(drive=None), r"drive is None; it must be a Drive"),
+    "platform": (lambda: two(at=3), r"at is 3; the machine has platforms 1 to 2"),
+    "distance": (lambda: two(at="2 mm"), r"at is a distance along a rotor's axis; name a platform instead"),
+    "friction without loads": (lambda: two(effects=jv.DryFriction(0.01, 0.02)), r"acts on loads, which this exciter does not"),
+    "shared effect": (lambda: jv.Exciter(LOADS, DRIVE, effects=jv.Gravity()), "effects.gravity acts on the whole machine"),
+    "own effect": (
+        lambda: jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE)] * 2, effects=jv.StaticImbalance(0.1)),
+        r"effects.static_imbalance acts on one rotor; give it to an exciter",
+    ),
+    "both forms": (lambda: jv.Scene(TWO, LOADS, DRIVE, exciters=[jv.Exciter(LOADS, DRIVE)]), "are given beside loads or drive"),
+    "none": (lambda: jv.Scene(TWO, exciters=[]), r"exciters is \[\]; it must be a list of exciters"),
+    "replaced number": (
+        lambda: jv.simulate(eqx.tree_at(lambda s: s.exciters[1].unbalance, two(), -1.0), 1.0),
+        r"exciters\[1\].unbalance is -1 kg m; it must be greater than 0",
+    ),
+    "start": (
+        lambda: jv.simulate(two(), 1.0, start=jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(2),), (jnp.zeros(2),))),
+        r"start.exciters are 1; this scene needs 2",
+    ),
+    "rotor of a motor": (
+        lambda: jv.simulate(two(), 1.0, start=jv.State(jnp.zeros(2), jnp.zeros(2), exciters=REST)),
+        r"exciters\[1\].start.rotor is None; under the drive 'dc_motor' it must be \(angle, speed\)",
+    ),
+}
+REST = [jv.ExciterState((jnp.zeros(2),), (jnp.zeros(2),)), jv.ExciterState()]
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_wrong_exciters_are_refused_by_name(name):
+    make, message = BAD[name]
+    with pytest.raises(jv.InputError, match=message):
+        make()
