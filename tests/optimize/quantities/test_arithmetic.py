@@ -204,3 +204,13 @@ def test_wrong_wishes_are_said_in_one_sentence(make, says):
     with pytest.raises(jv.InputError) as caught:
         make()
     assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_powers_have_the_power_of_a_unit_or_none():
+    share = Quantity("share", "", lambda s: s.loads.mass / s.machine.mass[0])
+    assert (STIFFNESS**2).unit == "(N/m)**2" and (share**2).unit == ""
+
+
+def test_platforms_of_a_phase_stay_with_what_is_made_of_it():
+    for made in (phase(mode=3, of=(2, 1)), -phase(mode=3, of=(2, 1)), 2.0 * phase(mode=3, of=(2, 1))):
+        assert made.of == (2, 1)
