@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.ode.scalar_rules import NotScalarizable
+from jaxvib.ode.scalar_rules import NotScalarizable, to_scalars
 from jaxvib.ode.scalarize import scalarize, scalarized_program
 
 
@@ -48,3 +48,9 @@ def test_a_term_that_is_not_there_is_not_computed():
 
     operations = [e.primitive.name for e in jax.make_jaxpr(run)(1.0, 2.0).eqns]
     assert operations.count("mul") == 0 and operations.count("add") == 0
+
+
+@pytest.mark.parametrize("value", [2.0, np.eye(2), jnp.eye(2)], ids=["a number", "NumPy's", "JAX's"])
+def test_scalars_of_a_value_are_its_entries(value):
+    found = to_scalars(value)
+    assert found.dtype == object and found.shape == np.shape(value) and np.array_equal(found.astype(float), value)
