@@ -69,3 +69,10 @@ def test_changes_of_stability_are_halved_until_they_are_known(monkeypatch):
     found = stability_changes(None, speeds, growth(None, speeds, None, steps=0) < 0.0, close=1e-4)
     np.testing.assert_allclose(found, at, rtol=1e-4)
     assert 10 < len(asked) < 18  # from 5 in 10 to 1e-4
+
+
+def test_balance_of_a_machine_free_to_drift_is_refused():
+    machine = jv.two_mass(mass=50.0, stiffness=0.0, damping=0.0, link_stiffness=4e4, link_damping=50.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.2, radius=0.1, drag=0.2), jv.ConstantSpeed(60.0))
+    with pytest.raises(jv.InputError, match=r"^machine\.stiffness lets the machine drift"):
+        states.balanced_stability(scene)
