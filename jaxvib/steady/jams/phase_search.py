@@ -22,7 +22,15 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
-from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, distinct_rows, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phase_starts import (
+    LOAD_SPEEDS,
+    at_speed,
+    distinct_rows,
+    equal_loads,
+    load_speeds,
+    phases_near,
+    solved_clusters,
+)
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     PhaseJam,
@@ -32,7 +40,6 @@ from jaxvib.steady.jams.phases import (
     jam_from,
     loads_with_drag,
     phase_jam,
-    solve_balance,
 )
 from jaxvib.units import count, random_numbers
 
@@ -49,8 +56,8 @@ _SHOWN_DRAG_FACTOR = 30.0
 _SAME_LINE_DIFFERENCE = 5e-3
 """Unstable patterns whose drags differ by less, relative, are drawn once."""
 
-_STARTS_PER_PROGRAM, _JAMS_PER_PROGRAM = 256, 64
-"""Numbers of starts and of jams in one program; typical scenes need a few hundred starts and some tens of jams."""
+_JAMS_PER_PROGRAM = 64
+"""Number of jams in one program; typical scenes have some tens."""
 
 _SAME_SPEED_DIFFERENCE, _SAME_PHASE_DIFFERENCE = 1e-6, 1e-5
 """Differences of speed (relative) and of phase (rad) below which two jams count as one."""
@@ -174,14 +181,12 @@ def phase_jams(
     loads = loads_with_drag(scene)
     number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
     balance = _assembled_balance(scene)
-    rng = random_numbers(seed)
-    return _jams_from_starts(scene, balance, *starts_of(balance, rng.uniform(-np.pi, np.pi, (number, loads.count))))
+    return _jams_from_starts(scene, balance, *solved_clusters(balance, number, random_numbers(seed)))
 
 
 def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, phase: np.ndarray) -> PhaseJams:
-    """Solve for jams from load speeds (n,) and phases (n, count)."""
-    omega, phase = in_chunks(_STARTS_PER_PROGRAM, lambda w, a: _solve_balances(balance, w, a), omega, phase)
-    groups = _equal_loads(balance)
+    """Solve for jams from load speeds (n,) and phases (n, count) of solved balances."""
+    groups = equal_loads(balance)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(balance.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
     # A start that was barely solved can give the same jam again, which only the converged jams reveal.
@@ -234,12 +239,6 @@ _assembled_balance = cached(assemble_torque_balance)
 def _jams_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     """`jam_from` many speeds and phases."""
     return eqx.filter_vmap(jam_from, in_axes=(None, 0, 0))(scene, omega, phase)
-
-
-@cached
-def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple[Array, Array]:
-    """`solve_balance` from many speeds and phases."""
-    return jax.vmap(lambda w, a: solve_balance(balance, w, a, on_numbers=True))(omega, phase)
 
 
 def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
@@ -300,17 +299,6 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, anew: Array) -> tu
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 
     return jax.lax.scan(step, phase, (omega, anew))[1]
-
-
-def _equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
-    """Groups of loads that are alike in every number, by their places."""
-    direction = np.asarray(balance.direction)
-    rows = np.concatenate(
-        [np.real(direction), np.imag(direction), np.stack([balance.unbalance, balance.drag, balance.averaged.inertia], 1)],
-        axis=1,
-    )
-    _, which = np.unique(rows, axis=0, return_inverse=True)
-    return [np.flatnonzero(which.ravel() == g) for g in range(int(np.max(which)) + 1)]
 
 
 def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:

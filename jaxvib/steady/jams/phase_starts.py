@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
-from jaxvib.steady.jams.phases import TorqueBalance, influence_of, torques_at
+from jaxvib.steady.jams.phases import TorqueBalance, influence_of, solve_balance, torques_at
 
-__all__ = ["LOAD_SPEEDS", "AtSpeed", "at_speed", "distinct_rows", "load_speeds", "phases_near", "starts_of"]
+__all__ = [
+    "LOAD_SPEEDS",
+    "AtSpeed",
+    "at_speed",
+    "distinct_rows",
+    "equal_loads",
+    "load_speeds",
+    "phases_near",
+    "solved_clusters",
+    "starts_of",
+]
 
 LOAD_SPEEDS = 240
 """Number of load speeds at which phases are searched, besides those near resonances."""
@@ -28,6 +41,94 @@ _SPEEDS_PER_PROGRAM, _PHASES_PER_PROGRAM = 400, 2048
 
 _PARTS_PER_CUT, _CUT_COUNT = 8, 2
 """Parts into which an interval of load speeds with a jam is divided, and number of divisions before Newton's method starts."""
+
+
+_STARTS_PER_PROGRAM = 256
+"""Number of starts in one program; typical scenes need a few hundred."""
+
+_STARTS_OF_CLUSTERS, _MAX_DIVISIONS = 16, 64
+"""Least number of random sets of phases for a division of equal loads into clusters, and largest number of divisions: more are
+not tried one by one, every load then has a phase of its own."""
+
+
+def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Speeds (n,) and phases (n, count) of solved balances, from `number` random sets of phases in all; not all distinct.
+
+        T_j = (w^4/2) S Im(e^{-i a_j} F),      F = sum_k S_k A_jk e^{i a_k} the same for equal loads
+
+    Equal loads need the same torque, therefore Im(e^{-i a_j} F) is the same for all of them, and at most two phases a_j are
+    possible. A search with one body for each cluster of loads at one phase, for each division of the equal loads into two
+    clusters, hence misses no jam; the unknowns are two phases for each group of equal loads, however many loads it has.
+    """
+    divisions = _divisions(equal_loads(balance))
+    each = max(number // len(divisions), min(number, _STARTS_OF_CLUSTERS))
+    found = []
+    for cluster in divisions:
+        merged = _merged(balance, cluster)
+        phases = rng.uniform(-np.pi, np.pi, (each, merged.unbalance.shape[0]))
+        starts = starts_of(merged, phases)
+        if balance.unbalance.size > 2:
+            more = _at_resonances(balance, phases)
+            starts = np.concatenate([starts[0], more[0]]), np.concatenate([starts[1], more[1]])
+        omega, phase = in_chunks(_STARTS_PER_PROGRAM, lambda w, a, m=merged: _solve_balances(m, w, a), *starts)
+        found.append((omega, phase[:, cluster]))
+    omega, phase = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return omega, phase
+
+
+@cached
+def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple[Array, Array]:
+    """`solve_balance` from many speeds and phases."""
+    return jax.vmap(lambda w, a: solve_balance(balance, w, a, on_numbers=True))(omega, phase)
+
+
+def equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
+    """Groups of loads that are alike in every number, by their places."""
+    direction = np.asarray(balance.direction)
+    rows = np.concatenate(
+        [np.real(direction), np.imag(direction), np.stack([balance.unbalance, balance.drag, balance.averaged.inertia], 1)],
+        axis=1,
+    )
+    _, which = np.unique(rows, axis=0, return_inverse=True)
+    return [np.flatnonzero(which.ravel() == g) for g in range(int(np.max(which)) + 1)]
+
+
+def _at_resonances(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Starts at every natural frequency below the rotor speed, from each of the `phases`.
+
+    Two clusters of one size have a jam exactly where the carrier lags a quarter of a turn, which no grid of load speeds meets.
+    That of two loads alone is left out: it exists at any drag, and the diagram over the drag has no curve for it.
+    """
+    frequencies = np.asarray(estimated_frequencies(balance.model.scene))
+    inside = frequencies[(frequencies > 0.0) & (frequencies < float(balance.speed))]
+    return np.repeat(inside, len(phases)), np.tile(phases, (inside.size, 1))
+
+
+def _divisions(groups: list[np.ndarray]) -> list[np.ndarray]:
+    """Numbers of the clusters of all loads, (count,), for each division of every group into two clusters."""
+    count = sum(group.size for group in groups)
+    sizes = [range(1, max(group.size // 2, 1) + 1) for group in groups]
+    if np.prod([len(some) for some in sizes]) > _MAX_DIVISIONS:
+        return [np.arange(count)]
+    divisions = []
+    for second in itertools.product(*sizes):
+        cluster = np.empty(count, dtype=int)
+        for group, size in zip(groups, second, strict=True):
+            cluster[group] = group[0]
+            cluster[group[group.size - size :]] = group[-1]
+        divisions.append(np.unique(cluster, return_inverse=True)[1])
+    return divisions
+
+
+def _merged(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalance:
+    """The balance of clusters of equal loads: each is one load with the unbalance and the drag of all its loads."""
+    first, many = np.unique(cluster, return_index=True, return_counts=True)[1:]
+    averaged = balance.averaged
+    scaled = [on_device(np.asarray(x)[first] * many) for x in (averaged.unbalance, averaged.drag, averaged.inertia)]
+    levers = on_device(np.asarray(averaged.levers)[:, first])
+    averaged = eqx.tree_at(lambda a: (a.unbalance, a.drag, a.inertia, a.levers), averaged, (*scaled, levers))
+    direction = on_device(np.asarray(balance.direction)[first])
+    return eqx.tree_at(lambda b: (b.averaged, b.direction), balance, (averaged, direction))
 
 
 def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

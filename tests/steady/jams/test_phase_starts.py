@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import jaxvib as jv
+from jaxvib.steady.jams import phase_starts
 from jaxvib.steady.jams.patterns import phase_pattern
 from jaxvib.steady.jams.phase_starts import _regular_phases, at_speed, distinct_rows, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import assemble_torque_balance, influence_of, solve_balance, torques_at
@@ -127,3 +129,43 @@ def test_rows_that_are_the_same_are_found_where_they_stand_first():
     assert len({tuple(row) for row in rows}) == first.size and np.all(np.diff(first) > 0)
     assert all(np.flatnonzero(which == k)[0] == place for k, place in enumerate(first))
     assert [found.size for found in distinct_rows(np.zeros((0, 3)))] == [0, 0]
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_jams_of_equal_loads_are_two_clusters(count):
+    """All jams in closed form: k loads stand an angle d from the others, tan(d/2) = -n cos(v)/((n - 2k) sin(v)), v = arg g."""
+    loads = jv.pendulums(count=count, mass=0.1 / count, radius=0.08, drag=0.08 / count)
+    scene = jv.Scene(jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0), loads, jv.ConstantSpeed(460.0))
+    unbalance, drag = 0.1 / count * 0.08, 0.08 / count * 0.08**2
+
+    def surplus(w, k):
+        g = 2.0 / (1.16e6 - 37.1 * w**2 + 843j * w)
+        v = np.angle(g)
+        d = 2.0 * np.arctan(-count * np.cos(v) / ((count - 2 * k) * np.sin(v))) if k else 0.0
+        return drag * (460.0 - w) + w**4 / 2.0 * unbalance**2 * np.imag(g * (count - k + k * np.exp(1j * d)))
+
+    awaited = []
+    for k in range((count + 1) // 2):
+        grid = np.linspace(20.0, 459.99, 4000)
+        values = np.array([surplus(w, k) for w in grid])
+        for i in np.flatnonzero(values[1:] * values[:-1] < 0.0):
+            awaited.append(brentq(surplus, grid[i], grid[i + 1], args=(k,), xtol=1e-10))
+    found = jv.phase_jams(scene, starts=16)
+    assert len(awaited) == 3 * ((count + 1) // 2)
+    np.testing.assert_allclose(np.sort(found.omega), np.sort(awaited), rtol=1e-8)
+
+
+def test_every_division_of_equal_loads_is_tried_once():
+    found = phase_starts._divisions([np.array([0, 2, 3, 5]), np.array([1]), np.array([4, 6])])
+    assert [part.tolist() for part in found] == [[0, 1, 0, 0, 2, 3, 4], [0, 1, 0, 3, 2, 3, 4]]
+    (alone,) = phase_starts._divisions([np.arange(20 * k, 20 * k + 20) for k in range(3)])
+    np.testing.assert_array_equal(alone, np.arange(60))
+
+
+@pytest.mark.parametrize("count", [4, 6])
+def test_two_clusters_of_one_size_jam_at_the_resonance(count):
+    """Together 3 jams for each division but that into halves, which has one, at the undamped natural frequency."""
+    loads = jv.pendulums(count=count, mass=0.1 / count, radius=0.08, drag=0.08 / count)
+    found = jv.phase_jams(jv.Scene(MACHINE, loads, jv.ConstantSpeed(460.0)), starts=16)
+    assert found.omega.size == 3 * (count // 2) + 1
+    assert np.min(np.abs(np.asarray(found.omega) / RESONANCE - 1.0)) < 1e-9
