@@ -5,6 +5,7 @@
 - A docstring begins with a noun or a verb, not with a word of `OPENERS`.
 - The name of a private constant says of what it is, such as `_MAX_CACHED_PROGRAMS`, not `_MOST` or `_POINTS`.
 - The name of a test has at most 60 characters.
+- Docstrings and messages of the packages contain none of the phrases of `PHRASES`.
 """
 
 from __future__ import annotations
@@ -77,11 +78,32 @@ COUNTED = {"COUNT", "NUMBER", "PARTS", "PIECES", "POINTS", "ROUNDS", "SHARE", "S
 
 LONGEST_TEST_NAME = 60
 
+PHRASES = (
+    "asked for",
+    "are told",
+    "as far as",
+    "force on the bed",
+    "is told",
+    "nobody",
+    "not to be had",
+    "said otherwise",
+    "who asks",
+)
+"""Phrases that are refused in all text of the packages, compared without line breaks; plain ones are requested, shown, if, no
+one, default, foundation force."""
 
-def findings(text: str) -> Iterator[tuple[int, str]]:
-    """(line, sentence) of each rule that a module breaks."""
+PACKAGES = ("jaxvib", "optimize")
+
+
+def findings(text: str, *, is_package: bool = True) -> Iterator[tuple[int, str]]:
+    """(line, sentence) of each rule that a module breaks; rules on phrases hold for modules of packages."""
     tree = ast.parse(text)
     for node in ast.walk(tree):
+        if is_package and isinstance(node, ast.Constant) and isinstance(node.value, str):
+            sentence = " ".join(node.value.split()).lower()
+            for phrase in PHRASES:
+                if re.search(rf"\b{phrase}\b", sentence):
+                    yield node.lineno, f'text with the phrase "{phrase}"'
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
             yield from _opener(node.body[:1])
             for before, after in zip(node.body, node.body[1:], strict=False):
@@ -113,9 +135,10 @@ def main(folders: list[str]) -> int:
     for folder in folders or FOLDERS:
         place = ROOT / folder
         for path in [place] if place.is_file() else sorted(place.rglob("*.py")):
-            for line, sentence in findings(path.read_text(encoding="utf-8")):
+            name = path.relative_to(ROOT)
+            for line, sentence in findings(path.read_text(encoding="utf-8"), is_package=name.parts[0] in PACKAGES):
                 found = True
-                print(f"{path.relative_to(ROOT)}:{line}: {sentence}")
+                print(f"{name}:{line}: {sentence}")
     return int(found)
 
 

@@ -20,7 +20,7 @@ __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, its module imported the first time it is asked for: a command pays for what it uses only."""
+    """Return a public name; its module is imported at the first use, so that a command imports only what it needs."""
     if name == "__version__":
         from importlib.metadata import version  # slow to import: only who asks pays
 

@@ -1,4 +1,4 @@
-"""Designs that are often asked for, each in one call: a space, an objective, demands."""
+"""Frequent design tasks, each in one call: a space, an objective, demands."""
 
 from __future__ import annotations
 

@@ -36,14 +36,14 @@ __all__ = [
 ]
 
 _TELLING = 1000.0
-"""Changes of more per cent are told in the objective's unit."""
+"""Largest change, per cent, that is shown in per cent; larger ones are shown in the unit of the objective."""
 
 
 _LINEAR = 10.0
-"""The largest change of the objective, in per cent, that is told from its slope."""
+"""Largest change of the objective, per cent, that is predicted from its slope."""
 
 _LEAST_MOVE = 1e-6
-"""The smallest move of a limit, in per cent, that is told."""
+"""Smallest change of a limit, per cent, that is shown."""
 
 
 class SynthesisStatus(eqx.Enumeration):

@@ -175,7 +175,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
 
 
 _NO_ARGUMENTS: type[click.UsageError] | tuple[()] = getattr(click.exceptions, "NoArgsIsHelpError", ())
-"""Raised where help is asked for by no argument; click below 8.2 prints it by itself."""
+"""Raised to print the help text of a command without arguments; click below 8.2 prints it itself."""
 
 
 def run(arguments: list[str]) -> int:

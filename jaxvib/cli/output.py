@@ -58,26 +58,26 @@ class Output:
             raise InputError(option, f"is {quoted(str(folder))}, which cannot be made a folder ({error.strerror})") from error
 
     def file(self, name: str) -> Path | None:
-        """The path of a result file; None where no folder was asked for."""
+        """Path of a result file; None without --out."""
         if self.folder is None:
             return None
         self.files.append(str(self.folder / name))
         return self.folder / name
 
     def keep(self, name: str, result: Result) -> None:
-        """Saves a result to a file of that name, where a folder was asked for."""
+        """Save a result to a file with that name, with --out."""
         path = self.file(name)
         if path is not None:
             result.save(path)
 
     def made(self, name: str) -> Path:
-        """The path of a file that is what the command is for: in the folder, in the current one where none was asked for."""
+        """Path of the main file of a command: in the folder --out, by default in the current folder."""
         path = (self.folder or Path()) / name
         self.files.append(str(path))
         return path
 
     def picture(self, name: str, draw: Callable[[], Figure]) -> None:
-        """Draws a figure where a folder or a report was asked for: into the file of that name, and onto the report."""
+        """Draw a figure into the file with that name and onto the report, with --out or --report."""
         path = self.file(name)
         if path is None and self.report is None:
             return
@@ -88,7 +88,7 @@ class Output:
             self.figures.append((Path(name).stem.replace("_", " "), figure))
 
     def csv(self, path: Path | None, result: Result, axis: str) -> None:
-        """Writes what a result holds along an axis into a CSV file, where one was asked for."""
+        """Write the values of a result along an axis into a CSV file, with --csv."""
         if path is None:
             return
         from jaxvib.results.csv import write_csv  # slow to import, and --help needs none of it

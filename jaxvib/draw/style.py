@@ -55,7 +55,7 @@ start over."""
 
 MARKERS = "osD^vPX*"
 STROKES = ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
-"""Marks and strokes of series, so that they are told apart without colours too."""
+"""Marks and strokes of series, which distinguish them without colours, too."""
 
 UNSTABLE = (0, (3, 2))
 """The dashes of what is not stable."""

@@ -52,7 +52,7 @@ Axes = dict[int, Array]
 
 
 class Motion(NamedTuple):
-    """Motion of an exciter as far as it is known before the accelerations.
+    """Motion of an exciter that is known before the accelerations.
 
     **Attributes**: `state`; the rotor's `speed`; `imbalance` of the rotor, see `RotorDynamics._imbalance`; `kinematics` of the
     loads; `drag` (count,), the torque of the rotor on them; `weight`, the torque of gravity on the unbalance, None without one;

@@ -268,8 +268,8 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
 
         (K - w^2 (M + sum m_j B^T B) + i w (C + n G)) Y = S w^2 B^T e,     q(t) = Re(Y exp(i w t)),    S = sum m_j R_j
 
-    the angle of the loads being w t. It is the limit of light loads (eps -> 0) of a jam. The rotor's `speed` n, rad/s, is asked
-    for where the carrier has a gyroscopic matrix G.
+    the angle of the loads being w t. It is the limit of light loads (eps -> 0) of a jam. The rotor's `speed` n, rad/s, is
+    needed if the carrier has a gyroscopic matrix G.
 
     **Returns** (nd,) complex. **Raises** `InputError` for a carrier with a gyroscopic matrix where no speed is given, loads at
     stations of their own, a motor in place of a given speed, and effects that this theory leaves out.

@@ -118,7 +118,7 @@ def export_fmu(
     ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
     >>> unit = jv.export_fmu(scene, pathlib.Path(tempfile.mkdtemp()) / "machine.fmu", binary=False)
     >>> unit.message
-    'source only: no binary was asked for'
+    'source only: no binary was requested'
     """
     require_one_of(fmi, ("2.0", "3.0"), "fmi")
     require_one_of(drive, ("scene", "input"), "drive")

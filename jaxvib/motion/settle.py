@@ -250,9 +250,9 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
 
 
 def _steady_in_the_mean(seen: np.ndarray) -> bool:
-    """True if stretches (4 n, 3 + nd), each with its drift first, scatter about means that do not move, and go on to do so.
+    """True if the values of stretches (4 n, 3 + nd), each with its drift first, scatter about constant means.
 
-    What moves by less than half the drift, which is told, is not seen in it.
+    Changes below half the drift are not resolved.
     """
     drift, values = seen[:, 0], seen[:, 1:]
     place = np.arange(len(seen)) - (len(seen) - 1) / 2.0

@@ -233,7 +233,7 @@ def _coarser(control: StepControl) -> StepControl:
 
 
 def _run_with_estimate(plan: RunPlan) -> Run:
-    """Return a run with the error that a second run with larger steps estimates, side by side where nobody watches."""
+    """Return a run with the error that a second run with larger steps estimates; in parallel without a progress meter."""
     control = plan.integration.control
     assert isinstance(control, StepControl)
     coarser = _coarser(control)

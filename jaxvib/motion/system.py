@@ -51,9 +51,9 @@ class PackedSystem(eqx.Module):
     wrapped by the same turns, so that their differences stay; `batch`: true if many runs advance together; the `solver` that
     integrates them, if it is not `method`.
 
-    **Attributes**: `program` the equations, on numbers where `is_scalarized`, else on arrays, None where JAX lets nobody read
-    programs; `size` how many numbers the state has; `is_on_scalars` whether they are held one by one; `args` the arguments of
-    `term`.
+    **Attributes**: `program`: the equations, on numbers if `is_scalarized`, otherwise on arrays; None if JAX does not give
+    access to programs; `size`: how many numbers the state has; `is_on_scalars`: True if they are separate scalars; `args` the
+    arguments of `term`.
     """
 
     args: Args

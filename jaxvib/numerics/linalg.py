@@ -40,7 +40,7 @@ TRUSTED = 1e-2
 """Largest relative error of an eigenvalue that is still an answer; beyond it its digits are lost to rounding."""
 
 _compiled = functools.partial(jax.jit, inline=True)
-"""Asked for outside a program, a loop would be traced and compiled at every call; within one, nothing changes."""
+"""Compilation of loops, which JAX traces and compiles at every call outside a program; within one, nothing changes."""
 
 _Entry: TypeAlias = Array | float
 """Entry of a matrix: a number, or an array of those of many matrices."""

@@ -31,7 +31,7 @@ _MAX_RECOMPUTED = 8
 
 
 def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program, each operation on the same numbers done once, and none whose result nobody reads.
+    """The same program without repeated operations and without operations whose results are not used.
 
     Equations written by automatic differentiation ask for the same parts again and again: a third to a half of them go.
     """

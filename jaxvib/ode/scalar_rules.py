@@ -33,7 +33,7 @@ Scalars: TypeAlias = np.ndarray
 """An array of dtype object: every entry is a traced scalar, or a NumPy scalar that the program itself holds as a constant."""
 
 Scalar: TypeAlias = Any
-"""A traced scalar, a NumPy scalar, or a `ComplexParts`: one entry of `Scalars`, as far as a type can say."""
+"""A traced scalar, a NumPy scalar, or a `ComplexParts`: one entry of `Scalars`."""
 
 Rule: TypeAlias = Callable[..., Scalars | list[Scalars]]
 """Function from the `Scalars` of an operation's arguments, and its parameters as keywords, to those of its results."""

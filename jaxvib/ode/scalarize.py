@@ -146,7 +146,7 @@ def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTre
 def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
     """`function`, traced as it is, on arrays, but for its sines and cosines, which are those of `jaxvib.numerics.sincos`.
 
-    **Returns** None where this version of JAX lets nobody read its programs.
+    **Returns** None if this version of JAX does not give access to its programs.
     """
     if not HAS_JAXPRS:
         return None

@@ -165,7 +165,8 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
 
 
 def in_background(*tasks: Callable[[], object]) -> None:
-    """Begin tasks in threads, with JAX's options of this thread. Nobody waits for them, and their errors are ignored.
+    """Begin tasks in threads, with JAX's options of this thread. The caller does not wait for them, and their errors are
+    ignored.
 
     A question that calls several `cached` functions one after the other knows their programs before their numbers. Its first
     answer takes less time if they are compiled side by side: `task = lambda: integrate.prepare(...)`. A call of the function

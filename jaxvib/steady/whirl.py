@@ -219,7 +219,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
     The kind is - Re(2 s + c/m): of the two real roots of a single equation it is negative for the slower one, in which damping
     holds back what the spring pulls, and positive for the faster one, in which damping stops a mass. Several overdamped motions
-    are told apart by it too, whatever their roots: it is the sign characteristic of the Hermitian matrix polynomial.
+    are distinguished by it too, whatever their roots: it is the sign characteristic of the Hermitian matrix polynomial.
 
     The error is the step of Newton's method for the scalar equation, with the rounding of its terms counted.
 
@@ -303,7 +303,7 @@ def _require_springs(stiffness: np.ndarray) -> None:
 
 
 def _held(stiffness: np.ndarray) -> bool:
-    """True if springs hold every motion, as far as rounding can tell."""
+    """True if springs resist every motion, within rounding."""
     size = np.sqrt(np.where(np.diag(stiffness) > 0.0, np.diag(stiffness), 1.0))
     rounding = 4.0 * stiffness.shape[0] * np.finfo(stiffness.dtype).eps
     return bool(np.all(np.linalg.eigvalsh(stiffness / np.outer(size, size)) > rounding))

@@ -1,4 +1,4 @@
-"""Chunks computed one after another: on the cores of this process, and what is told meanwhile."""
+"""Chunks computed one after another on the cores of this process, and their progress."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def plot_map(
 ) -> Drawn:
     """A map over two axes: of labels (regimes, jam modes) with the folds and torus points of exact jams drawn in, or of values.
 
-    **Arguments**: `measure` its name in the store, the regime where there is one unless said otherwise; `x`, `y` names of axes;
+    **Arguments**: `measure`: its name in the store (default: the regime, if there is one); `x`, `y` names of axes;
     along further axes the middle one is shown. `theory`: whether lines are drawn where exact jams fold or lose their stability;
     they are computed by `branches(scene, exact=True)` where one of the axes is the rotor's speed.
 
@@ -256,7 +256,7 @@ def _axis_label(store: Store, axis: str) -> str:
 
 
 def _measure(store: Store, name: str | None) -> str:
-    """The name of a measure with numbers, the first one unless said otherwise."""
+    """Name of a measure with numbers; default: the first one."""
     plain = [n for n in store.names if not _is_label(store, n)]
     found = name or next(iter(plain or store.names))
     if found not in store.names:

@@ -149,7 +149,7 @@ class Store:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Let nobody else write. **Raises** `InputError` if another process, or thread, writes already."""
+        """Lock the store for writing. **Raises** `InputError` if another process, or thread, writes already."""
         with contextlib.ExitStack() as stack:
             try:
                 is_mine = stack.enter_context(seals.locked(self.path))

@@ -39,7 +39,7 @@ __all__ = ["CaseCount", "Sweep", "open_sweep", "run_study", "sweep"]
 
 
 _MAX_WORKERS = 16
-"""Processes that may be asked for on any machine; on one with many cores, four for each."""
+"""Maximum number of processes on any machine; on a machine with many cores, four for each core."""
 
 
 class CaseCount(NamedTuple):

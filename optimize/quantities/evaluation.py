@@ -53,7 +53,7 @@ Key = tuple[tuple[Case, ...], Target]
 
 
 class TargetRecorder:
-    """Stands for what is known and notes what is asked for."""
+    """Evaluation that records the requested targets."""
 
     def __init__(self) -> None:
         self.keys: list[Key] = []

@@ -174,7 +174,7 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
 
 def _of_their_mode(problem: Problem, point: Point) -> Point:
-    """The designs, without values where a jam is not of the number that was asked for."""
+    """Designs, without values if a jam has another mode number than the requested one."""
     if not problem.keys:
         return point
     same = np.ones(len(point.z), bool)

@@ -78,8 +78,8 @@ class Problem(eqx.Module):
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
     def easy(self) -> Problem | None:
-        """The search that comes first: to leading order and without tolerances, demands that are not to be had so left out;
-        None where this is it, or where the objective is not to be had so."""
+        """First search: to leading order and without tolerances, without demands that have no leading order. None if this is
+        the same search, or if the objective has no leading order."""
         objective = self.objective.easy
         demands = [replace(d, quantity=d.quantity.easy, limit=d.limit.easy) for d in self.demands]
         held = tuple(Held(h.quantity.easy, h.value) for h in self.space.held)
@@ -299,8 +299,8 @@ def _reported(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: S
 
 
 def reported(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | None = None) -> np.ndarray:
-    """Values of quantities (s, q) of some scenes (arrays with a leading axis), NaN where one does not exist; with a `problem`
-    the programs of its search are used as far as they can be."""
+    """Values of quantities (s, q) of some scenes (arrays with a leading axis), NaN if one does not exist; with a `problem`
+    the programs of its search are reused if possible."""
     quantities, leaves = tuple(quantities), jax.tree.leaves(scenes)
     if not quantities:
         return np.zeros((leaves[0].shape[0], 0))

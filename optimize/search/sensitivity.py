@@ -16,7 +16,7 @@ from optimize.search.problem import Problem
 __all__ = ["influences_of", "limits_of", "machines_of", "neighbours"]
 
 _STEP = 0.01
-"""The relative change that influences are told for."""
+"""Relative change of the numbers in influences."""
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: np.ndarray) -> tuple[Limit, ...]:

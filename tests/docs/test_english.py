@@ -26,6 +26,15 @@ def english():
         ("_MOST = 3", "private constant without a noun"),
         ("_POINTS: int = 3", "private constant without a noun"),
         (f"def test_{'a' * 56}():\n    pass", "test name of 61 characters"),
+        ('"""Return the accuracy that was asked\n    for."""', 'phrase "asked for"'),
+        ('raise ValueError("the names are told by the file")', 'phrase "are told"'),
+        ('"""Return the sum, as far as it exists."""', 'phrase "as far as"'),
+        ('x = "force on the bed, N"', 'phrase "force on the bed"'),
+        ('"""Name that is told."""', 'phrase "is told"'),
+        ('"""Values that nobody reads."""', 'phrase "nobody"'),
+        ('"""Demands that are not to be had."""', 'phrase "not to be had"'),
+        ('"""Width, 6.4 unless said otherwise."""', 'phrase "said otherwise"'),
+        ('f"{x}: who asks pays"', 'phrase "who asks"'),
     ],
 )
 def test_each_rule_finds_its_example(english, text, says):
@@ -43,6 +52,7 @@ def test_each_rule_finds_its_example(english, text, says):
         "MOST = 3",
         f"def test_{'a' * 55}():\n    pass",
         'x = "What is no docstring"',
+        '"""Requested accuracy; fast as fast as can be."""',
     ],
 )
 def test_plain_text_is_not_found(english, text):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxvib.sweeps.sweep import Sweep
 
 _QUIET = 10.0
-"""Seconds from one line of progress to the next where nobody looks on."""
+"""Time between lines of progress, s, if the output is no terminal."""
 
 
 @app.command("sweep")
@@ -61,7 +61,7 @@ def sweep(
 @shared
 def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory: bool, output: Output) -> None:
     """Say what is in STORE, which `jaxvib sweep` wrote; --out adds its figures: map.png, shares.png, distribution.png,
-    tornado.png, as far as they fit the study."""
+    tornado.png; only those that fit the study."""
     from jaxvib.sweeps.sweep import open_sweep
 
     found = open_sweep(store)

@@ -232,11 +232,10 @@ def _outputs(model: Model, step: Array, state: State, rates: State) -> tuple[Arr
 
 
 def mean_speeds(times: Array, angle: Array, rate: Array, first: Sequence[int], last: Sequence[int] | None = None) -> Array:
-    """Mean speeds over stretches of samples, each over as many whole turns as there are before its last one, over all of it
-    where there is none.
+    """Mean speeds over stretches of samples, each over the whole turns before its last one, or over the whole stretch.
 
-    **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each stretch,
-    the last of all unless said otherwise. **Returns** (stretches, m) rad/s.
+    **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each stretch
+    (default of the latter: the last of all). **Returns** (stretches, m) rad/s.
     """
     ends = [len(times) - 1] * len(first) if last is None else last
     each = jax.vmap(_mean_speed, in_axes=(None, 1, 1, None, None))

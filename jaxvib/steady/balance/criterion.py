@@ -223,7 +223,7 @@ def criterion_table(result: Criterion) -> dict[str, Any]:
 
 
 def _joined(rows: np.ndarray) -> list[list[float | None]]:
-    """Rows [from, to] without the empty ones, those that touch joined, both as far as rounding can tell."""
+    """Rows [from, to] without the empty ones, those that touch joined, both within rounding."""
     joined: list[list[float]] = []
     close = np.sqrt(np.finfo(rows.dtype).eps)
     for start, end in rows[~np.isnan(rows[:, 0])].tolist():

@@ -156,6 +156,6 @@ def row_of(
     repeats: int,
     dtype: str = "float64",
 ) -> CostRow:
-    """The row of what `call` computes; its `error` is asked for after it was timed."""
+    """Row of the timed `call`, whose `error` is computed afterwards."""
     value, seconds, compiling = timed(call, repeats)
     return CostRow(tier, method, dtype, setting, error(value), seconds, compiling)

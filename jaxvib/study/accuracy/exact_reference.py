@@ -19,7 +19,7 @@ __all__ = ["SLOW_PERIODS", "ExactJam", "collocation_points", "exact_jam", "slow_
 
 
 SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
-"""The measuring window at the end of a run, and the longest run that is asked for, in slow periods."""
+"""Measuring window at the end of a run, and longest run, in slow periods."""
 
 
 class ExactJam(NamedTuple):

@@ -29,7 +29,7 @@ __all__ = ["gradient_precision"]
 _GRADIENT_TOLERANCE = 1e-8
 
 _MOST_NOTED = 2**17
-"""Steps that a run may take whose derivatives are asked for: the end of each is noted."""
+"""Maximum number of steps of a run with derivatives, which records the end of each step."""
 
 _supports = operator.attrgetter("machine.stiffness")
 """The supports' stiffnesses of a scene."""

@@ -51,7 +51,7 @@ _ORBIT_POINTS = (8, 16)
 _AVERAGED = (1e-3, 1e-6)
 
 _SINGLE = 2e-6
-"""The smallest tolerance that single precision is asked for."""
+"""Smallest tolerance in single precision."""
 
 
 @validated
@@ -196,7 +196,7 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
 
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
-        """Computed when it is first asked for, so that the row of the same program tells how long compiling takes."""
+        """Value computed at the first use, so that the row of the same program includes the time of compiling."""
         run = simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
         return np.ravel(np.asarray(read(run), float))
 

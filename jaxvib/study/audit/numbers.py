@@ -48,7 +48,7 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
       where the machine cannot tilt
     - lift: the foundation force over the weight, above which supports that a machine stands on would have to pull
 
-    What the scene holds already is not asked for. **Returns** a list of `NumberRow`.
+    Effects that are in the scene have no row. **Returns** a list of `NumberRow`.
 
     Source: ours; the first is the claim of Artyunin and Sumenkov 2019 that gravity is below 0.5 %.
     """
