@@ -1,4 +1,4 @@
-"""Runs that advance side by side with equal steps, and measurements along each until its end."""
+"""Batches of runs with equal steps, and measurements along each run."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from jaxvib.runtime.compat import fast_diffrax_loop_end
 __all__ = ["BATCH_SIZE", "PARTS", "BatchPlan", "BatchRun", "advance", "pack_batch", "run_in_batch", "stretches"]
 
 BATCH_SIZE = 64
-"""Runs side by side on a core: enough to fill its vectors, few enough that the stages of a step stay in its cache."""
+"""Number of runs in a batch on a core: enough to fill its vectors, few enough for its cache."""
 
 PARTS = 64
-"""Equal parts of a run before its window, over each of which the loads' mean speeds are taken."""
+"""Number of equal parts of a run before its window, with mean speeds of the loads over each."""
 
 
 _DOUBLINGS = 40
-"""Implicit steps in the first one, each twice as long as that before it: the shortest is 1e-12 of it."""
+"""Number of implicit steps in the first part, each twice as long as the previous one; the shortest is 1e-12 of the part."""
 
 
 @fast_diffrax_loop_end()
@@ -63,7 +63,8 @@ def stretches(
 ) -> tuple[Held, Array, Array]:
     """Beginnings of stretches of the same `length`, s, the length of each, and the integrator's state at the first.
 
-    Implicit steps do not resolve how loads are dragged along at the start: the first one is taken in steps that double.
+    Implicit steps do not resolve the acceleration of loads by drag at the start; therefore the first stretch has doubling
+    steps.
     """
     begins, lengths = length * jnp.arange(number, dtype=length.dtype), jnp.full(number, length)
     if not implicit:
@@ -81,14 +82,14 @@ def stretches(
 def pack_batch(
     field: Callable[[Array, State], State], state: State, single: bool, has_common_turns: bool, *, implicit: bool
 ) -> PackedSystem:
-    """The equations of many runs that advance together; an implicit method takes the numbers of each run as a vector."""
+    """Equations of a batch of runs; an implicit method takes the numbers of each run as a vector."""
     if implicit:
         return PackedSystem(field, state, solver=Rodas4())
     return PackedSystem(field, state, wrapped=single, has_common_turns=has_common_turns, batch=True)
 
 
 class BatchPlan(NamedTuple):
-    """Steps of runs that advance side by side, the same for all of them.
+    """Steps of a batch of runs, equal for all runs.
 
     **Attributes**: `until` s, the end; `window` s, the stretch before it that is measured; `samples` states in it, evenly
     apart; `each` steps in each of the `PARTS` before it; `between` steps from one sample to the next; `implicit` true if decay
@@ -121,9 +122,9 @@ class BatchRun(NamedTuple):
 
 
 def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
-    """Integrates the full equations from a state with equal steps, and measures the window at the end as `simulate` does.
+    """Integrate the full equations from a state with equal steps, and measure the window at the end like `simulate`.
 
-    Under `vmap` all runs make the same steps, so that none waits for another and no result depends on the runs beside it.
+    Under `vmap` all runs take the same steps: none waits for another, and no result depends on the other runs.
     """
     dtype = state.displacement.dtype
     single, has_common_turns = wrap_angles(scene, dtype)

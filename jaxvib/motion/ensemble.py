@@ -193,7 +193,7 @@ def ensemble(
     last, load_speed, apart, finite, detached, taken = ends
     error = np.full(plan.allowed.shape, np.inf if estimate else np.nan, plan.end.dtype)
     if plan.is_compared:
-        # The share that a method of order 3 would leave of the difference; this one is of order 8.
+        # Share of the difference that a method of order 3 would leave, a safe value for this method of order 8.
         error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
@@ -218,7 +218,7 @@ def _run_batch(
     equations: Equations,
     implicit: bool,
 ) -> _Ends:
-    """Runs side by side: those of their numbers that are their `own` with a leading axis, and what they have in `common`."""
+    """Integrate a batch of runs with numbers of their `own`, with a leading axis, and `common` numbers."""
 
     def one(own: list[Array]) -> _Ends:
         mine, ours = iter(own), iter(common)
@@ -229,10 +229,10 @@ def _run_batch(
 
 
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
-    """A run in a few parts of so many equal steps each, and one for every further count of them, all by one program.
+    """Integrate a run in a few parts with equal steps, and once more for each further count of steps, by one program.
 
-    **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
-    there, whether it stayed finite, which loads did not press on their track, the steps it took.
+    **Returns** for the first run: the final state, the mean speeds of the loads over the last part, the distance of the final
+    state of the second run, True if it stayed finite, the loads that lost contact with their track, and the number of steps.
     """
     single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
     watched = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
@@ -262,7 +262,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     last, other = (State(each.displacement, each.velocity, exciters=each.exciters) for each in (last, other))
     angle, _ = turning_angles(scene, lambda: length * jnp.arange(ENSEMBLE_PARTS - 1, ENSEMBLE_PARTS + 1), pair)
     finite, apart = is_finite(last), scaled_error(last, other, error_scale(last, natural_units(scene)))
-    # A run whose coarser one did not stay finite has an error that nobody knows.
+    # The error of a run is unknown (infinite) if the coarser run did not stay finite.
     apart = jnp.where(finite & ~is_finite(other), jnp.inf, apart)
     return last, (angle[1] - angle[0]) / length, apart, finite, detached, taken[0]
 
@@ -281,7 +281,7 @@ class _StateWithDetachment(State):
 
 
 class _FieldWithDetachment(eqx.Module):
-    """The equations of motion, and beside them missing' = max(-N, 0)."""
+    """Equations of motion extended by missing' = max(-N, 0)."""
 
     equations: Callable[[Array, State], State]
     scene: Scene

@@ -37,18 +37,18 @@ if TYPE_CHECKING:
 __all__ = ["Growth", "GrowthStatus", "growth"]
 
 _THOUSANDFOLD, _DOUBLED = math.log(1e3), math.log(2.1)
-"""Logarithms of growth over the later half of a run: exponential beyond doubt; and the most that a growth in proportion to
-time can reach, with a margin."""
+"""Logarithms of growth over the later half of a run: smallest value that is certainly exponential; largest value of growth in
+proportion to time, with a margin."""
 
 _UNSEEN = math.log(1.01)
-"""Logarithm of a growth over the later half of a run that is not told from the errors of the integration."""
+"""Largest logarithm of growth over the later half of a run that integration errors can cause."""
 
 _FADING = 0.85
-"""Largest ratio of the growth in the last quarter of a run to that in the quarter before it for a growth that is not
-exponential: in proportion to time it is 0.71, exponentially 1."""
+"""Largest ratio of growth in the last quarter of a run to that in the quarter before, for growth that is not exponential;
+growth in proportion to time has 0.71, exponential growth 1."""
 
 _RETURNED = 1e-2
-"""Distance of a motion from where it was at which it has returned, relative to the farthest that it went in between."""
+"""Distance from a previous state at which a motion has returned to it, relative to the largest distance in between."""
 
 _TURNS, _SAMPLES = 3.0, 4096
 """Turns of the slowest of rotor and loads in which a motion must return to count as periodic, and samples of that stretch."""
@@ -203,7 +203,7 @@ def growth(
 def _judged(late: np.ndarray) -> str:
     """Name of the `GrowthStatus` for logarithms `late` (n,) of the growth in each stretch of the later half of a run.
 
-    Periodic motions are not told from others here: "chaotic" stands for "unstable" too.
+    Periodic motions are not distinguished here: "chaotic" includes "unstable".
     """
     grown, error = float(np.sum(late)), _sum_error(late)
     first, last = np.split(late, [late.size // 2])
@@ -221,8 +221,8 @@ def _sum_error(values: np.ndarray) -> float:
 
         s^2 = n c_0 + 2 (n - 1) c_1
 
-    c_k their autocovariances; at least that of one value. A motion whose phase differs from one end of a stretch to the next
-    gives logarithms of growth that are large and cancel each other.
+    with the autocovariances c_k; at least that of one value. If the phase of the motion differs between ends of stretches,
+    logarithms of growth are large and cancel each other.
     """
     off = values - np.mean(values)
     each = float(np.sum(off**2)) / (values.size - 1)
@@ -253,7 +253,7 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
 
 
 def _distance(a: State, b: State, scale: State) -> float:
-    """Euclidean distance of two states, each number relative to its part's scale."""
+    """Euclidean distance of two states, with each number in units of the scale of its part."""
     parts = jax.tree.leaves(jax.tree.map(lambda x, y, s: np.sum(((np.asarray(y) - np.asarray(x)) / s) ** 2), a, b, scale))
     return math.sqrt(float(sum(parts)))
 

@@ -45,14 +45,14 @@ WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
 
 PER_TURN = 16
-"""Fewest samples in a turn of the rotor: the interpolant between them is then good to 1e-7."""
+"""Minimum number of samples in a turn of the rotor; the interpolant between them then has an error of 1e-7."""
 
 _UNBOUNDED = 1e8
-"""Factor of the start, or of the natural units, that no bounded motion reaches."""
+"""Factor on the initial displacement, or on the natural units, beyond which a motion is unbounded."""
 
 
 class StepControl(eqx.Module):
-    """Choice of steps: to `tolerance`, `max_steps` of them at most, or `steps` of them, all equal (scalars)."""
+    """Choice of steps: by a `tolerance` with at most `max_steps`, or `steps` equal steps (scalars)."""
 
     tolerance: Array | np.ndarray | None = None
     steps: Array | np.ndarray | None = None
@@ -74,7 +74,7 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
     if control.steps is not None:
         return diffrax.ConstantStepSize()
     assert control.tolerance is not None
-    # The error of an angle is absolute: relative to its ever-growing value, it would let a long run lose its phase.
+    # The error of an angle is absolute: relative to the growing angle, it would let a long run lose its phase.
     one, zero, dtype = jnp.ones(()), jnp.zeros(()), state.displacement.dtype
 
     def relative_of(own: ExciterState) -> ExciterState:
@@ -95,7 +95,7 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
 
 
 def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
-    """The controller, made to step onto the times at which the drive's acceleration jumps; fixed steps are left alone."""
+    """Controller that steps onto the times at which the acceleration of the drive jumps; fixed steps are unchanged."""
     jump_ts = [t for exciter in scene.exciters for t in exciter.drive.jump_ts()]
     if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
         return controller
@@ -103,7 +103,7 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
 
 
 def effects_rate(scene: Scene) -> Array:
-    """The fastest that effects add to the loads' motion, see `Effect.fastest_rate`; 0 where there is none."""
+    """Fastest rate that effects add to the motion of loads, see `Effect.fastest_rate`; 0 without such effects."""
     found, zero = [], jnp.zeros_like(scene.exciters[0].drive.speed)
     for exciter in scene.exciters:
         if exciter.loads is not None:
@@ -129,8 +129,8 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 
 
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
-    """True if angles are kept within a turn, and True if all loads' are so by the same turns: single precision, loads that
-    touch."""
+    """True if angles are wrapped into a turn (single precision), and True if the angles of all loads are wrapped by the same
+    turns (loads in contact)."""
     return jnp.dtype(dtype).itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 
@@ -156,7 +156,7 @@ def integrate(
     scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
     """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured`."""
-    # A start that does not exist (a jam mode absent in one run of a batch) must not keep the others waiting.
+    # A missing start (a jam mode absent in one run of a batch) must not delay the other runs.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
@@ -194,7 +194,7 @@ def integrate(
         )
     numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
-    # A run that did not end has no window; the state where it stopped says whether it was on its way to infinity.
+    # A run that did not end has no window; the state at which it stopped shows whether it was diverging.
     ended = solution.result == diffrax.RESULTS.successful
     bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
@@ -240,7 +240,7 @@ def _steps(
         if control.steps is not None:
             first = end / jnp.asarray(control.steps)
         if control.tolerance is not None:
-            # By the order 8 of the error; runs to two tolerances then differ from their first step on.
+            # Scaled by the order 8 of the error, so that runs with two tolerances differ from their first step on.
             first = 0.4 * jnp.asarray(control.tolerance) ** (1.0 / 9.0) / fastest
         return first, _controller(motion, state, unit, control)
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
@@ -257,7 +257,8 @@ def _is_coincident(angles: list[Array]) -> Array:
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:
-    """True if the carrier moves so far beyond its start and its natural units that only an unbounded motion does."""
+    """True if the displacement of the carrier exceeds its start and its natural units by `_UNBOUNDED`, as unbounded motions
+    do."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
     beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
     return beyond[0] | beyond[1] | ~is_finite(last)
@@ -265,7 +266,7 @@ def _diverged(unit: State, first: State, last: State) -> Array:
 
 def _status(result: diffrax.RESULTS, bounded: Array) -> RunStatus:
     ended = RunStatus.where(bounded, RunStatus.done, RunStatus.not_finite)
-    # A step that is refused until it is none has numbers in it that are not finite.
+    # A step that is rejected until its length is zero contains numbers that are not finite.
     failed = RunStatus.where(result == diffrax.RESULTS.dt_min_reached, RunStatus.not_finite, RunStatus.no_step)
     failed = RunStatus.where(result == diffrax.RESULTS.max_steps_reached, RunStatus.max_steps_reached, failed)
     failed = RunStatus.where(bounded, failed, RunStatus.not_finite)
@@ -273,7 +274,7 @@ def _status(result: diffrax.RESULTS, bounded: Array) -> RunStatus:
 
 
 def _stages(solver: diffrax.AbstractSolver) -> int:
-    """Evaluations of the vector field in a step; 0 for a method that does not say."""
+    """Evaluations of the vector field in a step; 0 for a method that does not state them."""
     tableau = getattr(solver, "tableau", None)
     return 0 if tableau is None else tableau.num_stages - tableau.fsal
 
@@ -284,11 +285,11 @@ def is_finite(state: Any) -> Array:
 
 
 _MAX_TURNS = 1e15
-"""Turns that are counted one by one in double precision."""
+"""Largest number of turns that double precision counts one by one."""
 
 
 def whole_turns(scene: Scene, stretch: float) -> float:
-    """The longest time within `stretch`, s, after which a rotor of constant speed is where it was; a turn at least."""
+    """Longest time within `stretch`, s, that is a whole number of turns of a rotor with constant speed; at least one turn."""
     turn = 2.0 * math.pi / float(scene.drive.speed)
     turns = stretch / turn
     if turns > _MAX_TURNS:

@@ -1,6 +1,6 @@
 """Plans of runs: choices that depend on numbers of a scene, taken on the host before a program is traced.
 
-Only this module asks which numbers are known. The method and static sizes (samples, steps, stretches) follow from known
+Only this module tests which numbers are known. The method and static sizes (samples, steps, stretches) follow from known
 numbers; under a JAX transformation sizes have fixed values.
 """
 
@@ -52,18 +52,18 @@ __all__ = [
 Control = StepControl | diffrax.AbstractStepSizeController
 
 MAX_STEPS = 2**31 - 1
-"""The largest limit of steps."""
+"""Largest value of `max_steps`."""
 
 _UNKNOWN_STEPS, _UNKNOWN_SAMPLES = 2**20, 2000
-"""Limit of steps, and samples, of a run whose length or speeds have no value yet."""
+"""Maximum number of steps, and samples, of a run with unknown length or speeds."""
 
 _FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
 
 _IMPLICIT_SHARE = 16.0
-"""Times the usual limit of steps that a run by the implicit method is allowed."""
+"""Factor on the maximum number of steps for runs by the implicit method."""
 
 _STRETCH_TURNS = 2.0e4
-"""Turns after which single precision no longer resolves time; longer runs are cut into stretches."""
+"""Number of turns after which single precision no longer resolves time; longer runs are divided into stretches."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def plan_run(
     if max_steps is None:
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_SHARE) * fastest, end)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
-        # Derivatives may be asked for; those of the written-out step take several times as long to compile.
+        # The caller may differentiate, and derivatives of the unrolled step take several times as long to compile.
         forward = isinstance(adjoint, diffrax.ForwardMode)
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
     kept, most = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
@@ -197,7 +197,7 @@ def _enough_samples(scene: Scene, end: Array) -> int:
 
 
 def _sample_size(scene: Scene) -> float:
-    """Bytes of a kept state with its forces, held three times while it is computed."""
+    """Size of a kept state with its forces in bytes, times three copies during the computation."""
     structure = scene.machine.structure()
     numbers = 2 * structure.mass.shape[0] + structure.foundation_stiffness.shape[0] + 1
     for exciter in scene.exciters:
@@ -289,7 +289,7 @@ def plan_ensemble(
     fastest, decay = _rates(scenes)
     number_of_steps, implicit = 0 if steps is None else count(steps.number, "steps"), False
     if known:
-        # Runs that are refused do not decide the steps of the others.
+        # Refused runs do not influence the steps of the others.
         most = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
         most = most if bool(np.any(allowed)) else [1.0, 0.0]
         step, implicit = steps_of(
@@ -300,7 +300,7 @@ def plan_ensemble(
     coarse = -(-each // 2)
 
     leaves, structure = jax.tree.flatten((scenes, states))
-    # A number that all runs share stays one number: it is not read anew for each. One at least says how many runs there are.
+    # A number that all runs share stays a single number. At least one array defines the number of runs.
     is_shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in leaves]
     is_shared[0] = is_shared[0] and not all(is_shared)
     return EnsemblePlan(

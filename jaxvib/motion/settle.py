@@ -33,26 +33,26 @@ from jaxvib.units.known import require_known
 __all__ = ["settle"]
 
 _REMEMBERED = 32
-"""Stretches, of 100 slow periods, by which a motion that does not repeat itself is judged."""
+"""Number of stretches, of 100 slow periods each, on which the decision about a steady mean is based."""
 
 _SCATTER = 3.6
-"""The means over the four quarters of these lie within so many of their standard errors where they are the same (95 %)."""
+"""Largest difference of the means over the four quarters of these that counts as chance, in standard errors (95 %)."""
 
 _AWAY = 10.0
-"""A settled motion may still be so many drifts away from its end."""
+"""Largest distance of a settled motion from its steady state, in units of the drift."""
 
 _CREEPS = 4
-"""Stretches by which loads that creep along balanced arrangements are judged."""
+"""Number of stretches on which the decision about creeping loads is based."""
 
 _EVENLY = 0.05
-"""The angles by which loads creep in two of these differ by less, relative to the largest."""
+"""Largest relative difference of the angles by which loads creep in two of these."""
 
 _NEUTRAL = 0.01
-"""Change of the residual unbalance, relative to that of the angles in rad, below which loads creep along balanced arrangements:
-in any other direction it is 1 divided by the number of loads, or more."""
+"""Largest change of the residual unbalance, relative to that of the angles in rad, of loads that creep along balanced
+arrangements; in any other direction it is at least 1 divided by the number of loads."""
 
 _FALLS = -3.0
-"""A drift whose logarithm falls by so many standard errors of its slope is not there to stay."""
+"""Slope of the logarithm of the drift, in standard errors, beyond which the drift is decreasing."""
 
 
 @validated
@@ -161,7 +161,7 @@ def _plan_settle(
     count(periods, "periods")
     double = scene.drive.speed.dtype.itemsize >= 8
     usual = 1e-6 if double else 1e-3
-    # An imbalance goes on from where it was: the rotor is there after whole turns.
+    # Stretches of whole turns: an imbalance continues at the angle at which it was.
     length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
     start = ("rest" if mode is None else "jam") if start is None else start
     is_jam = isinstance(start, str) and start == "jam"
@@ -195,7 +195,7 @@ def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
         drifts.append(float(run.drift))
         if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _AWAY * plan.drift:
             judged = _judged(run, "done")
-            # Loads that are not at exactly one angle leave an unstable motion by themselves.
+            # Loads that are not at exactly one angle leave an unstable motion without a test.
             if is_coincident or status_name(judged.status) == "done":
                 return judged, True
         if plan.remembered is not None:
@@ -224,7 +224,7 @@ def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
 
 
 def _slowest_decay(scene: Scene) -> float:
-    """The slowest rate at which free vibrations of the carrier with its loads decay, 1/s; 0 if one of them does not."""
+    """Smallest decay rate of the free vibrations of the carrier with its loads, 1/s; 0 if one of them does not decay."""
     mass, stiffness, damping = (np.asarray(matrix, float) for matrix in _matrices(scene))
     flow = np.linalg.solve(mass, -np.concatenate([stiffness, damping], axis=1))
     poles = np.linalg.eigvals(np.concatenate([np.eye(len(mass), 2 * len(mass), len(mass)), flow]))
@@ -236,9 +236,9 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
     """Relative distance of a motion from its steady state, estimated from the drifts of its stretches so far.
 
     A distance that decays at the rate a falls by 1 - exp(-a T) of itself from one half of the measuring window to the other,
-    T apart: that fall is the drift. Free vibrations that beat with the jam make some drifts small by chance, so the largest of
-    three counts unless they decay within a window. The rate is the carrier's slowest `decay`, or if it has none the one at
-    which drifts fall from stretch to stretch, of the time `stretch` each.
+    T apart; this decrease is the drift. Free vibrations that beat with the jam make some drifts small by chance; therefore the
+    largest of three counts unless the vibrations decay within a window. The rate is the carrier's slowest `decay`, or if it has
+    none the one at which drifts fall from stretch to stretch, of the time `stretch` each.
     """
     half, recent = 0.5 * float(np.ptp(np.asarray(run.window.time))), max(drifts[-3:])
     if decay == 0.0 and len(drifts) >= 6 and recent > 0.0:
@@ -270,7 +270,7 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
 
 
 def _is_creeping(regimes: Sequence[Regime]) -> bool:
-    """True if loads balance the rotor in each of some stretches, and creep evenly along arrangements that do so."""
+    """True if loads balance the rotor in each of some stretches and creep evenly along balanced arrangements."""
     if len(regimes) < _CREEPS or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
         return False
     phase = np.array([np.asarray(regime.phase) for regime in regimes])
@@ -282,7 +282,7 @@ def _is_creeping(regimes: Sequence[Regime]) -> bool:
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:
-    """Check that the loads still turn at the speed of the jam mode in which they started, and not at that of another one."""
+    """Check that the loads still turn at the speed of the jam mode in which they started."""
     modes = jam_modes(scene)
     speeds = np.asarray(modes.omega)
     away = {k: abs(float(speeds[modes.row(k)]) - float(run.omega)) for k in modes.mode_numbers()}

@@ -155,7 +155,7 @@ def run_planned(plan: RunPlan, *, throw: bool) -> Run:
 
 
 def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:
-    """Return a run by these steps, in as many stretches as the plan has; measured if that is wanted."""
+    """Return a run with these steps, in the stretches of the plan; measured if requested."""
     if plan.stretches > 1:
         return _run_in_stretches(plan, control, is_measured=is_measured)
     return _run_stretch(plan, plan.end, plan.state, control, is_measured=is_measured)
@@ -220,7 +220,7 @@ def _sum(counts: list[Array]) -> Array:
 
 
 _COARSER = 100.0
-"""Times the tolerance of a run that of the second run is, whose difference to the first is the error estimate."""
+"""Ratio of the tolerances of the second run, for the error estimate, and the first."""
 
 
 def _coarser(control: StepControl) -> StepControl:
@@ -246,7 +246,7 @@ def _run_with_estimate(plan: RunPlan) -> Run:
 
 
 _ATTEMPTS = 6
-"""Runs that an `accuracy` may take before it is given up."""
+"""Maximum number of runs for an `accuracy`."""
 
 
 def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
@@ -266,7 +266,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
         radians = plan.fastest * latest.window.time[-1]
         if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, plan.scene, latest.steps, radians)) > accuracy:
             break
-        # A little more than what is missing: the error shrinks a little slower than the tolerance.
+        # Slightly smaller than proportional, since the error decreases more slowly than the tolerance.
         share = min(max(0.2 * (accuracy / float(run.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(run.error)) else 1e-2
         before, coarser = latest, control
         control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), dtype))
@@ -281,7 +281,7 @@ def _compared(
     coarser: StepControl,
     before: Array | np.ndarray,
 ) -> Run:
-    """Return the finer run with its estimated error and the cost of both: so many evaluations were made `before` it."""
+    """Return the finer run with its estimated error and the cost of both runs; `before`: evaluations of previous runs."""
     theirs, counted = (coarse.window.state, coarse.status), (fine.evaluations, before)
     error, evaluations = _estimated(plan.scene, plan.fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
@@ -291,7 +291,7 @@ def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
     """Share of the difference between two runs that is the error of the finer one, if the motion is smooth.
 
     With a method of order 8 the error falls with the power 8/9 of the tolerance and the power 8 of the number of steps. The
-    powers used here are 0.45 and 3, so that the estimate errs upward.
+    powers used here are 0.45 and 3, which makes the estimate conservative.
     """
     if fine.steps is not None and coarse.steps is not None:
         return (coarse.steps / fine.steps) ** 3
@@ -325,8 +325,7 @@ def _estimated(
 
 
 def last_state(scene: Scene, run: Run) -> State:
-    """State at the end of a run under a constant speed, from which the run can go on: angles within a turn keep their
-    digits."""
+    """State at the end of a run at constant speed, for its continuation, with angles within a turn to keep their digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, has_common_turns = wrap_angles(scene, last.displacement.dtype)
 

@@ -149,7 +149,7 @@ def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | N
 
 @cached
 def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: Array) -> State:
-    """The motion of the jam in that row of all of them, the loads at these angles."""
+    """State in the jam of the given row, with the loads at the given angles."""
     turned = displacement[row] * jnp.exp(1j * jnp.mean(angle))
     return State(turned.real, -omega[row] * turned.imag, (angle,), (jnp.full_like(angle, omega[row]),))
 
@@ -226,7 +226,7 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, turning: Turning) 
 def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
     """Return the scene, for the start "spin_up" with a drive that rises over the time `spin_up` (s; default: half of `end`).
 
-    **Raises** `InputError` for a time that goes with another start or is longer than the run, and for another drive.
+    **Raises** `InputError` for a time with another start, for a time longer than the run, and for another drive.
     """
     if not (isinstance(start, str) and start == "spin_up"):
         if spin_up is not None:

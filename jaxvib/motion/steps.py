@@ -84,11 +84,11 @@ class EqualSteps:
 
 
 StepChoice = Tolerance | Accuracy | EqualSteps | diffrax.AbstractStepSizeController
-"""All that `stepsize_controller` may be."""
+"""Types of `stepsize_controller`."""
 
 
 def require(chosen: object, *kinds: type) -> None:
-    """**Raises** `InputError` for a choice of steps that is of none of these kinds."""
+    """**Raises** `InputError` for a choice of steps of another type."""
     if chosen is not None and not isinstance(chosen, kinds):
         names = {diffrax.AbstractStepSizeController: "a step size controller of diffrax"}
         allowed = ", ".join(names.get(kind, f"{kind.__name__}(...)") for kind in kinds)
@@ -96,14 +96,14 @@ def require(chosen: object, *kinds: type) -> None:
 
 
 def small_number(value: float, name: str, time: Array, least: float) -> float:
-    """A tolerance or an accuracy, which the precision of `time` can deliver: at least so many of its roundings.
+    """Validate a tolerance or an accuracy: at least the given number of roundings in the precision of `time`.
 
-    **Raises** `InputError` for what is none.
+    **Raises** `InputError` for other values.
     """
     precision = float(jnp.finfo(time.dtype).eps)
     plain = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not (plain and least * precision <= value < 1.0):
-        # 5 % more, so that what is said, two digits, is not below what is allowed.
+        # 5 % more, so that the value in the message, rounded to two digits, is allowed.
         raise InputError(
             name,
             f"is {quoted(value)}; in {time.dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"

@@ -1,4 +1,4 @@
-"""Decay that is faster than the motion: how fast it is, and which method and steps a run then takes."""
+"""Decay that is faster than the motion: its rate, and the method and steps of runs with it."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from jaxvib.runtime.programs import cached
 __all__ = ["IMPLICIT_PER_RADIAN", "advice", "fastest_decay", "is_unresolved", "steps_of", "stiff_solver"]
 
 _RESOLVED = 3.0
-"""Decay in an explicit step that leaves the method accurate; from about 6 on it diverges."""
+"""Largest decay in an explicit step that leaves the method accurate; beyond about 6 it diverges."""
 
 _STIFF = 100.0
-"""Decay so many times as fast as the motion is left to the implicit method: explicit steps would cost more."""
+"""Ratio of the rates of decay and motion beyond which the implicit method costs less than explicit steps."""
 
 IMPLICIT_PER_RADIAN = 32.0
 """Equal implicit steps in a radian of the fastest motion; order 4 then leaves about 1e-7."""
 
 _MAX_IMPLICIT = 64
-"""Numbers of a state up to which the implicit method's dense matrices are worth it."""
+"""Largest size of a state for which the dense matrices of the implicit method pay off."""
 
 
 @cached
 def fastest_decay(scene: Scene) -> Array:
-    """The fastest rate, 1/s, at which loads decay by their drag, or the carrier by its damping.
+    """Fastest decay rate, 1/s, of the loads by drag and of the carrier by damping.
 
         max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j),      the largest eigenvalue of M^-1 C
 
-    Q' is the derivative of a load's resistance by its rate, H its inertia, mu the trace of B M^-1 B^T: the carrier gives way to
-    the loads and so lessens their inertia. Explicit steps must resolve this rate, however slow the motion is.
+    Q' is the derivative of the resistance of a load by its rate, H its inertia, mu the trace of B M^-1 B^T: the motion of the
+    carrier reduces the effective inertia of the loads. Explicit steps must resolve this rate, even if the motion is slow.
     """
     scene = jax.lax.stop_gradient(scene)
     linear = linear_model(scene)
@@ -70,7 +70,7 @@ def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
 
 
 def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:
-    """The implicit method for a scene of known numbers that decays too fast for explicit steps, otherwise None."""
+    """Implicit method if the decay of a scene with known numbers is too fast for explicit steps, otherwise None."""
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
     return Rodas4() if size <= _MAX_IMPLICIT and float(fastest_decay(scene)) > _STIFF * float(fastest) else None
 
@@ -94,7 +94,7 @@ def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.
 
 
 def advice(scene: Scene) -> str:
-    """The cause of short steps of a run, as the end of a sentence; empty if decay is no faster than the motion."""
+    """Cause of short steps of a run, as the end of a sentence; empty if the decay is not faster than the motion."""
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""

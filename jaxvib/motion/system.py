@@ -1,5 +1,4 @@
-"""A vector field and a state in the form in which they are integrated fastest: its equations on single numbers, where it is
-small."""
+"""Vector field and state in the form for the fastest integration: equations on single numbers if the state is small."""
 
 from __future__ import annotations
 
@@ -26,26 +25,26 @@ from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
 __all__ = ["PackedSystem"]
 
 Held: TypeAlias = PyTree[Array]
-"""State as the integrator holds it: the numbers of a state; where angles are wrapped a pair, those and the turns done."""
+"""State of the integrator: the numbers of a state, or if angles are wrapped a pair of these and the counted turns."""
 
 _TURN = 2.0 * math.pi
 
 _LONG_ARRAY = 4
-"""Number of entries in an array of the state from which on derivatives take less time on arrays than on numbers, and all
-compiles sooner; runs take as long, from 8 entries on two thirds of it."""
+"""Smallest number of entries in an array of the state for which arrays are used instead of single numbers: derivatives take
+less time and everything compiles sooner; runs take the same time, from 8 entries on two thirds."""
 
 _MOST_WRITTEN = 8
 """Largest number of numbers in a state for which the stages of the method are written out one after another."""
 
 
 class PackedSystem(eqx.Module):
-    """Translates between a `State` and what the integrator holds: a vector of its numbers, or a tuple of them.
+    """Conversion between a `State` and the state of the integrator: a vector of its numbers, or a tuple of them.
 
-    The method whose stages are written out takes a tuple, which it keeps where a processor computes; any other takes a vector,
-    of which diffrax saves, compares and carries one array in place of many.
+    The unrolled method takes a tuple, whose numbers stay in processor registers. Any other method takes a vector, since diffrax
+    then saves, compares and carries one array instead of many.
 
-    Where angles are wrapped the integrator holds each within a turn, and beside it the whole turns it has done: a long run in
-    single precision keeps its phase, for an angle of a million radians has no digits left of where in a turn it is.
+    If angles are wrapped, the integrator has each angle within a turn and the number of whole turns. A long run in single
+    precision keeps its phase this way: an angle of a million radians has no digits left for the place in a turn.
 
     **Arguments**: the vector field; a state; `wrapped` whether angles are; `has_common_turns` whether all loads' angles are
     wrapped by the same turns, so that their differences stay; `batch`: true if many runs advance together; the `solver` that
@@ -84,44 +83,44 @@ class PackedSystem(eqx.Module):
         self.size = sum(leaf.size for leaf in leaves)
         self.args, given = field, (jnp.zeros((), leaves[0].dtype), state, field)
         is_written = self.size <= _MOST_WRITTEN if solver is None else isinstance(solver, UnrolledDopri8)
-        # Across the angles of many loads vectors are as full as across runs.
+        # Vectors over the angles of many loads are as full as vectors over runs.
         is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG_ARRAY)
         program = scalarized_program(_rates_of, *given) if is_small else None
         self.is_scalarized = program is not None
         self.program = arrays_program(_rates_of, *given) if program is None else program
         if program is not None:
-            # Entry by entry already here, so that the time loop has no arrays to take apart.
+            # Split into entries here, so that the time loop contains no arrays.
             self.args = scalars_of(field)
         self.is_on_scalars = self.is_scalarized and (batch or is_written)
         self.fences = self.is_on_scalars and solver is None
 
     @property
     def term(self) -> diffrax.ODETerm:
-        """The equations of motion on what the integrator holds."""
+        """Equations of motion for the state of the integrator."""
         return diffrax.ODETerm(self._rates)
 
     def method(self, adjoint: diffrax.AbstractAdjoint | None = None) -> diffrax.AbstractSolver:
         """The method of order 8 in the form that is fastest here, with the derivatives of `adjoint`, or by step replay."""
-        # Without the equations' numbers: a method holds no traced arrays.
+        # Without the numbers of the equations, since a method must not hold traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
         if self.size <= _MOST_WRITTEN:
             return UnrolledDopri8(batch=self.batch, wrap=wrap)
         return LoopDopri8(reuse=adjoint is None or isinstance(adjoint, diffrax.ForwardMode), wrap=wrap)
 
     def pack(self, state: State) -> Held:
-        """A state (or a tree like it) as the integrator holds it."""
+        """Convert a state (or a tree like it) to the form of the integrator."""
         y = tuple(scalars_of(state)) if self.is_on_scalars else ravel(state)
         return (y, jax.tree.map(jnp.zeros_like, y)) if self.wrapped else y
 
     def unpack(self, held: Held) -> State:
-        """States along a leading axis, from what the integrator held then; wrapped angles count from the first one's turn."""
+        """States along a leading axis from those of the integrator; wrapped angles count from the turn of the first one."""
         if not self.wrapped:
             return self._state(held)
         y, turns = held
         return self._state(_turned(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
 
     def _wrap(self, held: Held) -> Held:
-        """Takes whole turns out of the angles and counts them."""
+        """Move whole turns from the angles to their counts."""
         y, turns = held
         is_angle, leader = self._angles()
         lead = tuple(y[k] for k in leader) if self.is_on_scalars else y[leader]
@@ -177,7 +176,7 @@ class PackedSystem(eqx.Module):
 
 
 def _turned(y: Held, turns: Held, sign: float) -> Held:
-    """Numbers changed by whole turns, 2 pi in two parts: the rounding of 2 pi would add up to a drift."""
+    """Add whole turns to numbers, with 2 pi in two parts, since the rounding of 2 pi would accumulate."""
 
     def turned(x: Array, n: Array) -> Array:
         high = np.asarray(_TURN, x.dtype)

@@ -1,4 +1,4 @@
-"""The regime of a motion: swinging, jammed, balanced, ..., with the evidence."""
+"""Regime of a motion (swinging, jammed, balanced, ...) with the evidence."""
 
 from __future__ import annotations
 
@@ -33,14 +33,15 @@ if TYPE_CHECKING:
 __all__ = ["REGIMES", "Regime", "RegimeName", "regime"]
 
 _SAME_SPEED = 3e-3
-"""Speeds of two loads, of a load and the rotor, or of one load early and late, that differ by less count as one."""
+"""Relative difference below which two speeds count as equal: of two loads, of a load and the rotor, of one load early and
+late."""
 
 _LOCKED = 0.1
-"""Relative phases that move by less than this between two halves of the window count as fixed, rad."""
+"""Change of relative phases between two halves of the window below which they count as fixed, rad."""
 
 _STEADY_SLIP = 0.02
-"""Slips of a load behind the rotor in two halves of the window that differ by less, relative, count as one: the load is jammed,
-however small its slip is."""
+"""Relative difference of the slip of a load in two halves of the window below which the slip is steady: the load is jammed,
+even with a small slip."""
 
 _BALANCED = 0.02
 """Residual unbalance below which loads count as balancing the rotor, relative to the loads' own at one angle."""
@@ -58,7 +59,7 @@ class RegimeName(eqx.Enumeration):
 
 
 REGIMES = enumeration_names(RegimeName)
-"""The words for the members of `RegimeName`, in their order."""
+"""Short names of the members of `RegimeName`, in their order."""
 
 
 class Regime(Result):
@@ -118,7 +119,7 @@ class Regime(Result):
         speeds = ", ".join(f"{float(w):.5g}" for w in self.load_speed)
         evidence = [f"loads {speeds} rad/s, rotor {float(self.rotor_speed):.5g} rad/s, ripple {float(self.ripple):.2g} rad/s"]
         if bool(self.name == RegimeName.jammed):
-            # A mode that rises to the rotor's speed has its resonance behind it.
+            # A mode that rises to the rotor speed lies beyond its resonance.
             where = "beyond" if int(self.mode) == 2 * int(self.resonance) + 1 else "by"
             near = f"{where} resonance {int(self.resonance)} at {float(self.resonance_speed):.5g} rad/s (mode {int(self.mode)})"
             evidence += [near, pattern]
@@ -131,7 +132,7 @@ class Regime(Result):
 
     def _remainder(self) -> str:
         share = float(self.unbalance)
-        # Loads have no more than their own unbalance: what exceeds it is the rotor's.
+        # The loads have at most their own unbalance; the excess belongs to the rotor.
         if share > 1.005:
             return f"the rotor's imbalance is more than the loads can balance: {share:.2g} times their unbalance is left"
         return f"{100.0 * share:.3g} % of the loads' unbalance is left"
@@ -197,7 +198,8 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED
     behind = behind & (jnp.abs(slips[1] - slips[0]) < _STEADY_SLIP * jnp.abs(slips[1] + slips[0]) / 2.0)
     with_rotor = (jnp.abs(speed - rotor) < _SAME_SPEED * reference) & ~behind
-    # Relative to the first load: exp(i k (phi_j - phi_1)), averaged; how far apart the halves' averages are says whether fixed.
+    # Mean of exp(i (phi_j - phi_1)), relative to the first load; the difference of the means of both halves shows if it is
+    # fixed.
     to_first, moved = _relative(phi - phi[:, :1], half)
     to_rotor, slid = _relative(phi - turn[:, None], half)
     one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (jnp.max(moved) < _LOCKED)
@@ -231,7 +233,7 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
 
 
 def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
-    """The jam mode of loads at a mean speed between natural frequencies, ascending, infinite where there is none."""
+    """Jam mode of loads with a mean speed between ascending natural frequencies, which are infinite if missing."""
     ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
     below = jnp.sum(natural <= mean)
     rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
@@ -239,8 +241,8 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 
 
 def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
-    """True if the rotor of a motor is caught at a resonance: less than 15 % below one, and more than 5 % below the motor's own
-    speed."""
+    """True if the rotor of a motor is caught at a resonance: at most 15 % below it and more than 5 % below the speed of the
+    motor without load."""
     if scene.drive.ideal:
         return jnp.zeros((), bool)
     return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
@@ -256,8 +258,8 @@ def _relative(angle: Array, half: int) -> tuple[Array, Array]:
 def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     """Residual unbalance of loads at `phase` to the rotor, relative to that of all loads at one angle.
 
-    Of a rotor that tilts also what tilts it, about the loads' point: relative to the loads' own levers, or where they have
-    none to the rotor's radius of gyration.
+    For a rotor that tilts, the moment about the point of the loads is included, relative to the levers of the loads, or to the
+    radius of gyration of the rotor if the levers are 0.
     """
     mount, loads = scene.mount(), scene.loads
     each = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
@@ -278,7 +280,8 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
-    """Natural frequencies that turning loads meet, ascending, rad/s; of a gyroscopic rotor the forward whirls at its speed."""
+    """Natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor the forward whirls at its
+    speed."""
     if scene.mounting().gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])

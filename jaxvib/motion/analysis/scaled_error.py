@@ -1,4 +1,4 @@
-"""The natural units of a state, and the scaled difference of two."""
+"""Natural units of a state, and the scaled difference of two states."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def natural_units(scene: Scene) -> State:
     """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed; of a slip
     the rotor's speed at the loads' distance from its axis.
 
-    S is the loads' unbalance, or the rotor's own where that is larger.
+    S is the unbalance of the loads, or that of the rotor if it is larger.
     """
     carrier, pairs = scene.machine.carrier(), [_exciter_units(exciter) for exciter in scene.exciters]
     unbalances = [unbalance for each, _ in pairs for unbalance in each]
@@ -57,8 +57,8 @@ def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
 def error_scale(state: State, unit: State) -> State:
     """The scales of differences between states, one for each part of the state.
 
-    Of displacements and velocities it is the largest of all, but no less than the natural unit: a motion that is at rest has
-    none of its own. Of angles and speeds it is the natural unit, 1 rad and the rotor's speed.
+    The scale of displacements and velocities is the largest value, but at least the natural unit, since a motion at rest has no
+    scale. That of angles and speeds is the natural unit, 1 rad and the rotor speed.
 
     **Arguments**: `state` a `State`, or a stretch of them whose arrays have a leading axis; `unit` its `natural_units`.
 
@@ -74,7 +74,7 @@ def error_scale(state: State, unit: State) -> State:
         if unit.spin is not None and own.spin is not None:
             drilling, slip = unit.spin.drilling, unit.spin.slip
             slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in own.angle)
-            # A spin grows with nothing but chance to bound it.
+            # A spin can grow without bound.
             spin = Spin(None if drilling is None or own.spin.drilling is None else largest(own.spin.drilling, drilling), slip)
         return ExciterState(
             tuple(xp.asarray(unit.angle[0]) for _ in own.angle),
@@ -124,10 +124,10 @@ def estimated_error(
 
         difference x share + 2 eps (steps + radians)
 
-    The `share` is what a smooth motion leaves of the difference. Where an effect is not `smooth` the error falls by jumps, as
-    steps happen to meet what bends the motion, and both runs may miss it alike: twice the difference counts. Rounding adds
-    2 eps for each step, and for each radian of what moves fastest, whose phase hangs on rounded times; `ensemble`, whose equal
-    steps were found to round far less, leaves it out.
+    The `share` is that of a smooth motion. If an effect is not smooth, the error depends on where steps meet its kinks, and
+    both runs may have the same error; therefore twice the difference counts. Rounding adds 2 eps for each step and for each
+    radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits it, since its equal steps round far
+    less.
 
     **Arguments**: `difference` see `scaled_error`; `steps` of the run; `radians` that the fastest speed or frequency turns by.
 
@@ -140,7 +140,7 @@ def estimated_error(
 def turned(state: State, to: State) -> State:
     """A state (or a stretch of them), its angles moved by whole turns to where they are nearest to those of another.
 
-    In single precision angles are kept within a turn, and of two runs that are close one may count a turn more.
+    In single precision angles are wrapped into a turn, and one of two close runs may have an additional turn.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.zeros(1), np.zeros(1), (np.array([phi]),), (np.array([50.0]),)) for phi in (3.1, -3.1))

@@ -34,10 +34,10 @@ from jaxvib.runtime.programs import cached
 __all__ = ["GROWTH", "NEARLY_ONE_ANGLE", "is_nearly_one_angle", "prepare_separation", "separation_rate", "would_separate"]
 
 NEARLY_ONE_ANGLE = 0.2
-"""Loads within so many rad of each other count as loads at one angle."""
+"""Largest angle between loads that count as loads at one angle, rad."""
 
 GROWTH = 1e-2
-"""Growth over the stretch, in e-folds, above which loads separate: less is below the error of the samples' interpolation."""
+"""Growth over the stretch, in e-folds, above which loads separate; smaller values are within the error of interpolation."""
 
 
 def is_nearly_one_angle(angle: np.ndarray) -> bool:
@@ -68,7 +68,7 @@ def separation_rate(scene: Scene, stretch: Trajectory, k: int = 0) -> float:
 
 
 def prepare_separation(scene: Scene, state: State, samples: int) -> None:
-    """Begin to compile the program of `separation_rate` in a thread, for a stretch of so many states like `state`."""
+    """Begin to compile the program of `separation_rate` in a thread, for a stretch of states with the structure of `state`."""
     states = jax.tree.map(lambda leaf: np.zeros((samples, *leaf.shape), leaf.dtype), state)
     times = np.zeros(samples, state.displacement.dtype)
     in_background(functools.partial(_transition.prepare, scene, times, states, np.asarray(0), 0))

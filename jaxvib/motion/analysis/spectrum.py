@@ -1,4 +1,4 @@
-"""Spectra of a run: which frequencies it holds at its end, or from piece to piece as a waterfall."""
+"""Spectra of a run: at its end, or of successive pieces as a waterfall."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 __all__ = ["Spectrum", "spectrum_of"]
 
 _FINER = 4
-"""Factor by which frequencies are computed more densely than a piece resolves them, so that peaks are read to 2 %."""
+"""Ratio of the resolution of a piece and the spacing of frequencies, which resolves peaks to 2 %."""
 
 _OVER = 1.5
-"""Frequencies up to so many times the rotor's greatest speed are kept."""
+"""Largest frequency of spectra, in units of the largest rotor speed."""
 
 
 class Spectrum(Result):

@@ -1,4 +1,4 @@
-"""Exact jams: what is known of a periodic motion of the full equations in which coincident loads are stuck."""
+"""Exact jams: periodic motions of the full equations with jammed coincident loads, and their properties."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ __all__ = ["Orbit", "OrbitStatus", "orbits"]
 
 
 _MAX_INTEGRATION_STEPS = 2**17
-"""Integration steps of a turn beyond which no multipliers are computed: the carrier's fastest motion is then some 3e4 times as
-fast as the loads, and an orbit would take seconds to hours."""
+"""Maximum number of integration steps in a turn; beyond it no multipliers are computed. The fastest motion of the carrier is
+then about 3e4 times as fast as the loads, and an orbit would take seconds to hours."""
 
 
 class OrbitStatus(eqx.Enumeration):
@@ -226,10 +226,12 @@ def orbits(
     *,
     implicit: bool,
 ) -> tuple[Orbit, Floquet]:
-    """Many exact jams of one machine: `value` (P,) what is given of each, `start` (P,) where the other speed starts from,
-    `deviation` (P, G, M) where psi does.
+    """Solve for several exact jams of one machine.
 
-    **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps`, `implicit` as there.
+    **Arguments**: `value` (P,): the given speed of each; `start` (P,): initial values of the other speed; `deviation` (P, G,
+    M): initial psi; `steps`, `implicit`: see `floquet`.
+
+    **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`.
     """
     grid = grid_of(points, model.half_turn)
 
@@ -298,8 +300,8 @@ def orbits(
 def numbers_of(
     model: CoincidentModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
-    """Fields of one orbit that follow from its known motion: as `orbits` with the same arguments gave it, and with the same
-    derivatives; 0 where it gave none."""
+    """Fields of one orbit that follow from its known motion, with derivatives, equal to those of `orbits` for the same
+    arguments; 0 where these are NaN."""
     grid, there = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
     x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
     deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
@@ -320,7 +322,7 @@ def numbers_of(
 
 
 def _all_quantities(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
-    """Harmonics of one motion; slope of the branch, residual, errors of the rotor's speed and of the deviation, and what is
+    """Harmonics of one motion; slope of the branch, residual, errors of the rotor speed and of the deviation; and
     `_motion_quantities`."""
     branch = branch_tangent(model, grid, motion)
     harmonics = harmonics_of(model, grid, motion, branch.response)
@@ -330,10 +332,10 @@ def _all_quantities(model: CoincidentModel, grid: Grid, motion: PeriodicSolution
 def _motion_quantities(
     model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
 ) -> tuple[Array, ...]:
-    """Amplitude, foundation force, power and contact_torque between loads of one motion.
+    """Amplitude, foundation force, power and contact torque between the loads of one motion.
 
-    The power is the sum of what drag, friction and the carrier dissipate; n times the mean torque is the same, but loses its
-    digits for strong drag, whose torque is that of a small difference n - phi'.
+    The power is the sum of the dissipation by drag, friction and the carrier. It equals n times the mean torque, which loses
+    its digits for strong drag, since that torque belongs to a small difference n - phi'.
     """
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     torque = model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque)
@@ -342,18 +344,17 @@ def _motion_quantities(
     power = power + model.linear.dissipated(velocity)
     nd = harmonics.displacement.shape[0]
     swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
-    # Directions of the force on the foundation are put together as those of a vector.
+    # Components of the force on the foundation are combined like those of a vector.
     force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
     contact_torque = _least_contact_torque(model, grid, motion, harmonics)
     return (swings[:nd], force, power, contact_torque)
 
 
 def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
-    """The least torque, N m, with which loads that lie side by side contact_torque the next one ahead, on the average of a
-    period.
+    """Smallest mean torque over a period, N m, by which a load pushes the next one; the loads lie side by side.
 
-    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
-    vibration that holds a jam presses the loads together at every instant.
+    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The mean is
+    decisive, since no vibration of a jam presses the loads together at every instant.
     """
     loads = model.loads
     if loads.ball_radius is None or loads.count == 1:
@@ -366,12 +367,12 @@ def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSo
 
 
 _PEAK_SEARCH_PARTS = 16
-"""Number of parts of a period in which peaks are searched for separately: more than the harmonics that matter have peaks."""
+"""Number of parts of a period in which peaks are searched separately; the relevant harmonics have fewer peaks."""
 
 
 def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array:
-    """The greatest value, (16,), of the signal with these harmonics (K,) in each part of the period, its ends included; of one
-    that turns its sign in `half` a period the greatest magnitude in each part of that half."""
+    """Maximum, (16,), of the signal with harmonics (K,) in each part of the period, including its ends. For a signal that
+    changes its sign in `half` a period, maximum of the magnitude in each part of the half."""
     each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PEAK_SEARCH_PARTS
     if half:
         each, width = each // 2, width / 2.0
@@ -381,7 +382,7 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
         np.asarray(orders, harmonics.real.dtype),
     )
     angles = k * (starts[:, None] + width * places)[..., None]
-    # Real parts and beside them imaginary ones: products of complex numbers take four times as long.
+    # Real and imaginary parts in one real array, since products of complex numbers take four times as long.
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
     both, none = jnp.concatenate([harmonics.real, harmonics.imag]), np.zeros((k.size, k.size), k.dtype)
     slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
@@ -399,7 +400,7 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
         sine, cosine = sine_and_cosine(k[None] * theta[:, None])
         return theta, jnp.concatenate([cosine, -sine], 1)
 
-    # The value at an extremum does not change with where the extremum is: its place needs no derivative.
+    # The value at an extremum does not depend on its place to first order; therefore the place needs no derivative.
     return side * (jax.lax.fori_loop(0, 3, halley, (starts + width / each * best, begin))[1] @ both)
 
 

@@ -1,4 +1,4 @@
-"""The whole diagram of exact jams, and the points where their stability changes."""
+"""Branch diagram of exact jams, with the points of stability changes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 
 _ORBITS_PER_BATCH = 32
-"""Orbits that are computed side by side: enough to fill the machine's vectors, few enough to stay in its cache."""
+"""Number of orbits in a batch: enough to fill vector registers, few enough for the cache."""
 
 _COLLOCATION_POINTS = (16, 32, 64)
 
@@ -120,12 +120,12 @@ def exact_branches(
     most: Number | None = None,
     accuracy: float = 1e-8,
 ) -> ExactBranches:
-    """The whole branch n(Omega) of exact jams with its stability, and the points where that changes.
+    """Compute the branch n(Omega) of exact jams with its stability and the points of stability changes.
 
-    Every point is solved for itself at its own load speed, so folds need no continuation. Special points are bracketed by
+    Each point is solved separately at its own load speed; therefore folds need no continuation. Special points are bracketed by
     the points of the diagram and then found as roots: of dn/dOmega (fold), of prod (1 - s_i s_j) over pairs of multipliers
     (torus), of prod (1 + s_i) (period doubling; the loss of symmetry, where s is the growth over half a period with the
-    half-turn), of prod (1 - s_i) for loads that part from each other (loss of symmetry).
+    half-turn), of prod (1 - s_i) for loads that separate (loss of symmetry).
 
     **Arguments**: `points` along Omega, crowded about the resonances; `least`, `most` load speeds, rad/s or text (a fifth of
     the lowest resonance, a third above the scene's rotor speed); `accuracy` of the rotor speeds, relative.
@@ -159,7 +159,7 @@ def exact_branches(
 
 
 class _Values(NamedTuple):
-    """Exact jams, a leading axis over them; `tests` (P, 4) change sign where stability changes, see `_tests`."""
+    """Exact jams with a leading axis; `tests` (P, 4) change sign at stability changes, see `_tests`."""
 
     status: OrbitStatus
     omega: np.ndarray
@@ -177,15 +177,15 @@ class _Values(NamedTuple):
 
 
 class _Solver:
-    """Exact jams at given load speeds, in batches, with as many harmonics as each asks for."""
+    """Solver for exact jams at given load speeds, in batches, with as many harmonics as each jam needs."""
 
     def __init__(self, scene: Scene, accuracy: float, slowest: float):
         self.scene, self.accuracy = scene, accuracy
-        # Decay is fastest beside the slowest loads; one method for all, so that no test changes its sign between two.
+        # Decay is fastest for the slowest loads. One method for all points, so that no test changes sign between methods.
         self.implicit = bool(_is_stiff(scene, jnp.asarray(slowest, scene.drive.speed.dtype)))
 
     def __call__(self, omega: np.ndarray) -> _Values:
-        """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
+        """Solve for the jams at load speeds; a batch takes as many integration steps as its slowest loads need."""
         first, *more = _points(self.scene)
         found = self._batches(omega, first)
         for many in more:
@@ -231,12 +231,12 @@ def _values(scene: Scene, omega: Array | np.ndarray, many: int, accuracy: float,
 
 
 _KINDS_OF_TESTS = ("torus", "half_turn", "half_turn", "symmetry")
-"""The bifurcation that a sign change of each test means; where there is no half-turn, s = -1 is a period doubling."""
+"""Bifurcation at a sign change of each test; without the half-turn symmetry, s = -1 is a period doubling."""
 
 
 def _tests(growth: Floquet) -> Array:
-    """(P, 4) from the growths s over a turn of the grid: prod (1 - s_i s_j) over pairs, prod (1 + s_i); of loads that part
-    from each other prod (1 + s_i), prod (1 - s_i)."""
+    """Test functions (P, 4) of the growths s over a turn of the grid: prod (1 - s_i s_j) over pairs, prod (1 + s_i); for loads
+    that separate prod (1 + s_i), prod (1 - s_i)."""
     s = growth.roots
     first, second = np.triu_indices(s.shape[0], 1)
     tests = [jnp.prod(1.0 - s[first] * s[second], axis=0), jnp.prod(1.0 + s, axis=0)]
@@ -246,7 +246,7 @@ def _tests(growth: Floquet) -> Array:
 
 
 def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
-    """Every sign change between neighbours that are both known, followed to its root."""
+    """Roots of the test functions, from all sign changes between neighbouring points."""
     kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
     if not has_half_turn(solve.scene.all_effects):
         kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
@@ -266,7 +266,7 @@ def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
         share = next_share(np, (a, fa), (b, fb), (grid.omega[beyond], tests[beyond, which]), 1e-12)
     values, done = grid, np.zeros(row.size, bool)
     while not np.all(done):
-        # A root that is found stays where it is until all are.
+        # A converged root stays unchanged until all have converged.
         x = np.where(done, a, a + share * (b - a))
         values = solve(x)
         f = read(values)[pick, which]

@@ -1,4 +1,4 @@
-"""Exact jams by name: the one of a mode, of a load speed, or near one."""
+"""Exact jams of a mode, of a load speed, or near a load speed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _MAX_SPEED_DIFFERENCE = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
 _UNKNOWN_STEPS = 64
-"""Steps of the multipliers' integration under a JAX transformation: reverse derivatives need a number in the program."""
+"""Steps in the integration of the multipliers under a JAX transformation, since reverse derivatives need a static number."""
 
 
 @validated
@@ -112,7 +112,7 @@ def jam_orbit(
 
 
 def _solve_accurately(plan: OrbitPlan) -> Orbit:
-    """Return the first orbit that is accurate enough, or the best one: beside a fold more points add rounding, not accuracy."""
+    """Return the first orbit that is accurate enough, or the best one: near a fold more points add rounding errors only."""
     best, least = None, math.inf
     for points in plan.points:
         orbit = _solve(plan, points)
@@ -163,7 +163,7 @@ def _outputs(
     points: int,
     *_: object,
 ) -> Orbit:
-    """Outputs that follow from the motion, once it is solved: neither multipliers nor errors."""
+    """Outputs that follow from the solved motion, without multipliers and errors."""
     empty = jax.tree.map(lambda _: None, orbit)
     return dataclasses.replace(empty, **numbers_of(coincident_model(jammed_model(scene)), orbit, value, start, given, points))
 
@@ -182,10 +182,10 @@ def _solve_program(
     implicit: bool,
     settle: bool = False,
 ) -> Orbit:
-    """One exact jam.
+    """Solve for one exact jam.
 
-    Its multipliers take so many `steps` of the `implicit` or the explicit method, by default as many as the speeds need (no
-    reverse derivatives then). `settle` starts from the motion at the load speed `start`, if that is near the answer.
+    **Arguments**: `steps` of the `implicit` or explicit method for the multipliers (default: as many as the speeds need,
+    without reverse derivatives); `settle`: start from the motion at the load speed `start`, for a start near the solution.
     """
     model, deviation = coincident_model(jammed_model(scene)), None
     if settle:
@@ -196,7 +196,7 @@ def _solve_program(
     many = jnp.reshape(value, (1,)), jnp.reshape(start, (1,))
     batch, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit)
     orbit = jax.tree.map(lambda leaf: leaf[0], batch)
-    # A motion on a falling piece of the branch is no odd mode, one on a rising piece no even mode.
+    # Odd modes lie on rising pieces of the branch, even modes on falling pieces.
     there = exists
     if direction is not None:
         there = exists & (~(orbit.slope * direction < 0.0) | (orbit.status == OrbitStatus.at_fold))

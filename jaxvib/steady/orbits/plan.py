@@ -1,6 +1,6 @@
 """Plans of exact jams: choices that depend on numbers of a scene, taken on the host before a program is traced.
 
-Only this module asks which numbers are known. Under a JAX transformation the number of collocation points is fixed.
+Only this module tests which numbers are known. Under a JAX transformation the number of collocation points is fixed.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def plan_orbit(
         mode=None if mode is None else int(mode),
         points=_points(scene, loads, points, all_known=all_known),
         accuracy=accuracy,
-        # Unknown numbers may be those of loads with much drag.
+        # Unknown numbers may include strong drag.
         implicit=bool(_is_stiff(frozen, *speeds)) if all_known else True,
         is_known=all_known,
     )

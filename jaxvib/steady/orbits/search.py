@@ -18,10 +18,10 @@ from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 __all__ = ["branch_at", "exact_mode_speeds"]
 
 _BRANCH_POINTS, _POINTS_PER_BATCH = 800, 100
-"""Points of the exact branch that are computed, and of them at once."""
+"""Number of points of the exact branch, and of points in a batch."""
 
 _PARTS_PER_INTERVAL = 32
-"""Parts into which cubics divide the interval between two of these points."""
+"""Number of interpolated parts of the interval between two of these points."""
 
 _NEAR_FOLD_DISTANCE = 1e-6
 """Relative distance of the rotor's speed from a fold of the cubics below which the fold itself is computed."""
@@ -39,7 +39,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     """
     crowded, resonances = _fold_points(scene)
     crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
-    crowded = np.unique(np.append(crowded, target))  # twice the same point would look like a turn
+    crowded = np.unique(np.append(crowded, target))  # a duplicate point would look like a fold
     omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, crowded.size), crowded)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     known = np.isfinite(speed)
@@ -58,14 +58,14 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
         around = np.clip([k - _PARTS_PER_INTERVAL, k + _PARTS_PER_INTERVAL], 0, omega.size - 1)
         low, high = (float(w) for w in omega[around])
         if _ends_before(scene, low, high, target):
-            crossed[around[0] : around[1]] = False  # what seems to cross there is the error of the interpolation
+            crossed[around[0] : around[1]] = False  # the crossing is an interpolation error
         else:
             close.append(k)
     found: dict[int, float] = {}
     for k in np.flatnonzero(crossed):
         part = (target - speed[k]) / (speed[k + 1] - speed[k])
         found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
-    # So close to a fold that it lies between two points: both of its modes are about there.
+    # If the fold lies between two points, both of its modes are near these.
     for k in close:
         for side in (k - 1, k + 1):
             found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))
@@ -92,7 +92,7 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, looks: in
 
 
 def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the cubics through (x, y) with these slopes, `_PARTS_PER_INTERVAL` an interval."""
+    """Points of the cubics through (x, y) with the given slopes, `_PARTS_PER_INTERVAL` in each interval."""
     t, h = np.arange(_PARTS_PER_INTERVAL) / _PARTS_PER_INTERVAL, np.diff(x)[:, None]
     a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
     cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
@@ -101,8 +101,8 @@ def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.n
 
 @cached
 def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
-    """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN where there is
-    none."""
+    """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN without a
+    jam."""
     model = coincident_model(jammed_model(scene))
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 

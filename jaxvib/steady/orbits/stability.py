@@ -24,10 +24,10 @@ _PHASE_PER_STEP = 0.7
 as the carrier, and 1e-10 if they are three times as fast."""
 
 _STIFF_DECAY_RATIO = 3.0
-"""Decay so many times as fast as the fastest oscillation is left to the implicit method: explicit steps would have to resolve
-it, and from about 15 times on they diverge."""
+"""Ratio of decay rate and fastest oscillation beyond which the implicit method is used. Explicit steps would have to resolve
+the decay, and diverge from a ratio of about 15 on."""
 
-# The method's last stage is the end of the step, there to be evaluated for the next one.
+# The last stage of the method is the end of the step, whose evaluation is the first one of the next step.
 _NODES = np.concatenate([[0.0], NODES[:-1]])
 _ROWS = np.pad(ROWS[:-1, : len(_NODES)], ((1, 0), (0, 0)))
 _WEIGHTS = ROWS[-1]
@@ -37,8 +37,8 @@ class Floquet(NamedTuple):
     """Growth of small disturbances of periodic jams, trailing axis over the orbits.
 
     **Attributes**: `roots` (2 nd + 2 G - 1, P) complex: growth over a turn of the grid, that is half a period followed by the
-    half-turn where the motion has that symmetry (multipliers are their squares), else a period (they are the multipliers);
-    the trivial one, a shift in time, is taken out. `inner` (2, P): the same for two loads that separate while the others
+    half-turn if the motion has that symmetry (multipliers are their squares), otherwise a period (they are the multipliers);
+    without the trivial root, a shift in time. `inner` (2, P): the same for two loads that separate while the others
     stay, None for a single load. `trivial` (P,): the trivial root, 1 but for the error of the integration.
     """
 
@@ -48,7 +48,8 @@ class Floquet(NamedTuple):
 
 
 class _Rates(NamedTuple):
-    """The fastest of the carrier's `oscillation` and of the linear equations' `decay`, of carrier and loads, rad/s and 1/s."""
+    """Fastest rates of the linear equations: `oscillation` of the carrier, rad/s, and decay by `damping` of the carrier and by
+    `drag` of the loads, 1/s."""
 
     oscillation: Array
     damping: Array
@@ -58,7 +59,7 @@ class _Rates(NamedTuple):
 def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
     """Rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
 
-    A body of loads decays by drag and friction with an inertia that the carrier lessens:
+    A body of loads decays by drag and friction with an inertia that the motion of the carrier reduces:
 
         max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
     """
@@ -81,8 +82,8 @@ def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
 
 
 def is_stiff(model: CoincidentModel, omega: Array, speed: Array) -> Array:
-    """True if loads or carrier decay so fast, at load speeds `omega` and the rotor's `speed` (rad/s), that multipliers need the
-    implicit method."""
+    """True if multipliers at load speeds `omega` and the rotor's `speed` (rad/s) need the implicit method, by the decay rates
+    of loads and carrier."""
     rates = _rates(model, omega, speed)
     return jnp.maximum(rates.damping, rates.drag) > _STIFF_DECAY_RATIO * (rates.oscillation + 2.0 * omega)
 
@@ -202,7 +203,7 @@ class _Disturbances(NamedTuple):
         q2 = -self.damped(below1) - _times(self.stiffness, below) / self.w**2
         pushed = _times(self.port, q2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
         torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
-        # The port's acceleration with the bodies giving way to it: an equation for each of its directions.
+        # Acceleration of the port including the motion of the bodies: one equation for each direction.
         answers = self.lever * c.coupling[:, :, None]
         weight = jnp.sum(t[:, None] * answers[None], axis=2)
         factor = _times(self.accelerance, weight)
@@ -239,14 +240,14 @@ def floquet(
     *,
     implicit: bool = False,
 ) -> Floquet:
-    """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
+    """Floquet multipliers of the full state about periodic motions, by one integration of all linear equations.
 
     With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
 
         Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
         I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
 
-    T is the torque on the body, which depends on the port's acceleration a = Omega^2 B q'' too where there is dry friction.
+    T is the torque on the body. With dry friction it also depends on the acceleration of the port, a = Omega^2 B q''.
     Loads of one body that separate (sum d_j = 0) leave the carrier at rest: the second equation without its last term. Loads
     that lie side by side are pressed together and do not separate.
 
@@ -293,7 +294,7 @@ def _explicit_transition(
     def step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
         rows, weights = (jnp.asarray(x, dtype=dtype) for x in (_ROWS, _WEIGHTS))
 
-        # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
+        # A loop over the stages: if they are unrolled, the compiler recomputes every stage at each use.
         def stage(rates: tuple[Array, ...], now: tuple[Array, Array, _Coefficients]) -> tuple[tuple[Array, ...], None]:
             i, row, c = now
             moved = (x + h * jnp.tensordot(row, y, 1) for x, y in zip(state, rates, strict=True))
@@ -321,8 +322,8 @@ def _implicit_transition(
     h: Array,
     steps: int | Array,
 ) -> tuple[Array, ...]:
-    """Transition matrices as `_explicit_transition` returns them, by implicit steps."""
-    # One solve for all equations: its program is as large as the rest of the step.
+    """Transition matrices like those of `_explicit_transition`, by implicit steps."""
+    # One solve for all equations, since its program is as large as the rest of the step.
     total, orbits, dtype = sum(sizes), equations.omega.shape[0], equations.omega.dtype
 
     def step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -352,9 +353,10 @@ def _integrate(
     begin: Callable[[], tuple[Array, ...]],
     step: Callable[[_Coefficients, tuple[Array, ...]], tuple[Array, ...]],
 ) -> tuple[Array, ...]:
-    """The state after so many steps from `begin`, each with the coefficients at its `nodes`."""
+    """State after `steps` steps from `begin`, each with the coefficients at its `nodes`."""
     places = jnp.asarray(nodes, dtype=equations.omega.dtype)
-    # exp(i k theta) goes from step to step as a product: sines and cosines at every node took a quarter of the time.
+    # exp(i k theta) is updated from step to step by a product, since sines and cosines at every node took a quarter of the
+    # time.
     every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
     at_nodes, turning = _derivatives(every, 3, harmonics.deviation) * _wave(every, places * h), _wave(every, h[None])
 
@@ -406,13 +408,13 @@ def _small_solve(weight: Array, right: Array) -> Array:
 
 
 def _eigenvalues(matrices: Array) -> Array:
-    """Eigenvalues (P, n) of matrices (P, n, n), one matrix after the other: library calls for batches may wait for each other
-    for ever if several programs run side by side (jaxlib 0.10)."""
+    """Eigenvalues (P, n) of matrices (P, n, n), one matrix after the other, since batched library calls may deadlock if several
+    programs run in parallel (jaxlib 0.10)."""
     return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
 
 
 def _deflate(matrix: Array, known: Array) -> tuple[Array, Array]:
-    """The eigenvalue that belongs to the eigenvector `known`, and a matrix that has the others."""
+    """Eigenvalue of the eigenvector `known`, and a matrix with the other eigenvalues."""
     unit = known / jnp.linalg.norm(known)
     mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))
     mirror = mirror / jnp.linalg.norm(mirror)
