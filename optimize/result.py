@@ -78,7 +78,7 @@ class Outcome:
     force_per_amplitude: float
 
     def as_dict(self) -> dict[str, Plain]:
-        """Return the same for JSON: free numbers beside the quantities, None in place of NaN."""
+        """Return the same for JSON: free numbers beside the quantities, None instead of NaN."""
         shown = ("omega", "amplitude", "foundation_force", "force_per_amplitude")
         return {name: plain(value) for name, value in {**self.parameters, **{k: getattr(self, k) for k in shown}}.items()}
 
@@ -216,7 +216,7 @@ class Synthesis(Result):
         def changed(*percent: float) -> str:
             if math.isnan(best) or not max(map(abs, percent)) > _TELLING:
                 return " / ".join(f"{each:+.3g} %" for each in percent) + " of the objective"
-            moved = [max(abs(best), 1e-300) * each / 100.0 for each in percent]  # of almost nothing, a share tells nothing
+            moved = [max(abs(best), 1e-300) * each / 100.0 for each in percent]  # for an objective near 0
             unit, factor = shown_unit(self.unit, max(map(abs, moved)))
             return " / ".join(f"{each * factor:+.3g} {unit}".rstrip() for each in moved)
 
@@ -271,8 +271,8 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 
 
 def _if_moved(gain: float) -> str:
-    """The change of the objective, in per cent, if a limit is moved, from the `gain` for 1 %: by so little that the slope still
-    tells it, at most a tenth of the objective."""
+    """Text on the change of the objective by a changed limit, from the `gain` for 1 %; the change is so small that the slope is
+    valid, at most a tenth of the objective."""
     share = 1.0
     while abs(gain) * share > _LINEAR:
         share /= 10.0
@@ -288,7 +288,7 @@ def objective_text(objective: str) -> str:
 
 
 def amplitude_names(scene: Scene) -> list[str]:
-    """Names of the coordinates' amplitudes: that of platform 1 is the coordinate y1's."""
+    """Names of the amplitudes of the coordinates; that of platform 1 belongs to the coordinate y1."""
     names = scene.machine.structure().coordinates
     if not isinstance(scene.machine, Platforms):
         return [f"amplitude of {name}" for name in names]

@@ -1,4 +1,4 @@
-"""The design space: free numbers of a scene, their bounds and ties, catalogues, and quantities that are held."""
+"""Design space: free numbers of a scene, their bounds and ties, catalogues, and held quantities."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Tie(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A number that may have certain values only, ascending, SI; `start` its place in the design vector."""
+    """Number with a list of allowed values, ascending, SI; `start`: its place in the design vector."""
 
     name: str
     values: tuple[float, ...]

@@ -218,7 +218,7 @@ def _begun(space: DesignSpace, begin: Synthesis) -> np.ndarray:
 def _searched(
     space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options, tell: Tell
 ) -> tuple[DesignSpace, Problem, Found]:
-    """The best of the searches for each number of loads; of one alone where that is not free."""
+    """Best search over all allowed numbers of loads."""
     best: tuple[DesignSpace, Problem, Found] | None = None
     existing = drawn = 0
     for loads in space.counts or (space.scene.loads.count,):
@@ -243,7 +243,7 @@ def _searched(
 
 
 def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options) -> str:
-    """The quantities of a search that no random design has, in words."""
+    """Text with the quantities of a search that no random design has."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     every = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
     z = np.random.default_rng(options.seed).uniform(size=(options.starts, space.size))
@@ -258,7 +258,7 @@ def _rank(found: Found) -> tuple[bool, float]:
 
 
 def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
-    """The space with another number of loads. **Raises** `InputError` for loads that have numbers of their own."""
+    """Design space with another number of loads. **Raises** `InputError` for loads with individual numbers."""
     now = space.scene.loads
     if not getattr(now, "alike", False):
         raise InputError("choices.loads.count", "needs loads that share every number; give one mass, radius and drag for all")
@@ -272,12 +272,12 @@ def _mode_of(objective: Quantity, demands: Sequence[Demand]) -> int | None:
 
 
 def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
-    """The full equations of a machine, integrated until they have settled in a jam mode; or why there is no such run."""
+    """Run of the full equations of a machine until they have settled in a jam mode, or the reason why there is none."""
     if mode is None:
         return None, "the objective and the demands belong to no jam mode that could be integrated"
     if not verify:
         return None, "not requested"
-    try:  # the machine that was found is worth more than the check that failed
+    try:  # a failed verification must not lose the machine
         orbit = _exact_motion(scene, mode)
         if orbit is None:
             return settle(scene, mode=mode), ""
@@ -301,8 +301,8 @@ def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
 
 
 def _beside(orbit: Orbit) -> State:
-    """A state of the exact motion, with loads at slightly different angles: an unstable motion then leaves it. A machine with
-    little damping takes thousands of periods to come to the same motion from a start to leading order."""
+    """State of the exact motion with slightly separated loads, which leave the motion if it is unstable. From a start to
+    leading order, a machine with little damping takes thousands of periods to reach the same motion."""
     displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
     spread = _SPREAD * np.linspace(-1.0, 1.0, len(angle)) if len(angle) > 1 else np.zeros(1)
     return State(displacement, velocity, (angle + spread,), rate)
@@ -321,7 +321,7 @@ def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quant
 def _named(
     space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand], mode: int | None
 ) -> list[tuple[str, Quantity]]:
-    """The quantities of the table: the standard ones of a jam, then what is sought, held and demanded besides."""
+    """Quantities of the table: the standard ones of a jam, then the objective, held quantities and demands."""
     standard = _standard(scene, mode, objective.of)
     sought = objective.parts[0] if objective.name.startswith("negative ") and objective.parts else objective
     own = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
@@ -354,7 +354,7 @@ def _table(
 def _other_tiers(
     scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, mode: int | None
 ) -> tuple[list[float], list[float]]:
-    """The same quantities of the exact motion, and of the run that checks the design; NaN where they have no such tier."""
+    """Values of the quantities by the exact motion and by the run of the verification; NaN if they have no such tier."""
 
     def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
         other = quantity.at_tier(tier)

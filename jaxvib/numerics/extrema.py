@@ -12,11 +12,11 @@ from jax import Array
 __all__ = ["NODES", "extremum_value", "greatest", "locate_extrema"]
 
 NODES = 4
-"""Samples beside each other through whose values and slopes a polynomial goes."""
+"""Number of neighbouring samples whose values and slopes a polynomial interpolates."""
 
 
 def _hermite() -> np.ndarray:
-    """The matrix that makes the coefficients, lowest power first, of values and slopes at the nodes 0, 1, 2, 3."""
+    """Matrix from values and slopes at the nodes 0, 1, 2, 3 to polynomial coefficients, lowest power first."""
     nodes, powers = np.arange(NODES)[:, None], np.arange(2 * NODES)[None, :]
     return np.linalg.inv(np.concatenate([1.0 * nodes**powers, powers * 1.0 * nodes ** np.maximum(powers - 1, 0)]))
 
@@ -27,15 +27,15 @@ _COEFFICIENTS = _hermite()
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """Locate the extrema of an evenly sampled motion over its first half, its second half and all of it.
 
-    Between two samples it is the polynomial p of degree 7 through values and slopes of four samples, those two in their
-    middle (at the ends the outermost four), whose error there is
+    Between two samples the motion is the polynomial p of degree 7 through values and slopes of four samples, with these two in
+    the middle (at the ends the outermost four), and the error
 
         |x - p| <= 0.32 / 8! max |d^8 x/ds^8|        (at the ends 0.88 / 8!)
 
     with s the time in steps: 4e-9 of the amplitude for 16 samples a period, and 256 times less for twice as many.
 
-    **Arguments**: x, v (n,), n >= 4: samples, and their slopes times the sampling step. **Returns** values there, the first of
-    the four samples, and where the place is from it, in steps, from 0 to 3; (2, 3) each.
+    **Arguments**: x, v (n,), n >= 4: samples, and their slopes times the sampling step. **Returns** the extrema, the index of
+    the first of the four samples, and the place relative to it, in steps from 0 to 3; (2, 3) each.
     """
     n, half = len(x), len(x) // 2
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
@@ -46,7 +46,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     turns = v[:-1] * v[1:] < 0.0
 
     def nearer(_: int, share: Array) -> Array:
-        """A step of Newton's method for the place where the slope is 0."""
+        """Newton step for the zero of the slope."""
         curved = _at(bend, before + share)
         change = _at(slope, before + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
         return jnp.clip(share - change, 0.0, 1.0)
@@ -56,7 +56,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     steps = jnp.arange(n - 1)
 
     def greatest(sign: Array, start: Array, stop: Array) -> tuple[Array, Array, Array]:
-        """Over the samples from `start` to before `stop`; of several the first."""
+        """Extrema over the samples from `start` to before `stop`; the first of equal ones."""
         inside = sign * inner > sign * x[:-1]
         reached = jnp.where(inside, sign * inner, sign * x[:-1])
         reached = jnp.where((steps >= start) & (steps < stop - 1), reached, -jnp.inf)
@@ -81,7 +81,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def extremum_value(x: Array, v: Array, place: Array) -> Array:
-    """The value at an extremum, which stays one: where it lies between samples it moves with what it is made of.
+    """Value at an extremum, whose place between samples has derivatives, too.
 
     x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` counts from the first, in steps.
     """
@@ -94,14 +94,14 @@ def extremum_value(x: Array, v: Array, place: Array) -> Array:
 
 
 def greatest(values: Array) -> Array:
-    """The greatest of some numbers (n,), with its derivatives: those of `jnp.max` are 0/0 where a compiler computes two that
-    are alike twice and rounds them differently."""
+    """Maximum of numbers (n,) with derivatives. Those of `jnp.max` are 0/0 if the compiler recomputes equal numbers with other
+    rounding."""
     return values[jnp.argmax(values)]
 
 
 def _polynomial(x: Array, v: Array) -> Array:
     """Coefficients (8, ...) of the polynomial through values and slopes (4, ...) at 0, 1, 2, 3."""
-    # From the first sample on: what all have in common does not round.
+    # Relative to the first sample, so that a common offset causes no rounding.
     changes = jnp.concatenate([x - x[:1], v])
     found = jnp.tensordot(jnp.asarray(_COEFFICIENTS, x.dtype), changes, 1, precision="highest")
     return jnp.concatenate([found[:1] + x[:1], found[1:]])

@@ -1,8 +1,8 @@
-"""Fences that keep a compiler from computing a value anew for each use.
+"""Fences that prevent a compiler from recomputing a value for each use.
 
-XLA's fusion on a CPU computes a value anew for each use of it, and what it is made of with it: where shared parts are made of
-shared parts, that grows without bounds. It does not do so to the result of a division, which it takes to be dear. So a value
-is divided by a 1 that XLA does not know to be one. The compiler behind it, LLVM, does, and leaves the division out.
+XLA's fusion on a CPU recomputes a value, with all its operands, for each use; for nested shared operands the work grows without
+bound. It does not recompute the result of a division, which it considers expensive. Therefore a value is divided by a 1 that
+XLA does not recognize as 1. LLVM, which compiles the code afterwards, does and removes the division.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["fence", "hidden_one", "through_memory"]
 
 
 def fence(value: Array, one: Array) -> Array:
-    """A floating-point value that XLA computes once, however often it is used; `one` is a `hidden_one`.
+    """Fence a floating-point value, which XLA then computes once for any number of uses; `one` is a `hidden_one`.
 
     >>> fence(jnp.asarray([2.0, jnp.inf]), hidden_one(jnp.asarray(3.0))).tolist()
     [2.0, inf]
@@ -27,7 +27,7 @@ def fence(value: Array, one: Array) -> Array:
 
 
 def hidden_one(value: Array) -> Array:
-    """1, made of any floating-point value, of which a compiler has to know that a bit has no half to find it out.
+    """A 1 computed from a floating-point value by bit operations that XLA does not simplify.
 
     >>> float(hidden_one(jnp.asarray(jnp.nan)))
     1.0
@@ -39,8 +39,8 @@ def hidden_one(value: Array) -> Array:
 
 
 def through_memory(values: Sequence[Array], one: Array) -> list[Array]:
-    """Several single numbers that XLA computes once, all in one piece of code, which stores them and reads them again: what
-    needs several at a time comes so in less time than by a fence for each.
+    """Fence several single numbers at once: one piece of code computes, stores and reads them, which takes less time than one
+    fence for each if they are used together.
 
     >>> [float(x) for x in through_memory([jnp.asarray(2.0), jnp.asarray(3.0)], hidden_one(jnp.asarray(3.0)))]
     [2.0, 3.0]
@@ -50,8 +50,8 @@ def through_memory(values: Sequence[Array], one: Array) -> list[Array]:
 
 @jax.custom_jvp
 def _from_bits(stack: Array, one: Array) -> list[Array]:
-    """The numbers of a stack, each read as bits: the compiler puts what a number was made of in place of one that it reads as
-    what it is. Tangents have no bits to be read."""
+    """Unstack numbers by reading their bits, since the compiler would replace a number that is read as such by its operands.
+    Tangents are unstacked without this."""
     bits = jax.lax.bitcast_convert_type(stack, jnp.dtype(f"uint{8 * stack.dtype.itemsize}"))
     return [jax.lax.bitcast_convert_type(bits[i], stack.dtype) for i in range(len(stack))]
 

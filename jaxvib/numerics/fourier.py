@@ -16,10 +16,10 @@ __all__ = ["Grid", "analyzed", "deviation_analysis", "deviation_synthesis", "gri
 class Grid(NamedTuple):
     """Points on a period of theta = Omega t and the matrices of trigonometric interpolation between them.
 
-    With the half-turn symmetry psi(theta + pi) = psi(theta), e(theta + pi) = -e(theta), half a period says everything: psi
+    With the half-turn symmetry psi(theta + pi) = psi(theta), e(theta + pi) = -e(theta), half a period is sufficient: psi
     has even harmonics only and the point e of the loads odd ones.
 
-    **Attributes** (M points): `symmetric` whether it is half a period; `theta` (M,); `first`, `second` (M, M) d/dtheta and
+    **Attributes** (M points): `symmetric`: True if it is half a period; `theta` (M,); `first`, `second` (M, M) d/dtheta and
     d^2/dtheta^2 of psi; `deviation_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `deviation_weights` (J,): psi
     has the harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times
     cos and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis`
@@ -42,10 +42,10 @@ class Grid(NamedTuple):
 
 
 def grid_of(points: int, symmetric: bool) -> Grid:
-    """The grid of `points` on half a period where the motion has the half-turn symmetry, else on the whole of it.
+    """Grid of `points` on half a period if the motion has the half-turn symmetry, otherwise on a period.
 
-    `points` is made even for half a period and odd for a whole one, which keeps the highest harmonic of e whole. Each precision
-    that JAX is switched to has a grid of its own: JAX remembers an array with the precision in which it met it first.
+    `points` is rounded to an even number for half a period and to an odd number for a period, which keeps the highest harmonic
+    of e complete. Each precision has its own grid, since JAX caches an array with the precision of its first use.
     """
     return _grid_of(points, symmetric, jnp.result_type(float).itemsize == 8)
 
@@ -84,7 +84,7 @@ def _synthesis(orders: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def analyzed(values: Array, matrix: np.ndarray) -> Array:
-    """Harmonics (..., K) of values (..., M) at the points: a product of real numbers, a quarter of the complex one."""
+    """Harmonics (..., K) of values (..., M) at the points, by a product of real numbers, a quarter of the complex one."""
     return jax.lax.complex(*jnp.split(values @ matrix, 2, -1))
 
 

@@ -1,4 +1,4 @@
-"""Small linear algebra, written out where it is small enough: no library call stands in a time loop."""
+"""Small linear algebra, unrolled for small matrices, so that time loops contain no library calls."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ __all__ = [
 
 
 _WRITTEN = 8
-"""Up to so many equations `eliminate` is as fast as a library call for each system of a batch."""
+"""Largest number of equations for which `eliminate` is as fast as a library call for each system of a batch."""
 
 TRUSTED = 1e-2
-"""Largest relative error of an eigenvalue that is still an answer; beyond it its digits are lost to rounding."""
+"""Largest relative error of a valid eigenvalue; beyond it, its digits are lost to rounding."""
 
 _compiled = functools.partial(jax.jit, inline=True)
 """Compilation of loops, which JAX traces and compiles at every call outside a program; within one, nothing changes."""
@@ -47,7 +47,7 @@ _Entry: TypeAlias = Array | float
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """Matrix times vector as a sum: a library call in a time loop would keep the compiler from fusing it."""
+    """Matrix times vector as a sum, since a library call in a time loop prevents fusion."""
     return jnp.sum(matrix * vector[None, :], axis=-1)
 
 
@@ -63,7 +63,7 @@ def small_inverse(a: Sequence[Sequence[_Entry]]) -> Callable[[tuple[Array, ...]]
 
 
 def _eliminate(a: Sequence[Sequence[_Entry]], b: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Gauss' elimination, in each column the row with the largest entry first."""
+    """Gaussian elimination with the largest entry of each column as pivot."""
     rows = [[*line, right] for line, right in zip(a, b, strict=True)]
     n = len(rows)
     for k in range(n):
@@ -83,7 +83,7 @@ def _eliminate(a: Sequence[Sequence[_Entry]], b: tuple[Array, ...]) -> tuple[Arr
 
 
 def relative_to(metric: Array, matrix: Array) -> tuple[Array, Array]:
-    """L^-1 A L^-T (nd, nd) and L^-1 of a positive definite metric L L^T; its eigenvalues solve A x = value L L^T x."""
+    """L^-1 A L^-T (nd, nd) and L^-1 for a positive definite metric L L^T; its eigenvalues solve A x = value L L^T x."""
     n = metric.shape[0]
     if n > 3:
         eye = jnp.eye(n, dtype=metric.dtype)
@@ -110,7 +110,7 @@ def _small_factor_inverse(metric: Array) -> Array:
 
 
 def root_or_zero(values: Array) -> Array:
-    """Roots of eigenvalues that are never negative; what rounding cannot tell from 0 is 0, and so is its derivative."""
+    """Square roots of nonnegative eigenvalues; values within rounding of 0 are 0, with derivative 0."""
     there = values > 4.0 * values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
     return jnp.where(there, jnp.sqrt(jnp.where(there, values, 1.0)), 0.0)
 
@@ -118,8 +118,8 @@ def root_or_zero(values: Array) -> Array:
 def hermitian_error(pencil: tuple[Array, Array], values: Array, shapes: Array) -> Array:
     """Relative errors (k,) of eigenvalues of A x = value B x, both Hermitian, by Rayleigh's quotient x^H A x / x^H B x.
 
-    Its error is of second order in that of the shape; the rounding of its terms, which cancel where a soft spring stands beside
-    a stiff one, is counted.
+    Its error is of second order in that of the shape. The rounding of its terms, which cancel for soft springs beside stiff
+    ones, is included.
 
     **Arguments**: `pencil` A and B (n, n), B positive definite; `values` (k,); `shapes` (n, k).
     """
@@ -135,20 +135,20 @@ def hermitian_error(pencil: tuple[Array, Array], values: Array, shapes: Array) -
 def hermitian_modes(square: Array) -> tuple[Array, Array]:
     """Ascending eigenvalues (..., n) and eigenvectors (..., n, n) of Hermitian matrices.
 
-    The vectors of equal eigenvalues, which are not unique, have derivative 0 among each other in place of NaN.
+    The vectors of equal eigenvalues, which are not unique, have derivative 0 relative to each other instead of NaN.
     """
     if square.shape[-1] > 3 or jnp.iscomplexobj(square):
-        values, vectors = jnp.linalg.eigh(square)  # a named pair, which its derivative could not be
+        values, vectors = jnp.linalg.eigh(square)  # a plain tuple, since a derivative rule cannot return a named pair
         return values, vectors
     return _small_modes(square)
 
 
 @_compiled
 def _small_modes(square: Array) -> tuple[Array, Array]:
-    """Eigenvalues and vectors of real symmetric matrices up to 3 x 3 by Jacobi's rotations, written out.
+    """Eigenvalues and vectors of real symmetric matrices up to 3 x 3 by unrolled Jacobi rotations.
 
-    Not for speed alone: on two cores, library calls for large batches in one program can wait for each other for
-    ever (jaxlib 0.10), and machines of up to three platforms are the ones that are judged by the hundred thousand.
+    The reason is not only speed: on two cores, library calls for large batches in one program can deadlock (jaxlib 0.10), and
+    large batches have machines of up to three platforms.
     """
     n = square.shape[-1]
     entries = tuple(tuple(square[..., i, j] for j in range(n)) for i in range(n))
@@ -175,7 +175,7 @@ def _small_modes(square: Array) -> tuple[Array, Array]:
 
     a, v = jax.lax.fori_loop(0, (0, 0, 1, 6)[n], sweep, (entries, axes))
     numbers = [jnp.stack([a[i][i] for i in range(n)], axis=-1), *(jnp.stack(row, axis=-1) for row in v)]
-    values, *rows = jax.lax.sort(numbers, num_keys=1)  # each column goes with its value
+    values, *rows = jax.lax.sort(numbers, num_keys=1)  # each column belongs to its value
     return values, jnp.stack(rows, axis=-2)
 
 
@@ -192,7 +192,7 @@ def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple
 
 
 def magnitude(value: Array) -> Array:
-    """|value| of complex numbers, with derivative 0 in place of NaN where the value is exactly 0."""
+    """Modulus of complex numbers, with derivative 0 instead of NaN if the value is exactly 0."""
     square = value.real**2 + value.imag**2
     zero = square == 0.0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
@@ -241,7 +241,7 @@ def _adjugate(a: Array) -> tuple[Array, Array]:
 
 
 def _times(a: Array, b: Array) -> Array:
-    """a @ b as a sum, which the compiler fuses with what is around it."""
+    """Product a @ b as a sum, which the compiler can fuse."""
     return jnp.sum(a.reshape(*a.shape, *[1] * (b.ndim - 1)) * b[None], axis=1)
 
 
@@ -249,8 +249,8 @@ def _times(a: Array, b: Array) -> Array:
 def solve_in_turn(a: Array, b: Array) -> Array:
     """x of a x = b by the library; values alone. On a processor it is called for one system of a batch after the other.
 
-    A call for a batch may wait for itself for ever there: it hands its systems to the threads that run such calls, and when all
-    of them wait so, none is left to work (jaxlib before 0.11.2). From about 20 equations on, one after the other is faster too.
+    A batched call can deadlock there: it gives its systems to the threads that run such calls, and if all of them wait, no
+    thread is left to work (jaxlib before 0.11.2). From about 20 equations on, one after the other is also faster.
     """
     return jnp.linalg.solve(a, b)
 
@@ -296,7 +296,7 @@ def _eigenvectors_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tu
 def refined(product: Callable[[Array], Array], nearly: Callable[[Array], Array], b: Array, norm: Array) -> Array:
     """x of A x = b, with A x = `product`(x), its approximate inverse `nearly` and its row-sum `norm`.
 
-    Corrected by what is left until that is rounding: mostly never, at most 4 times.
+    Corrected by the residual until that is rounding: usually not at all, at most 4 times.
     """
     eps = jnp.finfo(norm.dtype).eps
 
@@ -320,7 +320,7 @@ def refined(product: Callable[[Array], Array], nearly: Callable[[Array], Array],
 
 
 def solve_definite(a: Array, b: Array) -> Array:
-    """x (n,) or (n, m) of a x = b, a symmetric and positive definite: nothing needs to be exchanged, and single numbers have no
+    """x (n,) or (n, m) of a x = b, a symmetric and positive definite, without pivoting and therefore without
     branches."""
     rows = jnp.concatenate([a, b if b.ndim > 1 else b[:, None]], axis=1)
     for k in range(b.shape[0]):
@@ -334,7 +334,7 @@ def solve_definite(a: Array, b: Array) -> Array:
 def eliminate(a: Array, b: Array) -> Array:
     """x (n,) or (n, m) of a x = b, by elimination with pivots.
 
-    Library calls for large batches in one program can wait for each other for ever (jaxlib 0.10, two cores).
+    Library calls for large batches in one program can deadlock (jaxlib 0.10, two cores).
     """
     n = a.shape[0]
     place = jnp.arange(n)
@@ -351,11 +351,11 @@ def eliminate(a: Array, b: Array) -> Array:
 
 @jax.custom_jvp
 def written_inverse(matrix: Array) -> Array:
-    """The inverse by Gauss and Jordan's elimination, written out: a library call would keep the compiler from fusing the
-    time loop, and large batches of them can wait for each other for ever on few cores (jaxlib 0.10).
+    """Inverse by unrolled Gauss-Jordan elimination, since a library call would prevent fusion in the time loop, and large
+    batches of them can deadlock on few cores (jaxlib 0.10).
 
-    There is no search for pivots. It is for matrices whose diagonal outweighs the rest: 1/(gamma h) - J does where h is
-    small, and a step that lost its digits is refused by its own error estimate, and tried again with a smaller h.
+    Without pivoting, for diagonally dominant matrices such as 1/(gamma h) - J for small h. A step that has lost its digits is
+    rejected by its error estimate and repeated with a smaller h.
     """
     for i in range(matrix.shape[0]):
         here = np.arange(matrix.shape[0]) == i

@@ -20,7 +20,7 @@ _PHASE = 1.0
 def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes c of Radau's right quadrature on [0, 1] and the matrix a, integrals of the Lagrange polynomials up to each node.
 
-    Both come from Legendre polynomials, whose matrices are well conditioned; those of powers would cost five digits.
+    Both follow from Legendre polynomials, whose matrices are well conditioned; those of powers would lose five digits.
     """
     ends = np.zeros(stages + 1)
     ends[-2:] = -1.0, 1.0  # P_s - P_(s-1) has the nodes for roots, 1 among them
@@ -47,19 +47,19 @@ _FORMS = _forms()
 
 
 def steps_for(radians: Array) -> Array:
-    """Number of steps for so many radians of the fastest oscillation; decay, however fast, asks for none."""
+    """Number of steps for the given radians of the fastest oscillation; decay of any rate needs no more."""
     return jnp.ceil(radians / _PHASE).astype(int)
 
 
 def transition(slopes: Array, h: float | Array) -> Array:
-    """The matrix (2 m, 2 m) that carries (x, x') over a step `h` of x'' = P x + R x', by Radau's collocation of order 11.
+    """Transition matrix (2 m, 2 m) of (x, x') over a step `h` of x'' = P x + R x', by Radau's collocation of order 11.
 
         x_i = x + h c_i x' + h^2 sum_j (a a)_ij k_j,   x'_i = x' + h sum_j a_ij k_j,   k_i = P_i x_i + R_i x'_i
 
-    It is L-stable: what decays within a step, such as the slip of a load with much drag, is gone at its end and does not
-    disturb what follows; an explicit method would have to resolve the decay.
+    It is L-stable: motions that decay within a step, such as the slip of a load with strong drag, vanish at its end. An
+    explicit method would have to resolve the decay.
 
-    **Arguments**: `slopes` [P, R] (6, m, 2 m) at `NODES`. **Returns** the matrix; derivatives go through it.
+    **Arguments**: `slopes` [P, R] (6, m, 2 m) at `NODES`. **Returns** the matrix, which is differentiable.
     """
     stages, m, _ = slopes.shape
     constant, linear, square = jnp.asarray(_FORMS, slopes.dtype)

@@ -1,8 +1,8 @@
-"""Sine and cosine without branches or tables, which a compiler turns into vector instructions.
+"""Sine and cosine without branches or tables, which a compiler can vectorize.
 
 XLA's CPU backend calls the C library once for each number. Here the angle is reduced by multiples of pi in three parts (Cody
-and Waite), for the cosine by odd multiples of pi/2, and what is left, within pi/2, goes into one odd polynomial: neither
-function computes anything of the other, which a compiler that computes every value anew for each use would do twice. The
+and Waite), for the cosine by odd multiples of pi/2, and one odd polynomial is evaluated at the remainder, within pi/2. The two
+functions share no value, since a compiler that recomputes values for each use would compute it twice. The
 error is below 1.1 times the distance of 1 to the next number for angles up to 1e5 and grows in proportion to the angle's own
 rounding beyond, as that of any sine of a rounded angle does.
 """
@@ -31,7 +31,7 @@ _PI = Fraction(
 )
 
 _TERMS = {np.dtype(np.float64): 8, np.dtype(np.float32): 5}
-"""Number of terms of the polynomial beside the angle itself."""
+"""Number of terms of the polynomial in addition to the angle."""
 
 
 def _parts(dtype: np.dtype) -> tuple[float, float, float]:
@@ -48,10 +48,10 @@ def _parts(dtype: np.dtype) -> tuple[float, float, float]:
 
 @functools.cache
 def _polynomial(terms: int) -> tuple[float, ...]:
-    """P(z) of so many terms, lowest power first, with sin r = r + r z P(z), z = r^2 up to (pi/2)^2.
+    """Coefficients of P(z), lowest power first, with sin r = r + r z P(z), z = r^2 up to (pi/2)^2.
 
-    Taylor's series, from which the highest powers are taken one after another by the Chebyshev polynomial that differs least
-    from 0 there (economization): the error is that of the best polynomial but for a few per cent.
+    Taylor's series with its highest powers removed one after another by Chebyshev polynomials (economization); the error
+    exceeds that of the best polynomial by a few per cent.
     """
     scale = 2 / (_PI / 2) ** 2
     chebyshev = [[Fraction(1)], [Fraction(-1), scale]]
@@ -72,7 +72,7 @@ def _polynomial(terms: int) -> tuple[float, ...]:
 
 
 def _summed(z: Array, coefficients: Sequence[float]) -> Array:
-    """sum_k coefficients_k z^k, in pairs (Estrin): a third as many products wait for one another as in Horner's form."""
+    """Polynomial sum_k coefficients_k z^k in pairs (Estrin), with a third of the dependent products of Horner's form."""
     parts: list[Array | float] = list(coefficients)
     while len(parts) > 1:
         parts = [parts[k] + parts[k + 1] * z if k + 1 < len(parts) else parts[k] for k in range(0, len(parts), 2)]
@@ -89,7 +89,7 @@ def _sine(x: Array, ahead: float) -> Array:
     r = ((x - halves * first) - halves * second) - halves * third
     z = r * r
     constant, *others = _polynomial(_TERMS[dtype])
-    # The largest term is added last, so that all others' roundings are as small as in Horner's form.
+    # The largest term is added last, which keeps the roundings of the others as small as in Horner's form.
     total = constant + z * _summed(z, others)
     # An odd number of half turns changes the sign: the last bit of the number, beside one that leaves it no fraction, is
     # shifted to where the sign is. Operations on bits take no time beside those on numbers.

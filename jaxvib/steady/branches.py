@@ -1,4 +1,4 @@
-"""The whole diagram: at which rotor speeds the loads jam at which speed."""
+"""Branch diagram: load speeds of jams over the rotor speed."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def branches(
     """
     scene = validate_scene(scene)
     if exact:
-        from jaxvib.steady.orbits.diagram import exact_branches  # needs the time integrator: only who asks pays
+        from jaxvib.steady.orbits.diagram import exact_branches  # imports the time integrator, which others do not need
 
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
@@ -160,7 +160,7 @@ def branches(
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     model = jammed_model(scene).decomposed()
     crowded, resonances = fold_points(model, per_side)
-    # As many points as asked for: those of the crowded grid, thinned evenly and pressed into the range.
+    # The requested number of points: those of the dense grid, thinned evenly and moved into the range.
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
     share = jnp.linspace(0.0, 1.0, points)
     omega = jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))

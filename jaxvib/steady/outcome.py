@@ -1,7 +1,7 @@
-"""Outcome of a question: its result, the error that its status stands for, or the status `refused`.
+"""Outcome of a computation: its result, the error of its status, or the status `refused`.
 
 Numbers of a scene may have no value until a compiled program runs. Checks of such numbers are skipped when the scene is built;
-if one of them turns out not to be allowed, the result has the status `refused` and no numbers.
+if one of them is not allowed, the result has the status `refused` and no numbers.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def outcome(
     failures: Collection[str] = (),
     hint: Callable[[str], str] = lambda _: "",
 ) -> Found:
-    """Return the result of a question about `scene` up to the time `end`, or raise the error of a known status.
+    """Return the result of a computation for `scene` up to the time `end`, or raise the error of a known status.
 
     **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: text after the sentence of the
     status with that name.

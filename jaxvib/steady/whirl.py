@@ -34,7 +34,7 @@ __all__ = ["CriticalSpeeds", "Whirl", "WhirlStatus", "critical_speeds", "whirl"]
 Weights = Literal["fixed", "none"]
 
 _TIE, _TIE_ROUNDINGS = 1e-9, 100.0
-"""Size of the coupling that tells two whirls of one speed apart, relative to the machine's own matrices, and the least size in
+"""Size of the coupling that separates two whirls of one speed, relative to the matrices of the machine, and its minimum in
 units of the rounding."""
 
 
@@ -62,7 +62,7 @@ class CriticalSpeeds(Result):
     forward: Array = eqx.field(metadata=in_unit("", "whirl"))
 
     def summary(self) -> str:
-        """A line for each speed, for a person to read."""
+        """Return a line of text for each speed."""
         pairs = zip(np.asarray(self.speed), np.asarray(self.forward), strict=True)
         lines = [f"critical speed {w:.6g} rad/s, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
         lost = [self.message] if self.status_name != "done" else []
@@ -180,8 +180,8 @@ def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
         return jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
 
     def one_of_each(values: Array, stops: Array) -> tuple[Array, Array]:
-        # Of each conjugate pair the one that turns forward in time. Real ones come in pairs too, one of a displacement that
-        # creeps back and one of a velocity that stops: without gyroscopic coupling as many of each, see `_stopping`.
+        # One value of each conjugate pair, with positive frequency. Real values also come in pairs: a displacement that creeps
+        # back and a velocity that stops; without gyroscopic coupling their numbers are equal, see `_stopping`.
         oscillates = jnp.abs(values.imag) > 1e-12 * jnp.max(jnp.abs(values))
         rank = jnp.argsort(jnp.argsort(jnp.where(oscillates, jnp.inf, stops)))
         creeps = rank < jnp.sum(~oscillates) // 2
@@ -191,7 +191,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
     def at(n: Array) -> tuple[Array, Array, Array, Array]:
         resisting = carrier.damping + n * gyroscopic
         values = jnp.linalg.eigvals(first_order(resisting))
-        # Two whirls of one speed are told apart by a coupling too small to be seen in the speeds.
+        # A coupling too small to change the speeds separates two whirls of one speed.
         coupled = jax.lax.stop_gradient(resisting + part)
         apart, vectors = jnp.linalg.eig(jax.lax.stop_gradient(first_order(coupled)))
         shapes = vectors[:nd]
@@ -231,7 +231,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
     slope, length = jnp.abs(2.0 * m * values + c), jnp.abs(values)
     rounding = len(sizes) * jnp.finfo(sizes.dtype).eps * (rough[0] * length**2 + rough[1] * length + rough[2])
     residual = jnp.abs((m * values + c) * values + k) + rounding
-    # Two roots that nearly coincide are apart by the square root of the rounding.
+    # The distance of two nearly equal roots is the square root of the rounding.
     step = jnp.minimum(residual / jnp.where(slope > 0.0, slope, 1.0), jnp.sqrt(residual / m.real))
     step = jnp.where(slope > 0.0, step, jnp.sqrt(residual / m.real))
     return -(2.0 * values + c / m).real, step / length
@@ -268,7 +268,7 @@ def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
     square, inverse = relative_to(carrier.stiffness, jax.lax.stop_gradient(inertia - part))
     shapes = inverse.T @ hermitian_modes(square)[1]
     values, shapes = values[::-1], shapes[:, ::-1]
-    # A whirl 1e7 times as fast as the slowest one counts as none.
+    # A whirl 1e7 times as fast as the slowest one does not count.
     none = 1e-14 * jnp.max(values)
     there, decided = values > none, jnp.abs(values) < none
     error = hermitian_error(jax.lax.stop_gradient((inertia, carrier.stiffness)), values, shapes)
@@ -315,13 +315,14 @@ def _mass(model: LinearModel, loads: Weights) -> Array:
 
 
 def _sense_matrix(mount: Mount) -> Array:
-    """A gyroscopic matrix (nd, nd) that tells whirls of one speed apart by their sense."""
+    """Gyroscopic matrix (nd, nd) that separates whirls of one speed by their direction."""
     planes = jnp.stack(mount.rows)
     turn = planes[:, 0].T @ planes[:, 1]
     return turn - turn.T
 
 
 def _sense(mount: Mount, shapes: Array) -> Array:
-    """Twice the area that shapes (nd, k) sweep in a turn at the rotor and of its tilts: positive with the rotor's sense."""
+    """Twice the area that shapes (nd, k) sweep in a turn, at the rotor and by its tilts; positive in the direction of the
+    rotor."""
     moved = jnp.stack(mount.rows).astype(shapes.dtype) @ shapes
     return jnp.sum(jnp.imag(moved[:, 0] * jnp.conj(moved[:, 1])), axis=0)

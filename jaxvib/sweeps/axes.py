@@ -44,7 +44,7 @@ _START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s
 _KEYS = ["from", "to", "count", "scale"]
 
 _MOST_CORNERS = 10
-"""Maximum number of axes for which all corners are checked; of more, only the two opposite corners are."""
+"""Maximum number of axes for which all corners are checked; with more axes only the two opposite corners are."""
 
 AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int | str]
 """A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the number is sampled."""
@@ -60,10 +60,10 @@ class Spot(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """A number, or several of one name, that changes from case to case.
+    """Number, or several numbers with one name, that changes from case to case.
 
-    **Attributes**: `name`, `unit`; `values` (n,) SI that it takes one after another, None for one that is sampled between `low`
-    and `high`, by ratio where `log`; the `spot` where it stands.
+    **Attributes**: `name`, `unit`; `values` (n,) SI, None for a number that is sampled between `low` and `high`, by ratio if
+    `log`; the `spot` of the number.
     """
 
     name: str
@@ -82,10 +82,10 @@ class Axis(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """All cases of a study: every combination of the axes' values, and for each of them every sample.
+    """All cases of a study: every combination of the values of the axes, and every sample for each of them.
 
-    **Attributes**: `axes`; `samples` how many, 0 without sampled axes; `seed`, `sampling` as in `samples`; `tile` how many
-    cases along each dimension are computed together.
+    **Attributes**: `axes`; number of `samples`, 0 without sampled axes; `seed`, `sampling` as in `samples`; `tile`: number of
+    cases of a chunk along each dimension.
     """
 
     axes: tuple[Axis, ...]
@@ -147,7 +147,7 @@ class Grid(NamedTuple):
 
 
 def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
-    """An axis by the name of its number and what it is given: a list of values, or a table.
+    """Axis of the number with that name, from a list of values or a table.
 
     **Raises** `InputError` for a name or values that the scene or a start cannot have.
     """
@@ -184,7 +184,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
         if np.unique(values).size < values.size:
             raise InputError(f"axes.{name}", "has a value twice; name each one once")
         axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, spot)
-    for end in (axis.low, axis.high):  # what one number may be, its constructor knows
+    for end in (axis.low, axis.high):  # the constructor checks the range of a single number
         validate_scene(put(scene, (spot,), jnp.asarray([end])))
     return axis
 
@@ -205,7 +205,7 @@ def _where(scene: Scene, name: str) -> tuple[Spot, str]:
 
 
 def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
-    """**Raises** `InputError` where two axes change the same number."""
+    """**Raises** `InputError` if two axes change the same number."""
     taken: dict[object, str] = {}
     for axis in axes:
         found, field, entry = axis.spot
@@ -221,7 +221,7 @@ def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
 
 
 def put(scene: Scene, spots: Sequence[Spot], values: Array) -> Scene:
-    """The scene with a case's numbers (axes,)."""
+    """Return the scene with the numbers (axes,) of a case."""
     for k, spot in enumerate(spots):
         if spot.number is not None:
             scene = put_numbers(scene, (spot.number,), jnp.full(spot.number.size, values[k]))

@@ -20,21 +20,20 @@ from jaxvib.units import Number, number
 __all__ = ["on_a_cluster"]
 
 _AHEAD = 2
-"""Chunks that are given out for each worker: one that it computes, one that waits."""
+"""Number of submitted chunks for each worker: one in computation, one waiting."""
 
 _STUDIES: dict[str, Study] = {}
-"""Studies whose program this worker has compiled."""
+"""Studies whose programs this worker has compiled."""
 
 
 def on_a_cluster(
     study: Study, todo: Iterable[int], *, workers: int | None, scheduler: str | None, timeout: Number
 ) -> Generator[tuple[int, Chunk], None, None]:
-    """Lets workers compute the chunks; gives each with its number as it is finished. This process alone writes.
+    """Compute the chunks by workers; yield each finished chunk with its number. Only this process writes.
 
-    A worker that dies loses the chunks that it held, which others compute again. A chunk whose workers died several times is
-    given up: its cases are "lost".
+    The chunks of a worker that dies are computed by others. If several workers died with a chunk, its cases are "lost".
 
-    **Raises** `InputError` where Dask is not installed, the scheduler does not answer, no worker comes, or one has other
+    **Raises** `InputError` if Dask is not installed, the scheduler does not answer, no worker connects, or a worker has other
     versions.
     """
     try:
@@ -48,7 +47,7 @@ def on_a_cluster(
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))
     with contextlib.ExitStack() as stack:
         if scheduler is None:
-            # Dask's profile of its workers, which nobody sees here, takes half of what a worker costs beside its chunks.
+            # Dask's profiling of its workers, which is not used here, takes half of their overhead.
             stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
             options = {"dashboard_address": None, "silence_logs": 50}
             address = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **options))
@@ -57,11 +56,11 @@ def on_a_cluster(
         try:
             client = stack.enter_context(Client(address, timeout=seconds, set_as_default=False))
             client.wait_for_workers(1, timeout=seconds)
-        except Exception as error:  # what else than a scheduler answers there may send anything
+        except Exception as error:  # another server at that address may send anything
             problem = f"is {scheduler!r}, and no scheduler with workers answers there within {seconds:g} s"
             advice = "start one with: dask scheduler; dask worker ADDRESS"
             raise InputError("scheduler", f"{problem} ({_first_line(error)}); {advice}") from error
-        # Arrays that a worker unpacks before it is told to compute in double precision would lose half their digits.
+        # Arrays that a worker unpacks before double precision is enabled would lose half their digits.
         plain = dataclasses.replace(study, scene=jax.tree.map(np.asarray, study.scene))
         precise, chunks = jnp.result_type(float) == np.float64, iter(todo)
         running, numbers = as_completed(loop=client.loop), {}
@@ -89,14 +88,13 @@ def on_a_cluster(
 
 
 def _remote(study: Study, chunk: int, key: str, expected_versions: dict[str, str], precise: bool) -> Chunk | str:
-    """Cases of a chunk, computed on a worker, or the reason why it may not compute them: its versions are others than the
-    store's."""
+    """Cases of a chunk, computed on a worker, or the reason for a refusal: versions that differ from those of the store."""
     for name, version in versions().items():
         if expected_versions[name] != version:
             return f"has {name} {version}, and the store was begun with {expected_versions[name]}: digits would differ"
     jax.config.update("jax_enable_x64", precise)
     take_a_device()
-    if key not in _STUDIES:  # the first copy that came here is kept, whose functions the program was compiled for
+    if key not in _STUDIES:  # the first received copy is kept, since the program was compiled for its functions
         _STUDIES[key] = dataclasses.replace(study, scene=jax.tree.map(jnp.asarray, study.scene))
     return compute(_STUDIES[key], chunk)
 

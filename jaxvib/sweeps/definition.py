@@ -1,4 +1,4 @@
-"""A validated study: its identity, the shape of the program that computes its cases, and the statuses of these."""
+"""Validated study: its identity, the static arguments of its program, and the statuses of its cases."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from optimize.quantities.quantity import Tier
 __all__ = ["CASE_STATUSES", "UNKNOWN", "CaseStatus", "Study", "SweepStatus", "identify"]
 
 UNKNOWN = "unknown"
-"""Key of the reason, in the identity of what cannot be compared."""
+"""Key of the reason in the identity of a value that cannot be compared."""
 
 _OPTIONS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
 """Options of JAX that change results."""
 
 
 def identify(value: object) -> Plain:
-    """Describe a value, see `identity`; one that cannot be compared is described by a text that no other one has."""
+    """Describe a value, see `identity`; a value that cannot be compared has a unique text."""
     try:
         return identity(value)
     except UnknownIdentity as error:
@@ -90,15 +90,15 @@ class Study:
     def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None, str]:
         """Static arguments of the compiled program, beside the scene and the cases.
 
-        The digest of the measures' identities is one of them: a function equals itself although a number that it refers to
-        has changed, and would find the program of before.
+        They include the digest of the identities of the measures: a function whose global numbers have changed equals itself,
+        and would get the previous program.
         """
         return self.spots, self.measures, self.plan, self.start, self.mode, digest(self.identities)
 
     @property
     def size(self) -> int:
-        """Number of cases that the program computes at a time: whole batches, because cases in a partial batch would be
-        computed by other instructions."""
+        """Number of cases in one call of the program, a multiple of the batch, since a partial batch would be computed by other
+        instructions."""
         return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // BATCH_SIZE) * BATCH_SIZE
 
     @property
@@ -123,7 +123,7 @@ class Study:
 
     @property
     def key(self) -> str:
-        """A text that differs from that of every other study."""
+        """Text that is unique for the study."""
         return digest(self.record)
 
     def changed(self) -> str | None:

@@ -34,12 +34,12 @@ Report = Callable[[Progress], None]
 
 
 def in_this_process(study: Study, todo: Iterable[int]) -> Generator[tuple[int, Chunk], None, None]:
-    """Computes chunks on all cores, by one program that all threads share; gives each with its number as it is finished."""
+    """Compute chunks on all cores by one program that all threads share; yield each finished chunk with its number."""
     return in_parallel(lambda chunk: compute(study, chunk), todo)
 
 
 def timed(cases: int, done: int, report: Report | None) -> Callable[[int], None]:
-    """A function to call with the number of cases of each chunk that is finished, which reports how far it is."""
+    """Function that is called with the number of cases of each finished chunk and reports the progress."""
     begun, before, now = time.perf_counter(), done, done
 
     def add(more: int) -> None:

@@ -1,4 +1,4 @@
-"""Figures of a store: which fits, what goes into it, read so that memory stays bounded."""
+"""Figures of a store, chosen by its axes and read with bounded memory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["figures", "plot_distribution", "plot_map", "plot_shares", "plot_sweep", "plot_tornado", "wilson"]
 
 _MAX_DOTS = 1500
-"""Largest number of cases along an axis of a figure; of more, only every k-th is drawn."""
+"""Largest number of cases along an axis of a figure; beyond it only every k-th case is drawn."""
 
 _ROWS = 9
 """Values of the other axis at which folds and torus points are computed."""
@@ -43,7 +43,7 @@ class _Table(NamedTuple):
 
 
 def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
-    """The interval of Wilson that holds a share, of which `hits` of `cases` were seen, with 95 %; 0 to 1 without cases.
+    """Wilson's 95 % interval of a share with `hits` of `cases`; 0 to 1 without cases.
 
     It is the set of shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
 
@@ -61,8 +61,8 @@ def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np
 
 
 def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
-    """The figure that fits a study: over two axes a map, of regimes where they were measured; over samples alone the
-    distribution of what was measured first; over one axis that as points."""
+    """Plot the figure that fits a study: over two axes a map, of regimes if they were measured; over samples alone the
+    distribution of the first measure; over one axis that measure as points."""
     opened = Store(Path(store))
     dims = _dims(opened)
     if len([d for d in dims if d != SAMPLE]) >= 2:
@@ -84,7 +84,7 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
 def figures(
     store: str | Path, measure: str | None = None, *, x: str | None = None, y: str | None = None, theory: bool = True
 ) -> Iterator[tuple[str, Figure]]:
-    """Every figure that fits a study, by name: "map", "shares", "distribution", "tornado"; for the arguments see `plot_map`.
+    """Figures that fit a study, by name: "map", "shares", "distribution", "tornado"; for the arguments see `plot_map`.
 
     **Raises** `InputError` for names that the store does not have.
     """
@@ -110,11 +110,11 @@ def plot_map(
     theory: bool = True,
     ax: Axes | None = None,
 ) -> Drawn:
-    """A map over two axes: of labels (regimes, jam modes) with the folds and torus points of exact jams drawn in, or of values.
+    """Plot a map over two axes: of labels (regimes, jam modes) with the folds and torus points of exact jams, or of values.
 
     **Arguments**: `measure`: its name in the store (default: the regime, if there is one); `x`, `y` names of axes;
-    along further axes the middle one is shown. `theory`: whether lines are drawn where exact jams fold or lose their stability;
-    they are computed by `branches(scene, exact=True)` where one of the axes is the rotor's speed.
+    along further axes the middle case is shown. `theory`: True to draw lines at which exact jams fold or lose their stability,
+    computed by `branches(scene, exact=True)` if one of the axes is the rotor speed.
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for names that the store does not have.
     """
@@ -150,8 +150,8 @@ def plot_map(
 
 
 def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """The share of the cases that each label has (regimes with their jam modes) over one axis, all other axes taken together,
-    with the intervals of Wilson that hold it with 95 %. **Returns** a matplotlib figure, or the given `ax`."""
+    """Plot the share of each label (regimes with their jam modes) over one axis, over all cases of the other axes, with
+    Wilson's 95 % intervals. **Returns** a matplotlib figure, or the given `ax`."""
     from jaxvib.draw.sweeps import shares_chart
 
     opened = Store(Path(store))
@@ -228,7 +228,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
 
 
 def _fifths(store: Store, axis: str) -> tuple[float, float]:
-    """Up to where the lowest fifth of an axis's values goes, and from where on the highest."""
+    """Upper end of the lowest fifth of the values of an axis, and lower end of the highest fifth."""
     values = store.read(axis, slice(0, 1 << 20))
     return float(np.nanquantile(values, 0.2)), float(np.nanquantile(values, 0.8))
 
@@ -238,7 +238,7 @@ def _dims(store: Store) -> list[str]:
 
 
 def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:
-    """An axis's values, no more than can be drawn, and every how many-th they are."""
+    """Values of an axis, at most as many as can be drawn, and their stride."""
     values = store.read(axis)
     step = -(-values.size // _MAX_DOTS)
     return values[::step], step
@@ -267,11 +267,11 @@ def _measure(store: Store, name: str | None) -> str:
 def _measure_label(store: Store, name: str) -> str:
     attributes = store.group[name].attrs
     words, unit = str(attributes.get("long_name", name)), attributes.get("units", "")
-    return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # no formula, whatever users call their quantities
+    return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # no formula, whatever the names of users' quantities
 
 
 def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:
-    """Numbers of a measure in a region, the largest along a further dimension; NaN where there is none."""
+    """Numbers of a measure in a region, the largest along a further dimension; NaN for missing ones."""
     values = store.read(name, region).astype(float)
     return np.max(values, axis=-1) if values.ndim > len(store.shape) else values
 
@@ -285,7 +285,7 @@ def _is_label(store: Store, name: str) -> bool:
 
 
 def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Table:
-    """Labels of the cases of a region: the regime's word, and where loads are jammed their mode."""
+    """Labels of the cases of a region: the name of the regime, and the mode of jammed loads."""
     words: list[str] = str(store.group["regime"].attrs["flag_meanings"]).split() if "regime" in store.names else ["not jammed"]
     first = len(words)
     done = store.read("status", region) == 1
@@ -301,8 +301,8 @@ def _theory(
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """Lines in the plane on which exact jams of the stored scene fold or lose their stability, by kind.
 
-    Only over the rotor's speed. Where the other axis is a number of the start, which steady motions do not depend on, lines are
-    straight; where it is one of the scene, they go through the points found at some of its values.
+    Only over the rotor speed. If the other axis is a number of the start, which has no influence on steady motions, lines are
+    straight; if it is a number of the scene, they connect the points at some of its values.
     """
     if _SPEED not in (across, up):
         return {}

@@ -1,9 +1,9 @@
 """Identity of a value: plain data that differ if two values can give different results.
 
 Numbers, containers and dataclasses are described by their entries, arrays by a digest of type, shape and bytes. A function of a
-user is described by its bytecode, its defaults and its closure, and by all that it refers to, recursively: global numbers,
-helper functions, classes, entries of the user's modules. The text of the source is not read: it may have been edited since it
-was imported. What comes from an installed package or from Python itself is described by its name and version.
+user is described by its bytecode, its defaults and its closure, and by everything that it refers to, recursively: global
+numbers, helper functions, classes, entries of the user's modules. The text of the source is not read, since it may have been
+edited after the import. Objects of installed packages and of Python are described by name and version.
 
 A value whose influence cannot be followed raises `UnknownIdentity`: open files, calls of `open` or `eval`, the clock, random
 numbers of the operating system.
@@ -35,10 +35,10 @@ from jaxvib.results.fields import Plain
 __all__ = ["UnknownIdentity", "difference", "digest", "identity"]
 
 _MAX_VALUES = 100_000
-"""Values that one description may go through."""
+"""Maximum number of values in one description."""
 
 _MAX_ENTRIES = 64
-"""Entries of an array that is written out; of a larger one only the digest is kept."""
+"""Maximum number of entries of an array that is written as such; a larger array is described by a digest."""
 
 _UNKNOWN_BUILTINS = {"open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "breakpoint", "__import__"}
 _UNKNOWN_MODULES = {
@@ -49,22 +49,22 @@ _UNKNOWN_ATTRIBUTES = {
     "fromfile", "genfromtxt", "load", "loadtxt", "memmap", "open", "open_dataset", "read_bytes", "read_csv", "read_excel",
     "read_text",
 }  # fmt: skip
-"""Names whose results depend on something outside of the process's memory: files, clock, environment."""
+"""Names of functions whose results depend on files, the clock or the environment."""
 
 _CLASS_ENTRIES_WITHOUT_EFFECT = {"_abc_impl"}
 
 
 class UnknownIdentity(Exception):
-    """Raised for a value whose influence on results cannot be followed; the message says why."""
+    """Raised for a value whose influence on results cannot be followed; the message gives the reason."""
 
 
 def digest(value: Plain) -> str:
-    """A text of fixed length that differs for different plain data."""
+    """Digest of plain data, a text of fixed length."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def identity(value: object) -> Plain:
-    """Describe a value by all that its results depend on. **Raises** `UnknownIdentity`.
+    """Describe a value by everything that its results depend on. **Raises** `UnknownIdentity`.
 
     >>> identity((1.0, "N"))
     {'tuple': [1.0, 'N']}
@@ -80,7 +80,7 @@ def identity(value: object) -> Plain:
 
 
 def difference(one: Plain, other: Plain, name: str = "") -> tuple[str, Plain, Plain] | None:
-    """The place of the first difference between two plain values, and what stands there in each; None if they are equal."""
+    """Place of the first difference between two plain values, and both entries there; None if the values are equal."""
     if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
         pairs = [(f"{name}.{key}" if name else key, one[key], other[key]) for key in one]
     elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
@@ -91,7 +91,7 @@ def difference(one: Plain, other: Plain, name: str = "") -> tuple[str, Plain, Pl
 
 
 class _Description:
-    """One description: values that are being described, and how many were."""
+    """One description: the values in progress and their number."""
 
     def __init__(self) -> None:
         self.active: dict[int, int] = {}
@@ -204,7 +204,7 @@ class _Description:
     def _function(self, function: types.FunctionType) -> Plain:
         home = str(function.__globals__.get("__name__"))  # `functools.wraps` puts another name into `__module__`
         if _is_library(home) and function.__globals__ is getattr(sys.modules.get(home), "__dict__", None):
-            code: Plain = _version(home)  # a wrapper or a closure of a package, whose version says what its code does
+            code: Plain = _version(home)  # a wrapper or a closure of a package, which its version identifies
         else:
             code = self._code(function.__code__, function.__globals__)
         names = function.__code__.co_freevars
@@ -243,7 +243,7 @@ class _Description:
                 raise UnknownIdentity(f"calls {name}")
             return name if hasattr(builtins, name) else {"missing": name}
         value = scope[name]
-        for step in rest:  # of a module only the entry that is used: others may change
+        for step in rest:  # only the used entry of a module, since others may change
             if not isinstance(value, types.ModuleType) or _is_library(value.__name__):
                 break
             if step.opname not in ("LOAD_ATTR", "LOAD_METHOD") or not hasattr(value, step.argval):
@@ -285,7 +285,7 @@ def _is_users(kind: type) -> bool:
 
 
 def _library_name(value: Any) -> str | None:
-    """The name and version of what a package or Python itself defines under its name; None for anything else."""
+    """Name and version of an object that a package or Python defines under its name; None for other objects."""
     module, inner = getattr(value, "__module__", None), getattr(value, "__qualname__", None) or getattr(value, "__name__", None)
     if not isinstance(inner, str) or isinstance(value, types.MethodType):
         return None

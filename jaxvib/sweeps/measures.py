@@ -24,7 +24,7 @@ _SETTLED_SPEED_SHARE = 0.01
 
 @dataclass(frozen=True)
 class RunMeasure:
-    """A number that is read off a run from the start to the end, see `BatchRun`.
+    """Number that is computed from a run, see `BatchRun`.
 
     **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that gives a scalar, or an array over `axis`, the
     name of a further dimension ("coordinate", "load"); `meanings`, the words for the values 0, 1, ... of one that is a label.
@@ -52,7 +52,7 @@ def _regime(run: BatchRun) -> Array:
 
 
 def _settling(run: BatchRun) -> Array:
-    """The end of the last part in which the speed of some load is not yet near its last one."""
+    """End of the last part in which the speed of a load differs from its final speed."""
     last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
     away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * jnp.abs(rotor), axis=1)
     late = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
@@ -107,7 +107,7 @@ loads' speeds stay within 1 % of the rotor's of their last ones."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:
-    """Measure, looked up by name if it is a text. **Raises** `InputError` for what is no measure."""
+    """Measure, looked up by name if it is a text. **Raises** `InputError` for other values."""
     if isinstance(given, (Quantity, RunMeasure)):
         return given
     if isinstance(given, str) and given in RUN_MEASURES:

@@ -1,4 +1,4 @@
-"""The one program that computes a chunk of cases, and what is done where a case brings it down."""
+"""Program that computes a chunk of cases, and the isolation of cases that raise errors."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from optimize.quantities.evaluation import Evaluation
 __all__ = ["Chunk", "compute", "planned", "shapes"]
 
 _SAMPLES = 1024
-"""States in the window over which a run is measured."""
+"""Number of states in the measuring window of a run."""
 
 _PER_TURN = 8
-"""Fewest of them in a turn of the rotor: loads that jam turn slower."""
+"""Minimum number of them in a turn of the rotor; jammed loads turn more slowly."""
 
 _SLOW_PERIODS = 20
-"""Periods of the lowest natural frequency that the window is long, as that of `simulate`."""
+"""Length of the window in periods of the lowest natural frequency, as in `simulate`."""
 
 _MAX_STEPS = 1e9
-"""Steps of a run: an hour of computing and more."""
+"""Maximum number of steps of a run, about an hour of computing."""
 
 _CODE = {name: k for k, name in enumerate(CASE_STATUSES)}
 
 
 class Chunk(NamedTuple):
-    """The cases of a chunk: by the measure's name what was found, (cases, ...); `status` (cases,) numbers of `CaseStatus`;
-    `errors` the sentence of each case that failed, by its place."""
+    """Cases of a chunk: values by name of the measure, (cases, ...); `status` (cases,): numbers of `CaseStatus`; `errors`: the
+    sentence of each failed case, by its index."""
 
     found: dict[str, np.ndarray]
     status: np.ndarray
@@ -64,7 +64,9 @@ def _each(
         this = put(scene, spots, value)
         evaluation, run = Evaluation(this), None
         if plan is not None:
-            separation = START_SEPARATION if start == "jam" else None  # at one angle, no run would show that a jam is unstable
+            separation = (
+                START_SEPARATION if start == "jam" else None
+            )  # with loads at one angle, no run would show that a jam is unstable
             state = put_start(initial_state(this, start, mode=mode, separation=separation, throw=False), spots, value)
             run = run_in_batch(this, state, plan)
 
@@ -92,9 +94,9 @@ def _speeds(scene: Scene, values: Array, spots: tuple[Spot, ...]) -> tuple[Array
 
 
 def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: float, steps: int | None) -> BatchPlan:
-    """The same steps and the same window for all cases: by the fastest and the slowest of the `corners` (n, axes) of the study.
+    """Plan of steps and window for all cases, by the fastest and the slowest of the `corners` (n, axes) of the study.
 
-    Frequencies grow with each stiffness and fall with each mass, so that no case between the corners is faster or slower.
+    Frequencies increase with each stiffness and decrease with each mass; therefore the corners have the extreme ones.
     """
     fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), spots))
     most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
@@ -105,7 +107,7 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
         name = "until" if steps is None else "steps"
         raise InputError(name, f"needs {until / step:.3g} steps for every run; give a shorter run or fewer steps")
     each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
-    # a number that is whole but for rounding stays what it is
+    # a number that is whole within rounding is not rounded up
     counts = (int(np.ceil(x - 1e-9)) or 1 for x in (each, between))
     return BatchPlan(until, window, _SAMPLES, *counts, implicit=implicit)
 
@@ -118,9 +120,9 @@ def shapes(study: Study) -> list[jax.ShapeDtypeStruct]:
 
 
 def compute(study: Study, chunk: int) -> Chunk:
-    """A chunk's cases. A case that raises an error is found by halving, and recorded with its sentence; no other case is lost.
+    """Compute the cases of a chunk. A case that raises an error is located by bisection and recorded with its sentence.
 
-    The program always has the same shape: a chunk with fewer cases is filled up with copies of its first one.
+    The program always has the same shape: a chunk with fewer cases is padded with copies of its first one.
     """
     values = study.grid.values(chunk)
     errors: dict[int, str] = {}
@@ -141,7 +143,7 @@ def _computed(
     try:
         found, finite = _cases(study.scene, jnp.asarray(filled), *study.program)
         return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
-    except RuntimeError as error:  # what a running program raises; a program that cannot be made is no case's fault
+    except RuntimeError as error:  # errors of a running program only; an error of its compilation concerns all cases
         if "RESOURCE_EXHAUSTED" in str(error):
             raise
         if len(which) == 1:
@@ -154,7 +156,7 @@ def _computed(
 
 
 def _sentence(error: Exception) -> str:
-    """The line of an error that says what happened."""
+    """Line of an error that describes it."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     messages = [line for line in lines if line.split(":")[0].endswith(("Error", "Exception")) and ": " in line]
     return (messages or lines or [type(error).__name__])[-1]

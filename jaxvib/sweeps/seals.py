@@ -31,7 +31,7 @@ def seal_of(store: Path, chunk: int) -> Path:
 
 
 def _digest(files: Mapping[str, Path]) -> str:
-    """Digest of names and contents; a file that is not there counts as such."""
+    """Digest of names and contents, including the absence of a file."""
     found = hashlib.sha256()
     for name, path in files.items():
         try:
@@ -46,7 +46,7 @@ def _digest(files: Mapping[str, Path]) -> str:
 
 
 def _stamps(files: Mapping[str, Path]) -> tuple[object, ...]:
-    """Change whenever a file is written anew or replaced."""
+    """Stamps of files, which change if a file is written again or replaced."""
 
     def stamp(path: Path) -> object:
         try:
@@ -84,7 +84,7 @@ def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None
 
 
 def seal_layout(store: Path) -> None:
-    """Write down all files of a store that has no chunks yet: metadata, values of axes."""
+    """Record digests of all files of a store without chunks: metadata, values of axes."""
     files = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob("*")) if path.is_file()}
     digests = {name: _digest({name: path}) for name, path in files.items()}
     (store / FOLDER).mkdir()
@@ -94,7 +94,7 @@ def seal_layout(store: Path) -> None:
 
 
 def changed_layout(store: Path) -> str | None:
-    """Description of the first file that is not as it was when the store was created; None if there is none."""
+    """Description of the first file that has changed since the creation of the store; None if there is none."""
     try:
         layout = json.loads(read_text(store / FOLDER / _LAYOUT, "a store"))
         digests = layout["files"]
@@ -110,7 +110,7 @@ def changed_layout(store: Path) -> str | None:
 
 
 def _lock(file: int, *, exclusive: bool) -> bool:
-    """Try to lock an open file, which the system frees when the process ends, however it ends; False if another one has it."""
+    """Try to lock an open file; False if another process has it. The system releases the lock at any end of the process."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -132,8 +132,8 @@ def _lock(file: int, *, exclusive: bool) -> bool:
 
 @contextlib.contextmanager
 def locked(store: Path) -> Iterator[bool]:
-    """Hold the lock of a store; gives False if another process or thread has it. **Raises** `OSError` if there is nothing to
-    lock and no file can be made."""
+    """Hold the lock of a store; yields False if another process or thread has it. **Raises** `OSError` if the lock file does
+    not exist and cannot be created."""
     path = store / FOLDER / _LOCK
     file = os.open(path, os.O_RDONLY if path.exists() and not os.access(path, os.W_OK) else os.O_RDWR | os.O_CREAT, 0o666)
     try:

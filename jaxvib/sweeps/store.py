@@ -1,8 +1,7 @@
-"""The store of a study on disk: labelled arrays in Zarr's format, written chunk by chunk, each chunk whole or not at all.
+"""Store of a study on disk: labelled arrays in Zarr's format, written in chunks, each completely or not at all.
 
 Numbers of a chunk are written first, then its statuses, its seal last: a digest of all its files (`jaxvib.sweeps.seals`). A
-chunk is finished if, and only if, its seal is that of its files. Every file appears at once under its name. Nothing is ever
-unpickled.
+chunk is finished if, and only if, its seal agrees with its files. Files are written atomically. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ from jaxvib.sweeps.program import Chunk
 __all__ = ["ChunkState", "Store", "require_zarr", "versions"]
 
 _FORMAT = 2
-"""Number of the layout of the store."""
+"""Version number of the layout of the store."""
 
 _PACKAGES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
 """Packages whose versions may change the last digits of a result."""
 
 
 class ChunkState(IntEnum):
-    """State of a chunk on disk: not computed or cut off, finished, or with files that are not those that were written."""
+    """State of a chunk on disk: not computed or incomplete, finished, or with changed files."""
 
     missing = 0
     finished = 1
@@ -53,7 +52,7 @@ class ChunkState(IntEnum):
 
 
 def require_zarr() -> ModuleType:
-    """The module zarr. **Raises** `InputError` where it is not installed."""
+    """Import zarr. **Raises** `InputError` if it is not installed."""
     try:
         import zarr
     except ImportError as error:
@@ -62,14 +61,14 @@ def require_zarr() -> ModuleType:
 
 
 def versions() -> dict[str, str]:
-    """Versions of all packages that a result depends on, and the sources of jaxvib: a digest, which also says if this process
-    has replaced a part of them."""
+    """Versions of all packages that a result depends on, and a digest of the sources of jaxvib, which also shows parts that
+    this process has replaced."""
     changed = "" if code_state(look=True).is_on_disk else " with changes in this process"
     return {name: importlib.metadata.version(name) for name in _PACKAGES} | {"sources": digest_of_sources()[:16] + changed}
 
 
 class Store:
-    """An opened store.
+    """Open store.
 
     **Attributes**: `path`; `attributes` its record: the study, versions, seed; `arrays` by name; `shape` of the cases and
     `tile` of a chunk; `names` of the measures.
@@ -89,7 +88,7 @@ class Store:
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
                 raise InputError("store", f"is {quoted(str(path))}, which is no store of a sweep; name another one")
             self.record: Tables = self.attributes["study"]
-            # A chunk without any answer gets its file too: one that is missing is damage.
+            # A chunk without values also gets a file, since a missing file counts as damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self.arrays = {name: self.group[name] for name in self.group.array_keys()}
             self.shape = tuple(self.group["status"].shape)
@@ -98,18 +97,18 @@ class Store:
             self.dims = list(self.group["status"].metadata.dimension_names)
         except InputError:
             raise
-        except Exception as error:  # whatever zarr and its codecs say of files that are not what they should be
+        except Exception as error:  # any error of zarr and its codecs for damaged files
             raise self.damaged(f"{type(error).__name__}: {error}") from error
 
     def damaged(self, what: str) -> InputError:
-        """The error to raise for a store that cannot be used."""
+        """Error for a store that cannot be used."""
         return InputError(
             "store", f"is {quoted(str(self.path))}, which is no store of a sweep, or a damaged one ({what}); name another"
         )
 
     @classmethod
     def create(cls, path: Path, study: Study) -> None:
-        """Create the empty store of a study, whole or not at all; one that another process has just created stays."""
+        """Create the empty store of a study atomically; a store that another process has just created stays."""
         zarr = require_zarr()
         part = path.with_name(f".{uuid.uuid4().hex}.partial")
         try:
@@ -131,7 +130,7 @@ class Store:
         return int(self.attributes["coordinates_of_machine"])
 
     def require_same(self, study: Study) -> None:
-        """**Raises** `InputError` if the store is of another study, or of other versions, or if that cannot be told."""
+        """**Raises** `InputError` if the store is of another study or of other versions, or if this cannot be determined."""
         for name, mine in study.identities.items():
             if isinstance(mine, dict) and UNKNOWN in mine and self.record["measure"].get(name) != mine:
                 problem = f"{mine[UNKNOWN]}; the numbers in {str(self.path)!r} may be of other code"

@@ -1,4 +1,4 @@
-"""Adam (optax) from many starts at once: along what is held, demands by an augmented Lagrangian."""
+"""Adam (optax) from many starts at once: along held quantities, with demands by an augmented Lagrangian."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from optimize.search.problem import Point, Problem, derive
 __all__ = ["STRETCH", "Descended", "descend"]
 
 STRETCH = 25
-"""Steps of the descent between two looks at it from outside."""
+"""Number of steps of the descent in one call of its program."""
 
 _ON_THE_WAY = 0.1
 """Allowed violation of held quantities during the descent, in which every step corrects the violation of the one before."""
 
 _UPDATE = 20
-"""Steps after which the multipliers of demands are set anew."""
+"""Number of steps between updates of the multipliers of demands."""
 
 
 class _Lane(NamedTuple):
-    """One search on its way: the point, Adam's state, how long its steps are, multipliers and weight of the demands, the size
-    that the objective began with, and how many steps it has taken."""
+    """State of one search: the point, the state of Adam, the step length, multipliers and weight of the demands, the initial
+    size of the objective, and the number of steps."""
 
     z: Array
     values: Array
@@ -48,7 +48,7 @@ class _Lane(NamedTuple):
 
 
 class Descended(NamedTuple):
-    """End of the descent, a `Point`, the multipliers of the demands there and the objective on the way (steps, starts)."""
+    """Result of the descent: a `Point`, the multipliers of the demands and the history of the objective (steps, starts)."""
 
     point: Point
     multipliers: np.ndarray
@@ -59,14 +59,14 @@ _ADAM = optax.scale_by_adam()
 
 
 def _least(rows: Array, right: Array) -> Array:
-    """The shortest x (d,) with rows (m, d) x = right (m,)."""
+    """Solution x (d,) of least norm of rows (m, d) x = right (m,)."""
     gram = rows @ rows.T
     ridge = jnp.finfo(gram.dtype).eps * (1.0 + jnp.trace(gram))
     return rows.T @ small_solve(gram + ridge * jnp.eye(gram.shape[0]), right)
 
 
 def _along(vector: Array, held: Array, free: Array) -> Array:
-    """The part of `vector` (d,) that moves free numbers only and changes nothing that is held."""
+    """Projection of `vector` (d,) onto changes of free numbers that keep the held quantities."""
     vector = vector * free
     if held.shape[0] == 0:
         return vector
@@ -144,11 +144,11 @@ def _stretch(problem: Problem, lanes: _Lane, rates: Array) -> tuple[_Lane, Array
 
 
 def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Callable[[float, Point], None]) -> Descended:
-    """Adam from every start at once; each step goes along what is held and corrects what the last one left of it.
+    """Descend by Adam from all starts at once; each step keeps the held quantities and corrects their deviations.
 
-    Demands are in the gradient by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w), the multipliers l_i and
-    the weight w set anew every 20 steps. A step to a design where the objective does not exist is not taken, and that start's
-    steps become half as long. `tell` is given what is done (0 to 1) and the point; an interrupt ends the descent where it is.
+    Demands are included by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w) with multipliers l_i and the
+    weight w, which are updated every 20 steps. A step to a design without the objective is rejected, and the step length of
+    that start is halved. `tell` is called with the progress (0 to 1) and the point; an interrupt ends the descent.
 
     **Returns** `Descended`.
     """
@@ -167,7 +167,7 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
 
 
 def _point(lanes: _Lane) -> Point:
-    """Point at which the lanes are, without pieces of the objective."""
+    """Point of the searches, without pieces of the objective."""
     z, values, slopes = (np.asarray(each) for each in lanes[:3])
     nothing = np.zeros((len(z), 0))
     return Point(z, values, slopes, lanes.known, lanes.known_slopes, nothing, np.zeros((*nothing.shape, z.shape[1])))

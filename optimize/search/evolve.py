@@ -1,4 +1,4 @@
-"""CMA-ES: designs sought by the values of the objective alone, for those with many valleys."""
+"""CMA-ES: search by values of the objective alone, for objectives with many local minima."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ _PRICE = 10.0
 """Penalty of a demand that is violated by its own size, in typical values of the objective."""
 
 _LANES = 8
-"""Designs that are computed together: populations are small, and few of them are lost at a time."""
+"""Number of designs in a batch; populations are small, and few designs are lost at a time."""
 
 _REMEMBERED = 200
-"""Number of last designs whose jams are kept."""
+"""Number of last designs whose jams are stored."""
 
 _KEPT = 8
-"""Designs that go on to be polished."""
+"""Number of designs that are polished."""
 
 _APART = 1e-2
 """Least distance of these in one free number, relative to its range."""
 
 _NOWHERE = 1e12
-"""The merit of a design whose objective does not exist."""
+"""Merit of a design without the objective."""
 
 
 class Evolved(NamedTuple):
-    """The best designs that differ (no point where none had the objective), the objective of the best one by generation (g, 1),
-    how many designs were drawn, how many of these had the objective, and whether the search was interrupted."""
+    """Result of an evolution: the best distinct designs (None if no design had the objective), the best objective of each
+    generation (g, 1), the numbers of drawn designs and of those with the objective, and True if it was interrupted."""
 
     point: Point | None
     history: np.ndarray
@@ -49,7 +49,7 @@ class Evolved(NamedTuple):
 
 
 def require_cma() -> None:
-    """**Raises** `InputError` where the package cma is not installed."""
+    """**Raises** `InputError` if the package cma is not installed."""
     if importlib.util.find_spec("cma") is None:
         raise InputError("searcher", "is 'cma', which needs the package cma; install it with: pip install '.[cma]'")
 
@@ -60,8 +60,8 @@ def _valued(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array,
 
 
 class Followed:
-    """Values of populations (s, 1 + me + mi), without derivatives: each design's jams are followed from the nearest of the last
-    designs, and looked up on the whole branch where that leads nowhere."""
+    """Values of populations (s, 1 + me + mi), without derivatives. The jams of each design are followed from the nearest of the
+    last designs, or computed from the whole branch if that fails."""
 
     def __init__(self, problem: Problem):
         self.problem = replace(problem, lanes=_LANES)
@@ -94,18 +94,18 @@ class Followed:
 
 
 def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float, float], None]) -> Evolved:
-    """CMA-ES (Hansen and Ostermeier, Evolutionary Computation 9, 2001; package cma), begun anew with twice the population where
-    it has settled (Auger and Hansen, IEEE CEC 2005), until so many `evaluations` are spent.
+    """Minimize by CMA-ES (Hansen and Ostermeier, Evolutionary Computation 9, 2001; package cma), restarted with twice the
+    population after convergence (Auger and Hansen, IEEE CEC 2005), with at most `evaluations` designs.
 
-    Sought is the least of the objective in parts of its size plus what breaking demands costs. `tell` hears how much is done
-    (0 to 1) and the least objective so far. An interrupt (KeyboardInterrupt) ends the search with what it has.
+    The merit is the scaled objective plus penalties of violated demands. `tell` is called with the progress (0 to 1) and the
+    best objective. An interrupt (KeyboardInterrupt) ends the search with its present result.
     """
     import cma  # an extra
 
     followed, m = Followed(problem), problem.equalities
     merits, designs, history = np.zeros(0), np.zeros((0, problem.space.size)), []
     size, drawn, existing, run, interrupted = np.nan, 0, 0, 0, False
-    # The package limits the step of several numbers only (an error of its own ends the search of one): a second one lies idle.
+    # The package fails for a single number; therefore a second one without effect is added.
     searched = max(problem.space.size, 2)
     population = 4 + int(3 * np.log(searched))
     random = np.random.default_rng(seed)
@@ -137,7 +137,7 @@ def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float,
 
 
 def _best(merits: np.ndarray, designs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The best of some designs that differ."""
+    """Best distinct designs."""
     kept: list[int] = []
     for k in np.argsort(merits, kind="stable"):
         if all(np.max(np.abs(designs[k] - designs[j])) > _APART for j in kept):

@@ -1,4 +1,4 @@
-"""Search from random starts to the best designs: the continuous search, and choices from catalogues by branch and bound."""
+"""Search for the best designs from random starts: continuous search, and catalogues by branch and bound."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from optimize.space import DesignSpace
 __all__ = ["Found", "Options", "Searcher", "choose", "find", "require_searcher"]
 
 _NODES = 400
-"""Bounds that are looked at before a catalogue is given up on."""
+"""Maximum number of bounds in a branch-and-bound search."""
 
 _STARTS_PER_BOUND = 8
-"""Designs that each bound of a catalogue is searched from."""
+"""Number of initial designs for each bound of a catalogue."""
 
 Tell = Callable[[str, float], None]
 
@@ -47,8 +47,8 @@ class Options:
 
 
 class Found(NamedTuple):
-    """Ends of searches, see `Polished`; `drawn` designs, of which `existing` had the objective; whether it was `interrupted`;
-    the bounds (d,) of the space it ended in, SI; how many `nodes` a choice from catalogues took."""
+    """Results of searches, see `Polished`; `drawn` designs, of which `existing` had the objective; `interrupted`; the final
+    bounds (d,), SI; the number of `nodes` of a choice from catalogues."""
 
     point: Point
     history: np.ndarray
@@ -71,7 +71,7 @@ class Found(NamedTuple):
 
 
 def require_searcher(searcher: object) -> None:
-    """**Raises** `InputError` for what is no `Searcher`, or one that is not installed."""
+    """**Raises** `InputError` for a name that is no `Searcher`, or for a package that is not installed."""
     if searcher not in get_args(Searcher):
         raise InputError("searcher", f"is {quoted(searcher)}; it must be one of: {', '.join(map(repr, get_args(Searcher)))}")
     if searcher == "cma":
@@ -79,8 +79,8 @@ def require_searcher(searcher: object) -> None:
 
 
 def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
-    """Searches from random starts. What takes long (exact motions, integrations, tolerances) is searched to leading order and
-    without tolerances first, and then from the best different machines that this finds and some random ones."""
+    """Search from random starts. With expensive quantities (exact motions, integrations, tolerances) a first search is to
+    leading order and without tolerances; the second starts from its best different machines and some random ones."""
     easy = None if options.begin is not None else problem.easy()
     if easy is None:
         return _find(problem, options, tell)
@@ -102,7 +102,7 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
 
 def _with_lanes(problem: Problem, space: DesignSpace) -> Problem:
-    """The search in another space, for few designs."""
+    """Problem in another space, for few designs."""
     return replace(problem, space=space, lanes=_STARTS_PER_BOUND)
 
 
@@ -113,8 +113,8 @@ def _spread(problem: Problem) -> bool:
 
 
 def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
-    """Searches from random starts, or from the designs `begin`; None where no design has the objective. An interrupt
-    (KeyboardInterrupt) ends the search with what it has."""
+    """Search from random starts, or from the designs `begin`; None if no design has the objective. An interrupt
+    (KeyboardInterrupt) ends the search with its present result."""
     tell("drawing starts", 0.0)
     begin, history, interrupted = options.begin, [], False
     if begin is None and options.searcher == "cma":
@@ -126,7 +126,7 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         )
         point, drawn, existing, interrupted = evolved.point, evolved.drawn, evolved.existing, evolved.interrupted
         history.append(evolved.history)
-        # What it found is polished, not descended from.
+        # Its designs are polished without a descent.
         options = replace(options, iterations=0, polishing=0 if interrupted else options.polishing)
     elif begin is not None:
         point = evaluate(problem, begin, looked_up(problem, begin))
@@ -160,14 +160,14 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         interrupted = True
         ended = polish(problem, last, 0, lambda *_: None)
     history.append(ended.history)
-    # Followed jams may have changed their numbers: the whole branch says which they are.
+    # Followed jams may have exchanged their mode numbers, which only the whole branch shows.
     point, broken, left, optimal = _of_their_mode(problem, ended.point), ended.violation, ended.left, ended.optimality
     lost = ~point.exists()
-    if np.any(lost):  # a machine that has the mode is worth more than a better one that lost it on the way
+    if np.any(lost):  # prefer a machine with the mode to a better one that has lost it
         point = _of_their_mode(problem, begun).where(lost, point)
         broken, left, optimal = violation(problem, point), np.where(lost, np.inf, left), optimality(problem, point)
     bounds = np.asarray(problem.space.low), np.asarray(problem.space.high)
-    # Of an evolution there is one value a generation; starts begin behind it.
+    # An evolution has one value for each generation, before those of the starts.
     wide = max(part.shape[1] for part in history)
     whole = np.concatenate([np.broadcast_to(part, (len(part), wide)) for part in history])
     return Found(point, whole, left, broken, optimal, drawn, existing, interrupted, bounds)
@@ -188,8 +188,8 @@ def _of_their_mode(problem: Problem, point: Point) -> Point:
 def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
     """The best design whose chosen numbers have values of their catalogues: branch and bound on the continuous search.
 
-    A bound is the best design with the numbers free between two values of the catalogue; where that is no better than the best
-    choice known, all choices between are left out. It is a local search: what it finds is the best of what its starts lead to.
+    A bound is the best design with numbers free between two values of the catalogue. If it is not better than the best known
+    choice, all choices between these values are skipped. The search is local: its result is the best one from its starts.
     """
     root = find(problem, options, lambda what, share: tell(what, 0.5 * share))
     choices = problem.space.choices
@@ -238,7 +238,7 @@ def _away(values: tuple[float, ...], x: float) -> float:
 
 
 def _few(found: Found) -> np.ndarray:
-    """The best designs that differ, (at most 7, d)."""
+    """Best distinct designs, (at most 7, d)."""
     order = np.argsort(np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf))
     kept: list[np.ndarray] = []
     for k in order:
@@ -249,7 +249,7 @@ def _few(found: Found) -> np.ndarray:
 
 
 def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, options: Options) -> Found | None:
-    """The search between narrower bounds, from the designs with these numbers."""
+    """Problem with narrower bounds, from the designs with these numbers."""
     space = problem.space.within(low, high)
     narrow = _with_lanes(problem, space)
     z = np.asarray(space.shares(np.clip(numbers, low, high)))

@@ -1,6 +1,6 @@
-"""A search as numbers: values and derivatives of many designs at once, jams followed from one design to the next.
+"""Numerical form of a search: values and derivatives of many designs at once, with jams followed between designs.
 
-Compiled are only the evaluation of a chunk of designs and a stretch of the descent (`descent`); chunks run side by side on all
+Only the evaluation of a chunk of designs and a stretch of the descent (`descent`) are compiled; chunks run in parallel on all
 cores.
 """
 
@@ -29,17 +29,17 @@ from optimize.space import DesignSpace, Held
 __all__ = ["Known", "Point", "Problem", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
 
 _CHUNK = 64
-"""Designs that are evaluated together on a core."""
+"""Number of designs in a batch on a core."""
 
 _NOTHING = 1e-9
-"""Values below this share of what a quantity is at other designs are roundings of 0."""
+"""Relative size, compared with other designs, below which a value of a quantity is a rounding error of 0."""
 
 Known = tuple[Any, ...]
 """Load speeds near which jams are followed, an array with a leading axis over the designs for each key."""
 
 
 class Problem(eqx.Module):
-    """A design space, what is to be small in it, and what is demanded.
+    """Design space with an objective and demands.
 
     **Attributes**: `space`; `objective`; `demands`, their forms, and
     `constants` (mi,), their limits where these are numbers; `keys` of what is followed; `scales` (mi,): the demands' units,
@@ -58,12 +58,12 @@ class Problem(eqx.Module):
 
     @property
     def equalities(self) -> int:
-        """Number of held quantities."""
+        """Number of held quantities, the equality constraints."""
         return len(self.space.held)
 
     def values(self, z: Array, near: Sequence[Array], pieces: bool = False) -> tuple[Array, tuple[Array, ...]]:
-        """The objective, by how much what is held is off, and the demands' excess, (1 + me + mi,), and the `pieces` of the
-        objective behind them; and the speeds followed."""
+        """Objective, deviations of held quantities and excess of demands, (1 + me + mi,), followed by the `pieces` of the
+        objective; and the followed speeds."""
         evaluation = Evaluation(self.space.at(z), dict(zip(self.keys, near, strict=True)))
         values = self.read(evaluation)
         if pieces:
@@ -71,7 +71,7 @@ class Problem(eqx.Module):
         return values, tuple(evaluation.found[key] for key in self.keys)
 
     def read(self, evaluation: Evaluation) -> Array:
-        """The same numbers from what is known of a scene."""
+        """The same numbers from an evaluation of a scene."""
         objective = jnp.reshape(self.objective.read(evaluation), (1,))
         held = self.space.residuals(evaluation)
         excess = [demand.excess(evaluation, limit) for demand, limit in zip(self.demands, self.constants, strict=True)]
@@ -130,15 +130,15 @@ class Point(NamedTuple):
         return np.all(np.isfinite(self.values), axis=1) & np.all(np.isfinite(self.slopes), axis=(1, 2))
 
     def where(self, chosen: np.ndarray, other: Point) -> Point:
-        """This point where `chosen`, the other elsewhere."""
+        """Point with the designs of this one if `chosen`, otherwise those of the other."""
         return jax.tree.map(lambda a, b: np.where(chosen.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), self, other)
 
     def take(self, index: np.ndarray) -> Point:
-        """The designs of these numbers."""
+        """Point with the designs of these indices."""
         return jax.tree.map(lambda a: a[index], self)
 
     def put(self, index: np.ndarray, new: Point) -> Point:
-        """The same, with other designs in these places."""
+        """Copy with other designs at these indices."""
 
         def one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             a = np.array(a)
@@ -158,8 +158,8 @@ class Point(NamedTuple):
 
 
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
-    """The search, with what it follows and the scale of each demand: its limit, or its value at the beginning; 1 if both are 0,
-    exactly or up to rounding."""
+    """Problem of a search with its followed speeds and the scale of each demand: its limit, or its value at the beginning; 1 if
+    both are 0 within rounding."""
     forms = tuple(demand.form() for demand in demands)
     keys, parts = _followed(space, objective, forms)
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
@@ -171,7 +171,7 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
 
 
 def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
-    """The modulus of each quantity (q,) at the beginning; 0 for what is nothing beside its change over the bounds."""
+    """Modulus of each quantity (q,) at the beginning; 0 if it is negligible relative to its change over the bounds."""
     z = np.random.default_rng(0).uniform(size=(7, space.size))
     scenes = _made(space, on_device(space.numbers(z)))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, scenes)
@@ -205,7 +205,7 @@ def _derived(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array
 
 @cached
 def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
-    """The load speed of each key for a batch of scenes, from whole branches."""
+    """Load speed of each key for a batch of scenes, from whole branches."""
 
     def one(scene: Scene) -> tuple[Array, ...]:
         paths: dict[tuple, JamModes] = {}
@@ -222,7 +222,7 @@ def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
 
         return tuple(guess(path, target) for path, target in keys)
 
-    # One after the other: that compiles in two thirds of the time and takes no longer.
+    # One after the other, which compiles in two thirds of the time and runs equally fast.
     return jax.lax.map(one, scenes)
 
 
@@ -245,7 +245,7 @@ def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
 
 
 def looked_up(problem: Problem, z: np.ndarray) -> Known:
-    """The speeds of what is followed for many designs, from whole branches; NaN where there is none."""
+    """Followed speeds of many designs, from whole branches; NaN without a jam."""
     if not problem.keys:
         return ()
     numbers = problem.space.numbers(np.asarray(z))
@@ -253,7 +253,7 @@ def looked_up(problem: Problem, z: np.ndarray) -> Known:
 
 
 def made(problem: Problem, numbers: np.ndarray) -> Scene:
-    """The scenes with these free numbers (s, d), SI: arrays with a leading axis, NumPy's."""
+    """Scenes with these free numbers (s, d), SI: NumPy arrays with a leading axis."""
     return in_chunks(problem.lanes, lambda x: _made(problem.space, x), numbers)
 
 

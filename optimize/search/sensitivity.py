@@ -20,8 +20,8 @@ _STEP = 0.01
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
-    """Everything held and demanded, and the bounds that are active, of the best design; `sides` (mi, 2) the values of demands
-    and of their limits there."""
+    """Limits of the best design: held quantities, demands and active bounds; `sides` (mi, 2): values of demands and of their
+    limits."""
     best, m = found.best, problem.equalities
     values, duals = found.point.values[best], found.optimality
     objective = abs(values[0]) if np.isfinite(values[0]) else np.nan
@@ -65,7 +65,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
 
 
 def neighbours(problem: Problem, found: Found) -> np.ndarray:
-    """The free numbers (1 + 2 d, d), SI, of the best design and of those where one of them is 1 % less, and more."""
+    """Free numbers (1 + 2 d, d), SI, of the best design and of its neighbours with one number 1 % smaller or larger."""
     numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
     off = np.diag(_STEP * numbers)
     return numbers + np.concatenate([np.zeros((1, len(numbers))), -off, off])
@@ -81,7 +81,7 @@ def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]
 
 
 def machines_of(problem: Problem, found: Found, same: float) -> tuple[Machine, ...]:
-    """The different machines that searches ended at, best first."""
+    """Distinct machines among the results of the searches, best first."""
     values = np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf)
     left = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
     space, machines = problem.space.within(*found.bounds), []

@@ -1,4 +1,4 @@
-"""The empirical criterion of auto-balancing: at which rotor speeds loads spread and cancel, at which they gather."""
+"""Empirical criterion of auto-balancing: rotor speeds at which loads spread and cancel, and at which they gather."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Criterion(Result):
 
 
 def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = None) -> Array:
-    """The criterion's functional at speed `omega` (scalar, rad/s): mean of S . r over one turn, kg m^2.
+    """Functional of the criterion at speed `omega` (scalar, rad/s): mean of S . r over one turn, kg m^2.
 
         f(S, w) = (S^2 w^2 / 2) Re(e^H A(w) e)
 
@@ -136,7 +136,7 @@ CRITERION_TERMS = (
     SlipRelease,
     SupportForce,
 )
-"""Terms that the criterion allows: those without a force on each load by itself, as a potential has."""
+"""Terms that the criterion allows: those without a separate force on each load, such as that of a potential."""
 
 
 @validated
@@ -196,12 +196,12 @@ def _gathering(resonances: Array, additional: Array) -> Array:
 
 
 def criterion_table(result: Criterion) -> dict[str, Any]:
-    """A machine's judgement as plain lists and numbers, ready for JSON; speeds in rad/s.
+    """Result of the criterion as plain lists and numbers for JSON; speeds in rad/s.
 
     **Returns** a dict: `status` a sentence; `resonances`, `additional` lists of speeds without damping,
     `damped_resonances`, `damped_additional` with; `balancing`, `gathering` lists of [from, to] with damping,
     `undamped_balancing`, `undamped_gathering` without. `to` is None where the interval has no end. Intervals that
-    touch are one; empty ones are left out.
+    touch are joined; empty ones are omitted.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=1e6, damping=30.0)

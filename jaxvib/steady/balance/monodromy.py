@@ -1,4 +1,4 @@
-"""The balanced motion and its monodromy matrix over a turn of the rotor."""
+"""Balanced motion and its monodromy matrix over a turn of the rotor."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from jaxvib.units import count
 __all__ = ["BATCH", "at_constant_speed", "balanced_motion", "checked_steps", "fine_and_coarse", "monodromies", "monodromy"]
 
 BATCH = 16
-"""Rotor speeds whose monodromies are computed side by side."""
+"""Number of rotor speeds in a batch of monodromy matrices."""
 
 _FORGOTTEN = 40.0
-"""Vibration that decays by exp(-40) in a turn is below the rounding of multipliers."""
+"""Decay in a turn, exp(-40), beyond which a vibration is below the rounding of multipliers."""
 
 _FEWEST, _MOST = 16, 2**17
-"""Steps of a turn; a rotor that asks for more is so slow that only carriers which come to rest within a turn are resolved."""
+"""Maximum number of steps in a turn; slower rotors are allowed only if the carrier comes to rest within a turn."""
 
 
 def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
-    """The balanced motion when the rotor has turned by `turn` rad."""
+    """State of the balanced motion after the rotor has turned by `turn` rad."""
     rest = jnp.zeros(len(scene.machine.structure().coordinates), angles.dtype)
     return State(rest, rest, (turn + angles,), (jnp.full_like(angles, 1.0) * scene.drive.speed,))
 
 
 def at_constant_speed(scene: Scene) -> Scene:
-    """The scene with a rotor that is at its working speed from the start."""
+    """Copy of the scene with a rotor that has its working speed from the start."""
     return scene.replace(drive=ConstantSpeed(scene.drive.speed))
 
 
@@ -55,13 +55,13 @@ def _steps_for(scene: Scene) -> Array:
 
 
 def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
-    """The monodromy matrix of the balanced motion over one turn of the rotor, (2 (nd + N), 2 (nd + N)).
+    """Monodromy matrix of the balanced motion over one turn of the rotor, (2 (nd + N), 2 (nd + N)).
 
         x'' = P(n t) x + R(n t) x',  x = (q / R, dphi),     (x, x' / n)(turn) = monodromy (x, x' / n)(0)
 
     **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of `radau.transition`, a Python number (then
-    reverse derivatives exist) or a scalar array. `jit`, `vmap` and `grad` go through it. The caller makes sure that the loads
-    cancel each other and the rotor's imbalance.
+    reverse derivatives exist) or a scalar array. It works under `jit`, `vmap` and `grad`. The caller ensures that the loads
+    cancel each other and the imbalance of the rotor.
     """
     scene = at_constant_speed(scene)
     field = vector_field(scene)
@@ -100,7 +100,7 @@ def monodromies(scene: Scene, angles: Any, speeds: Any, steps: int | None) -> Ar
 
 @cached
 def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array, Array]:
-    """The monodromy matrix at the scene's rotor speed, and that by half as many steps."""
+    """Monodromy matrix at the rotor speed of the scene, and the same with half as many steps."""
     fine = _steps_for(scene) if steps is None else steps
     return monodromy(scene, angles, fine), monodromy(scene, angles, fine // 2)
 
@@ -108,8 +108,8 @@ def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array
 def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | None:
     """Return `steps` if they are a count, or None if they are to be chosen for each speed.
 
-    **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor so slow that steps would have
-    to be longer than the carrier's vibration although that outlasts the turn: in the method it decays.
+    **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor so slow that the allowed steps do
+    not resolve a vibration of the carrier that outlasts the turn; the method would damp it.
     """
     asked, most = np.asarray(speeds), 0.1 * float(jnp.finfo(float).max) ** 0.5
     wrong = asked[~((asked > 0.0) & (asked < most))]
@@ -130,7 +130,7 @@ def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | N
 
 @cached
 def _slowest_decay(scene: Scene) -> tuple[Array, Array]:
-    """The slowest decay of the carrier's vibrations, 1/s, at the scene's speed, and the steps of a turn."""
+    """Slowest decay of the vibrations of the carrier, 1/s, at the speed of the scene, and the number of steps in a turn."""
     model = linear_model(scene)
     nd = model.mass.shape[0]
     solved = jnp.linalg.solve(

@@ -1,4 +1,4 @@
-"""Characteristic speeds of a machine: where the mean pull of its exciter on coincident loads changes sign."""
+"""Characteristic speeds of a machine, at which the mean force of its exciter on coincident loads changes sign."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["CharacteristicSpeeds", "CriterionStatus", "characteristic_speeds", "port_receptance"]
 
 _GRID_POINTS = 24
-"""Grid points on each side of each resonance, where sign changes of the damped machine are looked for."""
+"""Number of grid points on each side of each resonance in the search for sign changes of the damped machine."""
 
 
 class CriterionStatus(eqx.Enumeration):
@@ -73,17 +73,17 @@ class CharacteristicSpeeds(Result):
         return CriterionStatus.where(there, status, CriterionStatus.not_finite)
 
     def labelled(self, *, damped: bool = False) -> list[tuple[str, float]]:
-        """Every speed with its label ("resonance 1", "additional 1", ...), ascending."""
+        """All speeds with their labels ("resonance 1", "additional 1", ...), ascending."""
         kinds = ("resonance", "additional")
         speeds = (self.damped_resonances, self.damped_additional) if damped else (self.resonances, self.additional)
         rows = zip(kinds, speeds, strict=True)
         pairs = [(f"{kind} {k + 1}", float(w)) for kind, row in rows for k, w in enumerate(row)]
-        # Where speeds coincide the order is resonance k, additional k, resonance k + 1.
+        # The order of equal speeds is resonance k, additional k, resonance k + 1.
         pairs.sort(key=lambda pair: (int(pair[0].split()[1]), pair[0][0] != "r"))
         return [pair for pair in pairs if pair[1] == pair[1]]
 
     def summary(self) -> str:
-        """A table a person can read: each speed without and with damping, and each resonance's mode shape."""
+        """Return a table in text: each speed without and with damping, and the mode shape of each resonance."""
         damped = dict(self.labelled(damped=True))
         lines = [f"{'':14s}{'undamped':>12s}{'damped':>12s}  rad/s; mode shape ({', '.join(self.coordinates)})"]
         for label, speed in self.labelled():
@@ -108,15 +108,15 @@ class CharacteristicSpeeds(Result):
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:
-    """The exciter's port: displacement per force at speed `omega` (scalar, rad/s), (np, np) complex, m/N.
+    """Receptance of the exciter's port at speed `omega` (scalar, rad/s), (np, np) complex, m/N.
 
         A(w) = B [K - w^2 (M + sum m_j B^T B) + i w (C + w G)]^-1 B^T,     displacement = Re(A F exp(i w t))
 
-    The loads' masses move with the port; G, where there is one, takes the rotor's speed w.
+    The masses of the loads move with the port; a gyroscopic matrix G is taken at the rotor speed w.
 
     **Arguments**: `scene`; `omega`.
 
-    **Returns** (np, np) complex. It raises nothing of its own: at a resonance that nothing damps its numbers are not finite.
+    **Returns** (np, np) complex. Its values are not finite at an undamped resonance.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
@@ -137,11 +137,11 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     """Resonances and additional speeds of a scene's machine with its loads, without and with damping.
 
     Coincident loads push the port with S w^2 Re(e exp(i w t)), e the direction that turns (one number for a port with
-    one direction, (1, -i) for two). What is judged is the mean of push times displacement, with b = B^T e:
+    one direction, (1, -i) for two). The criterion is the mean of force times displacement, with b = B^T e:
 
         Re(e^H A(w) e) = Re(b^H [K - w^2 (M_S - i G) + i w C]^-1 b)
 
-    which without coupling through the rotor's speed is the trace of A. Undamped, its poles are the eigenvalues of
+    which is the trace of A without coupling by the rotor speed. Undamped, its poles are the eigenvalues of
     K y = w^2 (M_S - i G) y, its zeros those of the same problem on b^H y = 0 (the port held), and they interlace.
     Damped, its sign changes are bracketed on a grid between the lowest and the highest undamped resonance: outside that
     range damping cannot change the sign, since Re(b^H D^-1 b) = y^H (K - w^2 M_S) y with y = D^-1 b. A damper between
@@ -176,7 +176,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
 
 @cached
 def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, Array, Array]:
-    """The speeds, and the port, stiffness and mass of the carrier with its loads."""
+    """Characteristic speeds, and the port, stiffness and mass of the carrier with its loads."""
     model = linear_model(scene)
     carrier, direction = model.carrier, _direction(model)
     gyroscopic = model.mount.gyroscopic
@@ -186,7 +186,7 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
         resonances, additional = root_or_zero(values), root_or_zero(held)
         shapes = inverse.T @ vectors
     else:
-        # K is the metric: with a large polar moment M_S - i G is not positive definite, and a resonance is missing.
+        # The metric is K, since M_S - i G is not positive definite for a large polar moment, and a resonance is missing.
         square, inverse = relative_to(carrier.stiffness, model.mass - 1j * gyroscopic)
         values, vectors, held = _free_and_held_modes(square, inverse @ direction)
         resonances, additional = _inverse_root(values)[::-1], _inverse_root(held)[::-1]
@@ -197,7 +197,7 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
 
 
 def _direction(model: LinearModel) -> Array:
-    """b = B^T e (nd,); real for a port with one direction, whose phase does not matter."""
+    """Force direction b = B^T e (nd,); real for a port with one direction, whose phase has no effect."""
     return model.mount.rows[0][0] if len(model.mount.axes) == 1 else model.direction
 
 
@@ -210,7 +210,7 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
         return
-    # Resonances that rounding takes to 0 beside the highest, though a spring holds the motion.
+    # Resonances that rounding hides beside the highest, although a spring resists the motion.
     rounding = mass.shape[0] * np.finfo(mass.dtype).eps
     inverse = np.linalg.inv(np.linalg.cholesky(mass))
     squares = np.linalg.eigvalsh(inverse @ stiffness @ inverse.T)
@@ -231,15 +231,15 @@ def _inverse_root(values: Array) -> Array:
 
 
 def _free_and_held_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
-    """Ascending eigenvalues, vectors of `square` (nd, nd), and its eigenvalues (nd - 1,) on what is orthogonal to c."""
+    """Ascending eigenvalues and vectors of `square` (nd, nd), and its eigenvalues (nd - 1,) on the complement of c."""
     size = magnitude(c[0])
     phase = jnp.where(size > 0.0, c[0] / jnp.where(size > 0.0, size, 1.0), 1.0)
-    # The reflection that turns c into the first axis leaves the other axes as a basis of what is orthogonal to c.
+    # A reflection maps c to the first axis; the other axes are then a basis of the complement of c.
     mirror = c.at[0].add(phase * jnp.sqrt(jnp.sum((c * c.conj()).real)))
     length = jnp.sum((mirror * mirror.conj()).real)
     reflect = jnp.eye(c.shape[0], dtype=c.dtype) - 2.0 * jnp.outer(mirror, mirror.conj()) / length
     held = (reflect @ square @ reflect).at[0, :].set(0.0).at[:, 0].set(0.0)
-    # One call for both; the port's own direction gets an eigenvalue above all others.
+    # One call for both problems; the direction of the port gets an eigenvalue above all others.
     held = held.at[0, 0].set(2.0 * jnp.sqrt(jnp.sum(jnp.abs(jax.lax.stop_gradient(square)) ** 2)))
     values, vectors = hermitian_modes(jnp.stack([square.astype(held.dtype), held]))
     return values[0], vectors[0], values[1, :-1]
@@ -251,7 +251,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     carrier = model.carrier
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
     trace = jnp.finfo(last.dtype).eps ** 0.75 * last
-    # Adds nothing to the real part of 1/A, so moves no sign change, and makes the function smooth at the poles.
+    # This term does not change the real part of 1/A and the sign changes, and makes the function smooth at the poles.
     mobility = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
     smooth = 1j * last**2 / mobility * jnp.outer(b, b.conj())
 
