@@ -1,4 +1,4 @@
-"""Many tangents of a derivative, or many runs, at once, with their axis last: as vector instructions want them."""
+"""Batches of tangents of a derivative, or of runs, with their axis last, which suits vector instructions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxvib.runtime.compat import custom_vmap
 __all__ = ["VECTOR", "batch_last", "flat_tangents", "multi_tangent_jvp"]
 
 VECTOR = 8
-"""The number of tangents is padded to a multiple of this: how many numbers a processor works on at a time."""
+"""Width of vectors of a processor; the number of tangents is padded to a multiple of it."""
 
 X = TypeVar("X")
 Out = TypeVar("Out")
@@ -63,8 +63,8 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
 def batch_last(function: Callable[[X], Out], batched: Callable[[X, Mapped], Out]) -> Callable[[X], Out]:
     """`function`, under `vmap` computed by `batched`; with derivatives of every kind, which are mapped as JAX does it.
 
-    JAX puts the batch before all other axes of what a loop carries. `batched` may keep it as the last one, where every number
-    of the program is a vector over the batch, contiguous in memory.
+    JAX puts the batch before all other axes of the state of a loop. `batched` may keep it as the last axis: every number of the
+    program is then a vector over the batch, contiguous in memory.
 
     **Arguments**: `batched(x, mapped)`: `function(x)` of the whole batch, which lies along a last axis of those arrays of x
     that are True in the tree `mapped`, and of all arrays of the result.
@@ -108,7 +108,7 @@ def flat_tangents(tangents: Tangents, like: PyTree) -> list[Array | None]:
 
 
 def _tangents_last(function: _WithTangents) -> _WithTangents:
-    """f(x, tangents) for one direction, of a function for directions along a last axis: called once where f is mapped."""
+    """Convert a function for directions along a last axis to f(x, tangents) for one direction; a mapped f is called once."""
 
     def single(x: PyTree, tangents: Tangents) -> tuple[PyTree[Array], Tangents]:
         y, out = function(x, jax.tree.map(lambda dx: dx[..., None], tangents))

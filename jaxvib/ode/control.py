@@ -58,7 +58,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def rtol(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The tolerance to which an implicit method solves its equations."""
+        """Tolerance of the equations of an implicit method."""
         return self.tolerance
 
     @property
@@ -72,7 +72,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         return optimistix.rms_norm
 
     def wrap(self, direction: IntScalarLike) -> PIController:
-        """Time runs forward only."""
+        """Return the controller itself, since time runs forward only."""
         return self
 
     def init(
@@ -134,13 +134,13 @@ def moved_on(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLi
 
 
 class WrappedController(diffrax.AbstractAdaptiveStepSizeController):
-    """A controller that acts through another one, its `controller`, and hands on that one's tolerances to implicit methods."""
+    """Controller that wraps another `controller` and passes its tolerances to implicit methods."""
 
     controller: eqx.AbstractVar[diffrax.AbstractStepSizeController]
 
     @property
     def rtol(self) -> RealScalarLike:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The tolerance of an implicit method; 0 where the inner controller, such as one of constant steps, has none."""
+        """Tolerance of an implicit method; 0 if the inner controller has none, such as that of constant steps."""
         return getattr(self.controller, "rtol", 0.0)
 
     @property

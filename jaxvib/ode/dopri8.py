@@ -1,4 +1,4 @@
-"""Dormand and Prince's step of order 8, its stages unrolled, and what its forms share."""
+"""Dormand and Prince's step of order 8 with unrolled stages, and the common parts of its forms."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Tree = TypeVar("Tree")
 
 _TABLEAU = diffrax.Dopri8.tableau
 _LATE = 5
-"""The first stage after the first one of which states within a step are made."""
+"""First stage after stage 0 that contributes to states within a step."""
 
 _POLYNOMIALS = np.array(
     [
@@ -59,7 +59,7 @@ Source: P. Kidger's diffrax 0.7 (Apache 2.0), `diffrax/_solver/dopri8.py`, witho
 """
 
 NODES = np.asarray(_TABLEAU.c)
-"""At which share of the step each stage but the first is."""
+"""Time of each stage except the first, as a fraction of the step."""
 
 ROWS = np.stack([np.concatenate([row, np.zeros(len(NODES) - len(row))]) for row in _TABLEAU.a_lower])
 """Weights of earlier stages in each stage but the first; the last stage is the end of the step."""
@@ -69,12 +69,12 @@ ERROR = np.asarray(_TABLEAU.b_error)
 
 
 def ravel(tree: PyTree[Array], directions: int = 0) -> Array:
-    """The numbers of a tree as a vector (n,), or (n, directions) where there is that last axis."""
+    """Numbers of a tree as a vector (n,), or (n, directions) with that last axis."""
     return jnp.concatenate([leaf.reshape(-1, *leaf.shape[leaf.ndim - directions :]) for leaf in jax.tree.leaves(tree)])
 
 
 def unravel(flat: Array, like: Tree) -> Tree:
-    """The inverse of `ravel`; `like` tells structure and shapes."""
+    """Inverse of `ravel`; `like` has the structure and the shapes."""
     leaves, rest = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = [
@@ -85,21 +85,21 @@ def unravel(flat: Array, like: Tree) -> Tree:
 
 
 def dense_stages(stages: Array) -> Array:
-    """Stages that form states within a step, (10, ...): the first, and from the sixth on all."""
+    """Stages that contribute to states within a step, (10, ...): the first, and all from the sixth on."""
     return jnp.concatenate([stages[:1], stages[_LATE:]])
 
 
 def linear_combination(weights: Array, stages: Array) -> Array:
     """sum_j weights_j stages_j; weights (..., stages), stages (stages, ...).
 
-    As a product XLA computes it once, and in vectors; a sum that is written out it computes anew for each number that is taken
-    from it, and the weights with it.
+    XLA computes a product once and vectorizes it; an unrolled sum would be recomputed, with its weights, for each use of one of
+    its numbers.
     """
     return jnp.tensordot(weights.astype(stages.dtype), stages, 1, precision="highest")
 
 
 class Dopri8Interpolation(StepInterpolation):
-    """The motion within a step: y0 + (t - t0) sum_j w_j(s) k_j, s the share of the step that is done, k_j the stages' rates.
+    """Motion within a step: y0 + (t - t0) sum_j w_j(s) k_j with the fraction s of the step and the rates k_j of the stages.
 
     The polynomials w_j are diffrax's; `stages` is (10, n), see `dense_stages` and `ravel`.
     """
@@ -166,10 +166,10 @@ class UnrolledDopri8(AbstractDopri8):
     """Dormand and Prince's pair of order 8(7), its 13 stages written out one after another.
 
     The same numbers as `diffrax.Dopri8`, in another form: no loop over stages, no arrays of stages, so that a small time loop
-    compiles into one piece of code; and a fence after each stage, without which XLA's fusion computes each stage anew for
-    each use of it (a step of 900 multiplications becomes one of 4500).
+    compiles into one piece of code; and a fence after each stage, without which XLA's fusion recomputes each stage for each use
+    (a step of 900 multiplications becomes one of 4500).
 
-    Compiling takes longer than for `LoopDopri8`, several times as long where derivatives are taken.
+    Compiling takes longer than for `LoopDopri8`, several times as long with derivatives.
 
     **Arguments**: `batch`: true if many runs advance together, each number of the state an array over them: fences are then
     those for arrays, otherwise those for single numbers; `wrap` what is done to the state after each step, such as taking whole
@@ -189,7 +189,7 @@ class UnrolledDopri8(AbstractDopri8):
     interpolation_cls: ClassVar[Callable[..., Dopri8Interpolation]] = Dopri8Interpolation
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> VF:
-        """The rates at the start: the last stage of a step is the first of the next one."""
+        """Rates at the start, since the last stage of a step is the first one of the next step."""
         return terms.vf(t0, y0, args)
 
     def advance(
@@ -203,7 +203,7 @@ class UnrolledDopri8(AbstractDopri8):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Array, Y, VF]:
         """See `AbstractDopri8.advance`."""
-        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
+        # If the field may jump between steps (`made_jump` is traced), its value is computed again.
         first = solver_state if made_jump is False else terms.vf(t0, y0, args)
         one = hidden_one(jnp.asarray(t1, jax.tree.leaves(y0)[0].dtype))
         dt = terms.contr(t0, t1)
@@ -216,7 +216,7 @@ class UnrolledDopri8(AbstractDopri8):
         return y, jnp.stack([ravel(k) for k in stages]), error, stages[-1]
 
     def _fenced(self, values: Y, one: Array, known: Y = ()) -> Y:
-        """Values behind fences, but those that are `known` and have been behind one, as velocities are among rates."""
+        """Fence the values, except those that are `known` and already fenced, such as velocities among rates."""
         leaves, rest = jax.tree.flatten(values)
         new = [k for k, leaf in enumerate(leaves) if not any(leaf is each for each in jax.tree.leaves(known))]
         found = [leaves[k] for k in new]

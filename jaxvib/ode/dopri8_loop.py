@@ -30,12 +30,12 @@ from jaxvib.ode.types import VF, Args, BoolScalarLike, Mapped, RealScalarLike, T
 __all__ = ["LoopDopri8"]
 
 _Known: TypeAlias = "tuple[Array, Array] | None"
-"""The last stage of the step before (n,), and how many stages of a step it makes known: 1, or 0 where there is no such step.
-None where each step computes all of its stages."""
+"""Last stage of the previous step (n,), and the number of stages that it provides: 1, or 0 without a previous step. None if
+each step computes all of its stages."""
 
 _Inputs: TypeAlias = tuple[RealScalarLike, Array, Y, _Known, Args, Terms]
-"""Inputs of a step: the time at its start, its length, the state, what is known of its rates, the arguments of the equations,
-the equations."""
+"""Inputs of a step: the time at its start, its length, the state, its known rates, the arguments of the equations, the
+equations."""
 
 _Step: TypeAlias = tuple[Y, Array, Y]
 """The state at the end of a step, the rates of its stages (stages, n), the error of the state."""
@@ -44,21 +44,21 @@ _ROWS = np.concatenate([np.zeros((1, ROWS.shape[1])), ROWS])
 """Weights of earlier stages in each stage (stages, stages - 1)."""
 
 _NODES = np.concatenate([np.zeros(1), NODES])
-"""At which share of the step each stage is."""
+"""Time of each stage, as a fraction of the step."""
 
 Numbers = TypeVar("Numbers", Array, tuple[Array, Array])
 """A vector (n,), a batch of them (n, batch), or a vector and its tangents (n, directions)."""
 
 
 class LoopDopri8(AbstractDopri8):
-    """The same method as `UnrolledDopri8` with a loop over its stages, which compiles in a fraction of the time.
+    """Same method as `UnrolledDopri8` with a loop over the stages, which compiles in a fraction of the time.
 
-    Its program evaluates the equations in one place, whichever stage it is.
+    Its program contains the equations once, for all stages.
 
-    **Arguments**: `tangents` whether forward derivatives are taken (and reverse ones never): those of a step are then computed
-    along all tangents at once, eight of them for not much more than one costs; `reuse` whether the last stage of a step is the
-    first of the next one, which saves one evaluation of fourteen. Where the loop begins is then known at run time only, so that
-    diffrax's adjoints have no reverse derivatives; those of `jaxvib.ode.replay` are as without it. `wrap` as in
+    **Arguments**: `tangents`: True if forward derivatives, and no reverse ones, are taken; those of a step are then computed
+    along all tangents at once, eight for little more than the cost of one. `reuse`: True to use the last stage of a step as the
+    first one of the next step, which saves one evaluation of fourteen. The start of the loop is then known at run time only,
+    therefore diffrax's adjoints have no reverse derivatives; those of `jaxvib.ode.replay` are unchanged. `wrap` as in
     `UnrolledDopri8`.
 
     >>> import diffrax, jax, jax.numpy as jnp
@@ -78,11 +78,11 @@ class LoopDopri8(AbstractDopri8):
 
     @property
     def interpolation_cls(self) -> Callable[..., Dopri8Interpolation]:  # pyright: ignore
-        """The interpolation that finds states within a step."""
+        """Interpolation for states within a step."""
         return _WITH_TANGENTS if self.tangents else _WITHOUT_TANGENTS
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> _Known:
-        """No stage is known at first."""
+        """Initial state of the method, without a known stage."""
         return (jnp.zeros_like(ravel(y0)), jnp.asarray(0)) if self.reuse else None
 
     def advance(
@@ -161,7 +161,7 @@ def _advance_batched(inputs: _Inputs, mapped: Mapped) -> _Step:
         return ravel(jax.tree.map(spread, tree, along), 1)
 
     if known is not None:
-        # All begin with the first stage that one of them lacks.
+        # All start with the first stage that is missing in one of them.
         known = (whole(known[0], known_too[0]), jnp.min(known[1]))
 
     def rates(share: RealScalarLike, y: Array) -> Array:
@@ -182,7 +182,7 @@ _advanced = batch_last(_advance, _advance_batched)
 
 
 def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:
-    """`_advance` and the tangents of all that."""
+    """`_advance` with the tangents of its results."""
     t0, dt, y0, known, args, terms = inputs
     dt0, ddt, dy0, dknown, *others = tangents
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
@@ -220,7 +220,7 @@ def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:
 
 
 def _weighted_sum(weights: Array | np.ndarray, stages: Array) -> Array:
-    """sum_j weights_j stages_j, written out: in a loop that is faster than a product."""
+    """Sum of weights_j stages_j, unrolled, which is faster than a product in a loop."""
     if isinstance(weights, np.ndarray):
         return functools.reduce(operator.add, (weights[j].astype(stages.dtype) * stages[j] for j in np.flatnonzero(weights)))
     return _written_sum(weights.astype(stages.dtype), stages)
@@ -233,8 +233,8 @@ def _written_sum(weights: Array, stages: Array) -> Array:
 
 @_written_sum.defjvp
 def _written_sum_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The derivative as a product: transposed, the sum would add a whole array of stages for each stage of each stage."""
-    (weights, stages), (_, change) = primals, tangents  # the method's weights do not change
+    """Derivative as a product, since the transposed sum would add a whole array of stages for each pair of stages."""
+    (weights, stages), (_, change) = primals, tangents  # the weights of the method are constant
     return _written_sum(weights, stages), linear_combination(weights, change[: len(weights)])
 
 
@@ -249,7 +249,7 @@ def _stages(
     stages = jax.tree.map(lambda y: jnp.zeros((len(_ROWS), *y.shape), y.dtype), y0)
     if known is not None:
         stages = jax.tree.map(lambda k, first: k.at[0].set(first), stages, known[0])
-    # A division by a 1 that the compiler cannot know keeps it from computing the state anew for each use of it.
+    # A division by a 1 that the compiler does not recognize prevents recomputation of the state for each use.
     one = lax.stop_gradient(jnp.where(dt >= 0.0, 1.0, dt))
 
     def weighted(stages: Numbers, weights: Array | np.ndarray) -> Numbers:
@@ -264,5 +264,5 @@ def _stages(
         return jax.tree.map(lambda k, value: lax.dynamic_update_index_in_dim(k, value, j, 0), stages, new)
 
     stages = lax.fori_loop(0 if known is None else known[1], len(_ROWS), stage, stages)
-    # The state at the last stage is the end of the step; computed here no other one has to carry it along.
+    # The state at the last stage is the end of the step; it is computed here so that the loop does not carry it.
     return moved(stages, ROWS[-1]), stages, weighted(stages, ERROR)

@@ -16,17 +16,17 @@ __all__ = ["StepInterpolation"]
 
 
 class StepInterpolation(diffrax.AbstractLocalInterpolation):
-    """States within a step from `t0` to `t1`, by the share of it that is done; a step without a length has done none of it."""
+    """States within a step from `t0` to `t1`, by the fraction of the step, which is 0 for a step of length 0."""
 
     t0: Any
     t1: Any
 
     @abc.abstractmethod
     def at(self, share: Array, span: Array) -> Y:
-        """The state where `share` of the step is done, which is `span` long."""
+        """State at the fraction `share` of a step of length `span`."""
 
     def evaluate(self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True) -> Y:
-        """The state at `t0`, or by how much it changes from there to `t1`."""
+        """State at `t0`, or its change from `t0` to `t1`."""
         if t1 is not None:
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
         span = self.t1 - self.t0

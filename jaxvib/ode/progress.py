@@ -39,19 +39,19 @@ def _close() -> None:
 
 
 class ProgressBar(diffrax.AbstractProgressMeter):
-    """Shows how much of the run's time span is done, in steps of one per cent."""
+    """Progress bar of a run, in steps of one per cent."""
 
     def init(self) -> Array:
-        """The progress shown last."""
+        """State of the meter: the progress shown last."""
         return jnp.array(0.0)
 
     def step(self, state: Array, progress: RealScalarLike) -> Array:
-        """Shows `progress` where it is a per cent further."""
+        """Show `progress` if it has increased by one per cent."""
         progress = jnp.asarray(progress, dtype=state.dtype)
         further = (progress - state > 0.01) | (progress >= 1.0)
         jax.lax.cond(further, lambda p: jax.debug.callback(_show, p), lambda p: None, progress)
         return jnp.where(further, progress, state)
 
     def close(self, state: Array) -> None:
-        """Takes the bar away."""
+        """Remove the bar."""
         jax.debug.callback(_close)

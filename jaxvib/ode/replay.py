@@ -41,11 +41,11 @@ def solve(
 ) -> diffrax.Solution:
     """`diffrax.diffeqsolve` from time 0 to `end`, which fails by its result alone.
 
-    Its reverse derivatives are a step-replay adjoint: those of the very steps that were taken. A controller that chose its
-    steps once more on the way back would find them a rounding apart, and the next ones further: after some hundred turns they
-    are other steps, whose derivatives do not belong together (off by up to 1e-3). So a run that is to be differentiated notes
-    when each step begins, and the state at every so many of them. On the way back the states in between are computed once
-    more, and each step is transposed by itself, from the last one to the first:
+    Its reverse derivatives are a step-replay adjoint, of the steps that the run has taken. If a controller chose the steps
+    again on the way back, they would differ by rounding and diverge: after some hundred turns they are other steps, with
+    inconsistent derivatives (errors up to 1e-3). Therefore a run that is differentiated records the start of each step and some
+    of the states. On the way back the states in between are recomputed, and each step is transposed separately, from the last
+    one to the first:
 
         (y_i+1, dense_i) = step(y_i, t_i, t_i+1, numbers),    saved(t) = within(dense_i, t_i, t_i+1, t)
 
@@ -100,7 +100,7 @@ def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController
 
 
 class _Notes(NamedTuple):
-    """Record of a run: its number of steps, the end of each step (max_steps,), the state after every so many."""
+    """Record of a run: its number of steps, the end of each step (max_steps,), and states at regular numbers of steps."""
 
     steps: Array
     starts: Array
@@ -123,7 +123,7 @@ class _Slopes(NamedTuple):
 def _forward(
     perturbed: PyTree[bool], inputs: _Inputs, controller: diffrax.AbstractStepSizeController, *rest: *_Rest
 ) -> tuple[diffrax.Solution, _Notes]:
-    """The run, and its notes."""
+    """Run with its record."""
     end, first_step, y0, args, saveat, term = inputs
     starts = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None)
     states = diffrax.SubSaveAt(steps=_spacing(y0, rest[1]))
@@ -135,7 +135,7 @@ def _forward(
 
 
 def _spacing(y0: Y, max_steps: int) -> int:
-    """After how many steps a state is noted: after each one where that takes at most 1 MiB."""
+    """Number of steps between recorded states; 1 if that takes at most 1 MiB."""
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(y0))
     return max(1, min(-(-max_steps * size // 2**20), max_steps))
 
@@ -166,7 +166,7 @@ def _backward(
 
 @dataclasses.dataclass(frozen=True)
 class _WayBack:
-    """Way back over the steps of a run, from the last one to the first.
+    """Backward pass over the steps of a run, from the last one to the first.
 
     **Attributes**: the `notes` of the run, with a state after `every` so many steps, and `y0` before the first; `solver` and
     `controller`; the `numbers` of arguments and equations that are differentiated, and the `others`; the derivatives by `saved`
@@ -183,7 +183,7 @@ class _WayBack:
     every: int
 
     def slopes(self, zero: Array) -> _Slopes:
-        """Return the slopes after the whole way; `zero` of the type of times."""
+        """Return the slopes after the whole backward pass; `zero` has the type of times."""
         times = self.saved.times
         reached = self.span(self.notes.steps - 1)[1]
         slopes = _Slopes(
@@ -198,14 +198,14 @@ class _WayBack:
         return jax.lax.while_loop(lambda carry: carry[0] >= 0, lambda carry: self.to_note(*carry), start)[1]
 
     def span(self, i: Array) -> tuple[Array, Array]:
-        """Begin and end of step i."""
+        """Start and end of step i."""
         starts = self.notes.starts[jnp.maximum(i - 1, 0)]
         return jnp.where(i == 0, 0.0, starts), _end_before(self.controller, self.notes.starts[i])
 
     def step(self, y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
         """State after a step, and the data of the interpolation within it."""
         args, term = eqx.combine(numbers, self.others)
-        # As after a jump: nothing is known from the step before.
+        # As after a jump, without values of the previous step.
         y1, _, dense, _, _ = self.solver.step(term, t0, t1, y, args, self.solver.init(term, t0, t1, y, args), True)
         return y1, dense
 
@@ -271,7 +271,7 @@ class _WayBack:
 
 
 def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractSolver:
-    """An implicit method that solves its equations to the controller's tolerances, where it has none of its own."""
+    """Implicit method with the tolerances of the controller, if it has none of its own."""
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     finder = solver.root_finder
@@ -282,8 +282,8 @@ def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.Abstrac
 
 
 def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, j: Array) -> Array:
-    """Derivative of the start of step j of `count` by the end of the run: constant steps fill the time that the first one
-    leaves, those that a controller chose stay where they are."""
+    """Derivative of the start of step j of `count` by the end of the run: constant steps fill the time after the first one,
+    steps of a controller do not move."""
     if isinstance(controller, diffrax.ConstantStepSize):
         return jnp.where((j > 1) | (count == 1), j / count, 0.0)
     return jnp.where(j == count, 1.0, 0.0)
@@ -334,7 +334,7 @@ def _by_inputs(
     saved: _Saved,
     slopes: _Slopes,
 ) -> PyTree[Array | None]:
-    """Slopes by the inputs that are differentiated, None for the others."""
+    """Slopes by the differentiated inputs, None for the others."""
     by_end, by_times = slopes.end, []
     parts = jnp.zeros_like(slopes.times).at[saved.places].set(slopes.times)
     for sub, by_ts in zip(saveat.subs, cotangents.ts, strict=True):

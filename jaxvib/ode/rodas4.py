@@ -1,4 +1,4 @@
-"""A Rosenbrock method for small stiff systems whose Jacobian is cheap: no iterations."""
+"""Rosenbrock method, without iterations, for small stiff systems with cheap Jacobians."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ _DENSE = (
 
 
 class _Interpolation(StepInterpolation):
-    """The method's own continuous extension of order 3, a cubic in the share s of the step, `coefficients` c (2, n):
+    """Continuous extension of the method of order 3, a cubic in the fraction s of the step with `coefficients` c (2, n):
 
         y = (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1))
 
-    It uses no rates at the ends of a step, which stiffness makes useless.
+    It does not use the rates at the ends of a step, which are useless for stiff equations.
     """
 
     y0: Array
@@ -72,8 +72,8 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
 
         (1/(gamma h) - J) k_i = f(t + c_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
 
-    A step costs one Jacobian J by forward mode, one inverse and 6 evaluations, whatever the step's length; there is no
-    Newton iteration to wait for or to fail. The state is one vector of a few dozen numbers at most.
+    A step of any length costs one Jacobian J by forward mode, one inverse and 6 evaluations, without a Newton iteration. The
+    state is one vector of at most a few dozen numbers.
 
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.7.
     """
@@ -90,7 +90,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         return 4
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Array, args: Args) -> None:
-        """Nothing is carried from step to step."""
+        """Initial state of the method, which is empty."""
 
     def func(self, terms: Terms, t0: RealScalarLike, y0: Array, args: Args) -> Array:
         """The vector field."""
@@ -108,7 +108,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     ) -> StepResult:
         """One step from t0 to t1."""
         h = t1 - t0
-        # A padded step has no length; its inverse must not be a division by 0.
+        # A padded step has the length 0; its inverse must not divide by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
         jacobian, time_derivative = _jacobian(terms, t0, y0, args)
         inverse = written_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)

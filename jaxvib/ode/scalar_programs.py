@@ -1,4 +1,4 @@
-"""Programs on single numbers, as `jaxvib.ode.scalarize` makes them, in other forms that give the same results in less time."""
+"""Equivalent but faster forms of programs on single numbers, see `jaxvib.ode.scalarize`."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from jaxvib.runtime.compat import (
 __all__ = ["fenced", "is_floating", "substituted", "without_repeats"]
 
 _MAX_RECOMPUTED = 8
-"""A value used more than once that takes more operations than these is fenced: see `fenced`."""
+"""Largest number of operations of a value with several uses that is not fenced, see `fenced`."""
 
 
 def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
     """The same program without repeated operations and without operations whose results are not used.
 
-    Equations written by automatic differentiation ask for the same parts again and again: a third to a half of them go.
+    Equations from automatic differentiation contain the same parts many times: a third to a half of them are removed.
     """
     first: dict[Var, Var | Literal] = {}
     done: dict[tuple[object, ...], JaxprEqn] = {}
@@ -51,7 +51,7 @@ def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
         if equation.primitive in _commutative():
             names.sort()
         key = (equation.primitive, *names, *(f"{k}={v!r}" for k, v in equation.params.items()))
-        # What has an effect is done as often as it stands there; parameters that are programs are not compared.
+        # Operations with side effects are kept; parameters that are programs are not compared.
         alone = bool(equation.effects) or any(hasattr(v, "jaxpr") or callable(v) for v in equation.params.values())
         if key in done and not alone:
             first.update(zip(equation.outvars, done[key].outvars, strict=True))
@@ -69,11 +69,10 @@ def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
-    """The results of a program on scalars, none of whose values the compiler computes many times over.
+    """Results of a program on scalars, without repeated computation of values by the compiler.
 
-    Every value that is used more than once and would take more than a few operations is fenced, see `jaxvib.numerics.fence`.
-    Where shared parts are made of shared parts, as in a derivative of equations, the time grows without bounds otherwise: 4096
-    samples of 3000 operations took 8 s.
+    Every value with several uses and more than a few operations is fenced, see `jaxvib.numerics.fence`. Otherwise the time
+    grows without bound for nested shared parts, as in derivatives of equations: 4096 samples of 3000 operations took 8 s.
     """
     jaxpr = program.jaxpr
     uses: dict[Var, int] = {}
@@ -88,7 +87,7 @@ def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
         results = _computed(equation, [read(atom) for atom in equation.invars])
         spent = _size(equation) + sum(cost.get(atom, 0) for atom in _variables(equation.invars))
         if equation.primitive == _division():
-            spent = 0  # its result is not computed anew
+            spent = 0  # its result is not recomputed
         for atom, result in zip(equation.outvars, results, strict=True):
             dear = uses.get(atom, 0) > 1 and spent > _MAX_RECOMPUTED and is_floating(atom)
             known[atom], cost[atom] = (fence(result, one), 0) if dear else (result, spent)
@@ -105,7 +104,7 @@ def _computed(equation: JaxprEqn, values: list[Array]) -> Sequence[Array]:
     if inner is None:
         found = equation.primitive.bind(*values, **equation.params)
         return found if equation.primitive.multiple_results else [found]
-    # The one operation with a derivative of its own that these programs have.
+    # The only operation with a custom derivative in these programs.
     return unfenced_sine_and_cosine(*values) if "call_jaxpr" in equation.params else jaxpr_as_fun(inner)(*values)
 
 
@@ -116,12 +115,12 @@ def _division() -> Primitive:
 
 @functools.cache
 def _commutative() -> set[Primitive]:
-    """The operations that give the same for their arguments in either order."""
+    """Commutative operations."""
     return {primitive_of(operation, np.float32(1.0), np.float32(2.0)) for operation in (lax.add, lax.mul)}
 
 
 def is_floating(x: Any) -> bool:
-    """True if a variable of a program is a number of single or double precision, for which `jaxvib.numerics` has the sines."""
+    """True if a variable of a program has single or double precision, for which `jaxvib.numerics` has sines."""
     return x.aval.dtype in (np.float32, np.float64)
 
 
@@ -131,7 +130,7 @@ def _variables(atoms: Iterable[Var | Literal]) -> list[Var]:
 
 
 def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instead | None]) -> ClosedJaxpr:
-    """A program in which others stand for those operations of one result for which `chosen` gives some."""
+    """Program in which operations with one result are replaced by those that `chosen` returns for them, if any."""
     instead: dict[int, Var] = {}
     equations: list[tuple[JaxprEqn, Atoms]] = []
 

@@ -1,4 +1,4 @@
-"""Rules by which operations of JAX act on object arrays of scalars, the table of `jaxvib.ode.scalarize`."""
+"""Rules of JAX operations on object arrays of scalars, for `jaxvib.ode.scalarize`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 Scalars: TypeAlias = np.ndarray
-"""An array of dtype object: every entry is a traced scalar, or a NumPy scalar that the program itself holds as a constant."""
+"""Array of dtype object whose entries are traced scalars, or NumPy scalars that are constants of the program."""
 
 Scalar: TypeAlias = Any
 """A traced scalar, a NumPy scalar, or a `ComplexParts`: one entry of `Scalars`."""
@@ -65,14 +65,14 @@ def is_known(x: Scalar) -> bool:
 def _is_zero(x: Scalar) -> bool:
     """True if `x` is a 0 of the program itself, such as an entry of an identity matrix or of a direction of a derivative.
 
-    What is multiplied by it is not there, and no operation is left of it, even where it is infinite or not a number, and the
-    program on arrays would give NaN. The zeros of a scene's parameters and states are traced, and are multiplied out.
+    A product with it is omitted with its operations, even if the other factor is infinite or NaN, for which the program on
+    arrays would give NaN. The zeros of parameters and states of a scene are traced, and are multiplied.
     """
     return is_known(x) and x == 0
 
 
 class ComplexParts:
-    """A complex number by its parts, of which one is often known to be 0; XLA multiplies that out."""
+    """Complex number as two parts, one of which is often a known 0 that XLA would multiply."""
 
     __slots__ = ("imag", "real")
 
@@ -91,12 +91,12 @@ def _parts(x: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def joined(x: Scalar) -> Scalar:
-    """A complex number as one scalar; any other as it is."""
+    """Complex number as one scalar; any other number unchanged."""
     return lax.complex(*(jnp.asarray(part) for part in _parts(x))) if isinstance(x, ComplexParts) else x
 
 
 def _by_parts(rule: Callable[..., Scalar]) -> Callable[..., Scalar]:
-    """A rule for real numbers, applied to the real and to the imaginary parts."""
+    """Apply a rule for real numbers to the real and imaginary parts."""
 
     def apply(*x: Scalar, **params: object) -> Scalar:
         if not any(_is_complex(v) for v in x):
@@ -177,7 +177,7 @@ def _choice(*cases: Scalar, which: Scalar) -> Scalar:
 
 
 def _bound(primitive: Primitive) -> Callable[..., Scalar]:
-    """The operation itself, on scalars."""
+    """Rule that applies the operation to scalars."""
     return lambda *x, **params: primitive.bind(*(jnp.asarray(joined(v)) for v in x), **params)
 
 
@@ -264,9 +264,9 @@ def _pad(x: Scalars, value: Scalars, *, padding_config: Sequence[tuple[int, int,
 
 
 def primitive_of(function: _Function, *arguments: ArrayLike) -> Primitive:
-    """The one primitive that a public function of JAX is made of.
+    """Primitive of a public function of JAX that consists of one.
 
-    **Raises** `NotScalarizable` where it is made of several, or of none.
+    **Raises** `NotScalarizable` if it consists of several, or of none.
     """
     equations = jax.make_jaxpr(function)(*arguments).jaxpr.eqns
     if len(equations) != 1:
@@ -276,7 +276,7 @@ def primitive_of(function: _Function, *arguments: ArrayLike) -> Primitive:
 
 @functools.cache
 def inlined() -> tuple[Primitive, ...]:
-    """Primitives whose inner program, their parameter `jaxpr`, stands for themselves."""
+    """Primitives that are replaced by their inner program, the parameter `jaxpr`."""
     return primitive_of(jax.jit(jnp.negative), 1.0), primitive_of(jax.checkpoint(lax.neg), 1.0)
 
 
@@ -284,7 +284,7 @@ def inlined() -> tuple[Primitive, ...]:
 def rules() -> dict[Primitive, Rule]:
     """The rule of each primitive that has one; primitives are found by tracing public functions, not by their names.
 
-    A function that another version of JAX makes of several operations has no rule: programs with it stay on arrays.
+    A function that consists of several operations in another version of JAX has no rule; programs with it stay on arrays.
     """
     x, v, yes = np.float32(1.0), np.ones((2, 2), np.float32), np.True_
     z = np.complex64(1.0)

@@ -61,10 +61,10 @@ Shared = TypeVar("Shared")
 Out = TypeVar("Out")
 
 _Sines: TypeAlias = dict[int, tuple[Scalar, tuple[Array, Array]]]
-"""Sines by the `id` of an angle: the angle, which keeps the id its own, its sine and cosine."""
+"""Sines by the `id` of an angle: the angle, which keeps the id unique, its sine and cosine."""
 
 MAX_SCALARS, _MAX_OPERATIONS = 32, 1200
-"""Largest numbers of entries of a state and of operations on them for which compiling equations on scalars pays."""
+"""Largest numbers of state entries and of operations for which equations are compiled on scalars."""
 
 _BLOCK = 4096
 """Number of entries of a batch that go through a program on scalars together: it may hold a thousand values of each in
@@ -74,11 +74,11 @@ memory."""
 def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> Callable[..., PyTree[Scalars]]:
     """`function`, traced for arguments of these shapes, on single numbers.
 
-    **Returns** a function of the same arguments in which every array is an object array of scalars; so is what it returns.
-    Sines and cosines are those of `jaxvib.numerics.sincos`. A product with a 0 that the program itself holds is left out.
+    **Returns** a function of the same arguments in which every array is an object array of scalars, as are its results.
+    Sines and cosines are those of `jaxvib.numerics.sincos`. Products with zeros that are constants of the program are omitted.
 
-    **Raises** `NotScalarizable` where an operation of the program has no rule on scalars, here or when the function that is
-    returned is called. A function with a derivative of its own (`jax.custom_jvp`) has none: its derivative would be lost.
+    **Raises** `NotScalarizable` if an operation of the program has no rule on scalars, here or at a call of the returned
+    function. A function with a custom derivative (`jax.custom_jvp`) has none, since its derivative would be lost.
 
     >>> import jax.numpy as jnp, numpy as np
     >>> on_scalars = scalarize(lambda x: x[0] * jnp.ones(2) + x, jnp.zeros(2))
@@ -97,14 +97,14 @@ def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array])
             return jax.tree.unflatten(structure, [elementwise(joined)(value) for value in found])
         except NotScalarizable:
             raise
-        except Exception as error:  # whatever a rule did not foresee
+        except Exception as error:  # any error of a rule
             raise NotScalarizable(f"a rule failed: {error!r}") from error
 
     return run
 
 
 def scalar_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr:
-    """`scalarize`, traced: a program that takes the numbers of all arguments and gives those of the result, in order.
+    """Trace the function of `scalarize`: a program from the numbers of all arguments to those of the result, in order.
 
     **Raises** `NotScalarizable` if an operation has no rule on scalars.
     """
@@ -131,7 +131,7 @@ def scalar_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
 def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
     """Return `scalar_program`, or None for a program that has no such form.
 
-    This is so if an operation has no rule on scalars, if there are too many operations, and if this version of JAX does not
+    There is none if an operation has no rule on scalars, if there are too many operations, or if this version of JAX does not
     give access to its programs.
     """
     if not HAS_JAXPRS:
@@ -144,7 +144,7 @@ def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTre
 
 
 def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
-    """`function`, traced as it is, on arrays, but for its sines and cosines, which are those of `jaxvib.numerics.sincos`.
+    """Trace `function` on arrays, with the sines and cosines of `jaxvib.numerics.sincos`.
 
     **Returns** None if this version of JAX does not give access to its programs.
     """
@@ -172,11 +172,10 @@ def scalars_of(tree: PyTree[Array]) -> list[Array]:
 
 
 def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared], Out]:
-    """`jax.vmap(function, in_axes=(0, None))`, on single numbers where `function` is small enough; for values only.
+    """`jax.vmap(function, in_axes=(0, None))`, on single numbers if `function` is small enough; for values only.
 
-    The program on scalars is fenced, so that its time grows with the number of its operations whatever they are, and it goes
-    through a large batch in blocks, so that its memory does not grow with the batch. Its derivatives are right but need not be
-    fast.
+    The program on scalars is fenced, therefore its time is proportional to the number of operations. It processes a large batch
+    in blocks, therefore its memory does not grow with the batch. Its derivatives are right but may be slow.
 
     **Arguments**: `function(x, shared)` gives a tree of arrays; the first leaf of x is a time or another finite scalar.
 
@@ -191,7 +190,7 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
         shared = jax.tree.map(jnp.asarray, shared)
         program = scalarized_program(function, one, shared) if size <= MAX_SCALARS else None
         if program is None:
-            # With the batch as the last axis of every array, as far as `vmap` can keep it there: half the time.
+            # The batch is the last axis of every array, if `vmap` can keep it there, which takes half the time.
             last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), batch)
             found = jax.vmap(function, in_axes=(-1, None), out_axes=-1)(last, shared)
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
@@ -258,7 +257,7 @@ def _run(jaxpr: Jaxpr, consts: Sequence[ArrayLike], arguments: list[Scalars], si
 
 
 def _checked(result: Scalars, aval: Any, name: str) -> Scalars:
-    """The result of an operation, after a look at whether it has the shape and the dtype the program on arrays says."""
+    """Result of an operation, after a check of shape and dtype against the program on arrays."""
     scalars = (x for x in result.flat if hasattr(x, "dtype"))
     if result.shape != aval.shape or any(x.dtype != aval.dtype for x in scalars):
         raise NotScalarizable(f"{name}: its rule gave another shape or dtype than {aval}")
@@ -266,7 +265,7 @@ def _checked(result: Scalars, aval: Any, name: str) -> Scalars:
 
 
 def _of_angle(x: Scalar, place: int, sines: _Sines) -> Scalar:
-    """The sine or cosine of an angle, both computed once however often a program asks."""
+    """Sine or cosine of an angle; both are computed once for all uses in a program."""
     if is_known(x):
         return np.cos(x) if place else np.sin(x)
     if not jnp.issubdtype(x.dtype, jnp.floating):
