@@ -1,4 +1,4 @@
-"""Costs of the ways to compute one quantity: rows of a table, the cheapest of them, the figure."""
+"""Costs of the methods for one quantity: rows of a table, the cheapest method, the figure."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ __all__ = ["WANTED", "Cost", "CostRow", "cost_figure", "relative", "row_of", "ti
 T = TypeVar("T")
 
 WANTED = (1e-2, 1e-4, 1e-6)
-"""Errors for which tables and figures name the cheapest way."""
+"""Errors for which tables and figures show the cheapest method."""
 
 _PATIENCE = 1.0
-"""Seconds after which a timing is not repeated any more."""
+"""Total time after which a timing is not repeated, s."""
 
 
 class CostRow(NamedTuple):
-    """One way of computing the quantity: `tier`, `method`, `dtype`, `setting` (a tolerance or a number of points, in words),
-    its relative `error`, the `seconds` it took once compiled, and what the first call took besides, `compile`."""
+    """Cost of one method: `tier`, `method`, `dtype`, `setting` (a tolerance or a number of points, as text), its relative
+    `error`, the `seconds` of a compiled call, and the additional seconds of the first call, `compile`."""
 
     tier: str
     method: str
@@ -95,9 +95,9 @@ class Cost(Result):
 
 
 def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
-    """Error against seconds, a panel for each of `costs` by its title, a line for each method, the same in all panels.
+    """Plot error against seconds: a panel for each of `costs` with its title, and the same line for a method in all panels.
 
-    Rings mark the cheapest way to each of the errors `WANTED`.
+    Rings mark the cheapest method for each of the errors `WANTED`.
 
     **Arguments**: `costs` a `Cost` for each title, which stands above its panel; `ax` as many axes to draw onto. **Returns**
     a matplotlib figure, or the given `ax`.
@@ -127,7 +127,7 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
 
 
 def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
-    """A result, the seconds of its fastest computation, and what the first one took besides."""
+    """Result of a call, the time of the fastest call, and the additional time of the first one, s."""
     begun = time.perf_counter()
     value = jax.block_until_ready(call())
     first, best, spent = time.perf_counter() - begun, np.inf, 0.0
@@ -142,7 +142,7 @@ def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
 
 
 def relative(value: ArrayLike, reference: np.ndarray) -> float:
-    """The largest difference, relative to the largest entry; infinite for what is not finite."""
+    """Largest difference, relative to the largest entry; infinite for values that are not finite."""
     difference = float(np.max(np.abs(np.ravel(np.asarray(value, float)) - reference)) / np.max(np.abs(reference)))
     return difference if np.isfinite(difference) else np.inf
 

@@ -23,7 +23,7 @@ SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
 
 
 class ExactJam(NamedTuple):
-    """A jam mode exactly, with many points and fewer."""
+    """Exact jam with many points and with fewer."""
 
     mode: int
     fine: Orbit
@@ -38,9 +38,9 @@ class ExactJam(NamedTuple):
 
 
 def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
-    """The exact jam of a mode, the last but one that is stable by its slope where none is named.
+    """Exact jam of a mode (default: the last but one that is stable by its slope).
 
-    **Raises** `InputError` for a drive whose speed is not constant, and where no mode is stable.
+    **Raises** `InputError` for a drive whose speed is not constant, and if no mode is stable.
     """
     if not scene.drive.constant:
         raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; a jam is one at a constant speed: use ConstantSpeed")
@@ -49,15 +49,15 @@ def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
 
 
 def usual_mode(scene: Scene) -> int:
-    """The jam mode that is asked about where none is named: the last but one that is stable by its slope.
+    """Default jam mode: the last but one that is stable by its slope.
 
-    **Raises** `InputError` where no mode is stable, and as `jam_modes`.
+    **Raises** `InputError` if no mode is stable, and for the same scenes as `jam_modes`.
     """
     modes = jam_modes(scene)
     rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
     if not rising:
         raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
-    return rising[-2] if len(rising) > 1 else rising[-1]  # the last one turns with the rotor, nearly
+    return rising[-2] if len(rising) > 1 else rising[-1]  # the loads of the last one turn almost with the rotor
 
 
 def collocation_points(scene: Scene, points: int) -> int:
@@ -72,6 +72,6 @@ def slow_period(scene: Scene) -> float:
 
 
 def unstable(tiers: str, jam: ExactJam) -> str:
-    """Sentence that says why tiers that integrate in time cannot answer for an unstable jam."""
+    """Sentence with the reason why time integration cannot compute an unstable jam."""
     largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
     return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"

@@ -1,4 +1,4 @@
-"""Derivatives of any quantity of a scene against finite differences whose own error is known."""
+"""Comparison of derivatives of any quantity of a scene with finite differences of known error."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _DIFFERENCE_STEPS = tuple(float(h) for h in np.logspace(-2.0, -7.0, 11))
 """Relative steps of the sweep; each is `_RATIO` times the next."""
 
 _SMALL_DERIVATIVE_SHARE = 1e-3
-"""Derivatives are judged relative to themselves, but for those below this share of the largest: relative to that."""
+"""Smallest scale of a derivative in its relative error, as a share of the largest derivative."""
 
 _SAFETY = 3.0
-"""Differences within so many times what finite differences may be off say nothing."""
+"""Factor on the error of finite differences within which a difference counts as noise."""
 
 _LARGE, _TINY = 1e-2, 1e4 * float(np.finfo(float).eps)
 """Changes are as large as the largest one above this share of it; below this share of the quantity itself they are rounding."""
@@ -222,7 +222,7 @@ def check_gradients(
         return put_numbers(scene, numbers, at + shares * scales)
 
     def by(shares: Array) -> Array:
-        """The quantity with each number moved by that share of its size."""
+        """Values of the quantity with each number changed by that share of its size."""
         given = call_user(quantity, "quantity", put(shares))
         if not is_real(given):
             raise InputError("quantity", f"gives {quoted(given)}; it must give one real number")
@@ -262,7 +262,7 @@ _MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]
 
 
 def _movable(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber], np.ndarray, tuple[str, ...]]:
-    """The numbers that are checked, the size that their steps are relative to, and the names of those at a bound."""
+    """Checked numbers, the sizes to which their steps are relative, and the names of numbers at a bound."""
     found, scales, left_out = [], [], []
     for name in numbers_of(scene) if free is None else free:
         for each in find_number(scene, name, "free").single(scene):
@@ -285,12 +285,12 @@ def _central(by: Callable[[Array], Array], n: int, i: int, step: float) -> float
 
 
 def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, float]:
-    """The derivative from central differences (k,) at falling steps, what it may be off, and the step it was best at."""
+    """Derivative from central differences (k,) with decreasing steps, its error, and the best step."""
     better = central[1:] + (central[1:] - central[:-1]) / (_RATIO**2 - 1.0)
     apart = np.abs(np.diff(better))
     rounding = np.finfo(float).eps * abs(value) / np.asarray(_DIFFERENCE_STEPS[2:-1])
     noise = np.maximum(np.maximum(apart[:-1], apart[1:]), rounding)
-    # Steps so small that the quantity does not feel them agree with each other, and not with the larger ones.
+    # Differences with steps below the resolution of the quantity agree with each other, but not with the larger ones.
     inner = better[1:-1]
     for k in range(1, noise.size):
         with np.errstate(invalid="ignore"):
@@ -303,9 +303,10 @@ def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, floa
 
 
 def _parts(central: np.ndarray, slopes: np.ndarray, value: float) -> bool:
-    """True if the quantity changes as much at small steps as at large ones, and derivatives (r,) say that it would.
+    """True if the quantity changes as much at small steps as at large ones, consistent with its derivatives (r,).
 
-    Noise of a quantity changes it at small steps too, and leaves its derivatives alone; a wrong derivative leaves the quantity.
+    Noise also causes changes at small steps, but leaves the derivatives unchanged; a wrong derivative leaves the quantity
+    unchanged.
     """
     changed = 2.0 * np.abs(central) * np.asarray(_DIFFERENCE_STEPS)
     most, small = float(np.max(changed)), float(np.median(changed[-5:]))

@@ -43,7 +43,7 @@ class HarmonicConvergence(Result):
     - `harmonics` (n,): the highest one of the carrier
     - `omega` (w,), rad/s, of the jams
     - `error` (n, w), relative, of the rotor speed, by comparison with twice as many points as the last
-    - `known` (n, w): the estimate of it that each jam has
+    - `known` (n, w): the estimate of the error by each jam
     """
 
     status = Computed.done
@@ -54,12 +54,12 @@ class HarmonicConvergence(Result):
     known: np.ndarray = eqx.field(metadata=in_unit("", "harmonics", "omega"))
 
     def summary(self) -> str:
-        """A line for each number of harmonics: the largest error and the largest estimate of it, for a person to read."""
+        """Return a line of text for each number of harmonics: the largest error and the largest estimate."""
         rows = zip(self.harmonics, np.max(self.error, axis=1), np.max(self.known, axis=1), strict=True)
         return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {known:.1e}" for n, error, known in rows)
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Error over the highest harmonic, a line a load speed; the jams' own estimates dashed.
+        """Plot the error over the highest harmonic, a line for each load speed; estimates dashed.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """

@@ -1,4 +1,4 @@
-"""The tiers: ways to compute the jam of a scene, each with the scenes that it can answer for."""
+"""Tiers: methods to compute the jam of a scene, each with the scenes that it includes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["TIERS", "JamValues", "Tier"]
 
 
 class JamValues(Protocol):
-    """The quantities that every tier names alike."""
+    """Common quantities of the results of all tiers."""
 
     @property
     def omega(self) -> Array:
@@ -53,7 +53,7 @@ class Tier(NamedTuple):
     jam: Callable[[Scene, int, float], JamValues]
 
     def refusal(self, scene: Scene) -> str | None:
-        """The sentence by which the tier refuses the scene; None where it answers.
+        """Sentence by which the tier refuses the scene, otherwise None.
 
         >>> import jaxvib as jv
         >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
@@ -94,4 +94,4 @@ TIERS = (
         lambda scene, mode, until: settle(scene, mode=mode, throw=False),
     ),
 )
-"""Tiers in order of cost; the last one answers for every scene."""
+"""Tiers in order of cost; the last one includes every scene."""

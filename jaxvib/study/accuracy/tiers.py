@@ -1,4 +1,4 @@
-"""The error of the leading order: jams of light-load theory against exact ones as the loads get heavier."""
+"""Error of the leading order: jams of light loads compared with exact jams for increasing mass of the loads."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Tiers(Result):
     exact: TierValues = eqx.field(metadata=part(prefix="exact_"))
 
     def summary(self) -> str:
-        """A line for each mass: the load speed by both tiers, or why there is none, for a person to read."""
+        """Return a line of text for each mass: the load speed by both tiers, or the reason why it is missing."""
         lines = []
         for k, mass in enumerate(self.mass):
             light, exact = (
@@ -60,7 +60,7 @@ class Tiers(Result):
         return "\n".join(lines)
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Relative differences over the load's mass: load speed, amplitude, foundation force; hollow where unstable.
+        """Plot relative differences over the mass of a load: load speed, amplitude, foundation force; hollow if unstable.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """

@@ -1,4 +1,4 @@
-"""Work-precision: error against seconds of one quantity of a scene, computed in every way there is."""
+"""Work-precision: error against seconds of one quantity of a scene, by all methods."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver | None]] = {
     "Tsit5": diffrax.Tsit5,
     "Dopri8": diffrax.Dopri8,
 }
-"""Methods of time integration by name; the default is what `simulate` takes unless told otherwise."""
+"""Methods of time integration by name; "default" is the default of `simulate`."""
 
 _TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 _ORBIT_POINTS = (8, 16)
@@ -140,7 +140,7 @@ class _Ask(NamedTuple):
 
 
 def _single(tree: Tree) -> Tree:
-    """A scene, or more, in single precision; goes with `jax.enable_x64(False)`."""
+    """Convert scenes to single precision, for use under `jax.enable_x64(False)`."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
 
 
@@ -186,7 +186,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
 
 
 def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cost:
-    """Quantity of a motion that is no jam: measured at the end of a run from rest."""
+    """Quantity of a motion without a jam, measured at the end of a run from rest."""
     end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
 
     def read(found: Result) -> Array:
@@ -228,7 +228,7 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
     """Full runs by every solver to every tolerance, in double and (the default method) in single precision."""
     ends = {tolerance: length(tolerance) for tolerance in ask.tolerances}
     fastest, _ = frequency_bounds(ask.scene)
-    steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # one for all: it is a part of the program
+    steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # the same for all, since it is a part of the program
 
     def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:
         solver = SOLVERS[name]()

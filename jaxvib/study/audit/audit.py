@@ -167,7 +167,7 @@ def audit(
     repeated = RepeatedComparison(question, repeats)
     own = repeated.values(scene, repeated.tier(scene))
     until = question.until if isinstance(question, RunComparison) else None
-    # Of a machine that hardly moves, what its loads could do: their unbalance radius.
+    # The scale of a machine that hardly moves is the unbalance radius of its loads.
     amplitude = [a * (own.magnified / MIN_AMPLITUDE_SHARE if own.magnified > 1.0 else 1.0) for a in own.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     status = "done"

@@ -1,4 +1,4 @@
-"""A scene against the same one with an effect more or less."""
+"""Comparison of a scene with the same scene with or without an effect."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from jaxvib.study.audit.variants import Variant
 __all__ = ["CHANGES", "EffectRow", "RepeatedComparison", "effect_row", "field_operations", "relative_changes"]
 
 CHANGES = ("amplitude", "foundation_force", "omega", "fold")
-"""The quantities whose changes an audit tells, by their names in `EffectRow`."""
+"""Compared quantities, by their names in `EffectRow`."""
 
 _TURNS, _TOLERANCE, _MAX_STEPS = 100, 1e-8, 2**24
-"""Turns of the rotor of the run whose time is taken, its tolerance, and the most steps that it may make."""
+"""Length of the timed run in turns of the rotor, its tolerance, and its maximum number of steps."""
 
 
 class EffectRow(NamedTuple):
@@ -39,7 +39,7 @@ class EffectRow(NamedTuple):
 
     **Attributes**
 
-    - `name` of the effect, `present`: True if the scene has it (it was taken out), False if not (it was put in), `tier` of the
+    - `name` of the effect, `present`: True if the scene has it (it was removed), False if not (it was added), `tier` of the
       computation
     - changes by the effect, relative to the scene's own value: `amplitude` (of the coordinate that changes most, in units of
       the largest of its kind, and in a machine that hardly moves of a hundredth of the loads' unbalance radius),

@@ -94,7 +94,7 @@ class JamComparison(NamedTuple):
         return True
 
     def exact(self, scene: Scene) -> MotionValues:
-        """MotionValues of the exact orbit; NaN, and a kind that says so, if there is no such jam."""
+        """Values of the exact orbit; NaN and a kind "no jam mode" if the jam does not exist."""
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
         there = bool(np.isfinite(orbit.omega))
         kind = f"jam mode {self.mode}, {orbit.judgement}" if there else f"no jam mode {self.mode}"
@@ -121,7 +121,7 @@ class JamComparison(NamedTuple):
         return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
     def full(self, scene: Scene) -> MotionValues:
-        """MotionValues of the full equations, from near the exact jam until they are settled."""
+        """Values of the full equations, from near the exact jam until they are settled."""
         run = settle(scene, start=self.state(scene), throw=False)
         return _read(scene, run, fold_speed(without_excluded_effects(scene), float(run.omega)))
 
@@ -152,7 +152,7 @@ class RunComparison(NamedTuple):
         raise NotImplementedError
 
     def full(self, scene: Scene) -> MotionValues:
-        """MotionValues of the full equations."""
+        """Values of the full equations."""
         start = self.state(scene)
         run = simulate(scene, self.until, start=start, save="window", turns=_WINDOW_PERIODS, estimate=False, throw=False)
         return _read(scene, run, math.nan)

@@ -1,4 +1,4 @@
-"""Dimensionless numbers that say what a scene may lack."""
+"""Dimensionless numbers on effects that a scene may lack."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class NumberRow(NamedTuple):
 
 
 def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -> list[NumberRow]:
-    """The numbers that judge what `scene` leaves out, at the motion `values` and a relative `accuracy`.
+    """Compute the numbers on effects that `scene` lacks, for the motion `values` and a relative `accuracy`.
 
     - gravity on the loads: g/(R Omega^2), its share in the force with which a load presses on its track
     - crowding: the share of the track that the loads' diameters fill, N arcsin(r/R)/pi, and what of the unbalance is lost
       where they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R; r that of steel balls where none is given
-    - distance: how near two loads come to each other, in diameters, where nothing keeps them apart
+    - distance: smallest distance of two loads, in diameters, without contact
     - dry against viscous friction: that of a ball bearing, or of steel on steel, over the drag b_W R^2 (n - Omega)
     - gyroscopic: the loads' inertia about the axis over that of the machine about a tilt, with R as its radius of gyration,
       where the machine cannot tilt

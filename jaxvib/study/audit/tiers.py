@@ -42,7 +42,7 @@ class TierRow(NamedTuple):
     says: str
 
     def words(self) -> str:
-        """The row in words."""
+        """Return the row as text."""
         if not self.answers:
             return f"does not answer; {self.says}"
         off = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))

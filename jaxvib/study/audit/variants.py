@@ -1,4 +1,4 @@
-"""Scenes with one effect more or less."""
+"""Variants of a scene with one effect added or removed."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _DROOP = 0.015
 
 
 class Variant(NamedTuple):
-    """A `scene` with one thing more or less than the one that is audited: its `name`; `present`, whether the audited scene has
-    it; `says`, with which numbers it was put in."""
+    """Variant of the audited scene with one effect added or removed: `name` of the effect; `present`: True if the audited scene
+    has it; the varied `scene`; `says`: the numbers with which it was added."""
 
     name: str
     present: bool
@@ -35,7 +35,7 @@ class Variant(NamedTuple):
 
 
 class WithoutGyroscopic(Machine):
-    """A machine without what couples its coordinates through the rotor's speed."""
+    """Machine without the gyroscopic coupling of its coordinates."""
 
     machine: Machine
     kind: str = eqx.field(static=True)
@@ -86,7 +86,7 @@ def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[
     for kind, effect in EFFECTS.items():
         if kind in known:
             continue
-        with contextlib.suppress(InputError):  # it does not go with this machine or these loads
+        with contextlib.suppress(InputError):  # this machine or these loads cannot have the effect
             usual = effect.typical(scene.machine, scene.loads, scene.drive.speed, jnp.asarray(amplitude))
             if usual is not None:
                 more = scene.replace(effects=(*scene.all_effects, usual.effect))

@@ -25,11 +25,11 @@ __all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_poi
 
 
 _LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
-"""Beyond this amplitude, rad, the averaged formula and the fitted arcs are off by so much, relative."""
+"""Amplitude, rad, and relative error of the averaged formula and the fitted arcs beyond it."""
 
 _MAX_AMPLITUDE = np.pi / 2.0
-"""Beyond this amplitude, rad, the error of the arcs fitted to the turning points is unknown: with 25 samples a second and weak
-friction it moved mu1 by 0.4 to 0.9 percent, up to three times the interval of the noise."""
+"""Amplitude, rad, beyond which the error of the arcs fitted to the turning points is unknown. With 25 samples a second and weak
+friction it changed mu1 by 0.4 to 0.9 percent, up to three times the interval of the noise."""
 
 
 class Estimate(NamedTuple):
@@ -84,7 +84,7 @@ class Decrement(Result):
     periods: int = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
-        """The number with its interval, for a person to read."""
+        """Return the number with its interval as text."""
         return (
             f"by {self.periods} periods: mu1 {self.viscous.value:.5g} N m s, from {self.viscous.low:.5g} to "
             f"{self.viscous.high:.5g}; {len(self.estimates)} pairs scatter by {self.scatter:.2g}"
@@ -142,7 +142,7 @@ def turning_points(record: Record) -> TurningPoints:
             continue
         size = min(abs(f[k] - middle), np.pi)
         away = np.abs(frequency * (t - t[k]))
-        # Of a large swing only the nearer part is such an arc; a coarse record needs all of it.
+        # For a large swing only the nearer part is such an arc; a coarse record needs the whole part.
         near = away <= np.pi / 3.0 / (1.0 + size**2 / 3.0)
         near = near if np.count_nonzero(near) >= 9 else away <= np.pi / 3.0
         # In units of 1/w; below 0 beyond 90 deg, where the arc is a hyperbolic cosine.
@@ -185,7 +185,7 @@ def period_stretch(amplitude: np.ndarray) -> np.ndarray:
 
 
 def _alternating(f: np.ndarray, least: float) -> list[int]:
-    """Indices of maxima and minima in turn, each confirmed by a way back of `least`; the two ends are none."""
+    """Indices of alternating maxima and minima, each confirmed by a return of at least `least`; without the two ends."""
     found: list[int] = []
     high = low = 0
     rising: bool | None = None
@@ -202,7 +202,7 @@ def _alternating(f: np.ndarray, least: float) -> list[int]:
 
 
 def _regular(t: np.ndarray, peaks: list[int]) -> list[int]:
-    """The longest stretch of turning points in step: noise about a pendulum at rest, or the hand that let go, is not."""
+    """Longest stretch of regular turning points, without noise about a pendulum at rest and the release by hand."""
     steps = np.diff(t[peaks])
     even = [True, *((steps[1:] < 1.6 * steps[:-1]) & (steps[1:] > 0.6 * steps[:-1])), False]
     cuts = [0, *(k for k, is_even in enumerate(even) if not is_even)]
@@ -304,6 +304,6 @@ def _slope(amplitude: np.ndarray) -> np.ndarray:
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
-    """The estimate with its interval: noise and instruments in squares."""
+    """Estimate with its interval, from the sum of squares of noise and instrument errors."""
     half = float(np.hypot(quantile * error, instrument * value))
     return Estimate(value, error, value - half, value + half)

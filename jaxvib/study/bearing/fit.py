@@ -82,7 +82,7 @@ def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints,
 
 
 def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
-    """More steps than the integration takes; a power of 2, so that few lengths of a record need few compilations."""
+    """Upper bound of the integration steps, a power of 2, so that records of many lengths share few programs."""
     return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
 
 
@@ -141,11 +141,12 @@ def fit_swing(
 def _least_squares(
     residual: Callable[[Array], tuple[Array, tuple[Array, Array, Array]]], start: Array, n: Array
 ) -> tuple[Array, Array, Array, tuple[Array, Array], Array]:
-    """Return x (p,) of the least sum of squares of `residual`, `n` of whose entries count; residual, slopes, the rest, success.
+    """Minimize the sum of squares of `residual`, of which `n` entries count, by the method of Levenberg and Marquardt.
 
-    Levenberg and Marquardt's method, written so that the program holds the integration once: it is what takes long to compile.
-    It is done where the next full step is less than 0.01 standard errors, and good where it is less than 0.1: below, the
-    steps of the integration blur the sum.
+    The program contains the integration once, since that takes long to compile. The iteration ends if the next full step is
+    below 0.01 standard errors, and has converged below 0.1, since the steps of the integration limit the resolution.
+
+    **Returns** x (p,), residual, slopes, the rest, success.
     """
     slopes_of = jax.jacfwd(residual, has_aux=True)
     size, p = jax.eval_shape(residual, start)[0].shape[0], start.shape[0]

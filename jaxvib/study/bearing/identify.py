@@ -1,4 +1,4 @@
-"""The friction of a bearing from the recorded swing of a pendulum on it."""
+"""Identification of the friction of a bearing from the recorded swing of a pendulum on it."""
 
 from __future__ import annotations
 
@@ -34,13 +34,14 @@ if TYPE_CHECKING:
 __all__ = ["Identified", "IdentifyStatus", "identify"]
 
 _AT_REST = 1.3
-"""Half periods without a turning point before the first or after the last one, of which a swinging pendulum has 1.2 at most."""
+"""Number of half periods without a turning point before the first or after the last one that ends a swing; a swinging pendulum
+has at most 1.2."""
 
 _STRUCTURE = 1e-5
-"""Share of records with nothing but noise about the fit that are called patterned."""
+"""Share of records with pure noise about the fit that get the status `patterned`."""
 
 _CONTRADICTS = 0.05
-"""Relative difference of frequencies, besides what instruments leave open, that no ruler and no scales explain."""
+"""Relative difference of frequencies, in addition to instrument errors, that errors of length and mass cannot explain."""
 
 
 class IdentifyStatus(eqx.Enumeration):
