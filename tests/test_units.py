@@ -167,7 +167,7 @@ def test_a_count_ends_where_indices_and_memory_end():
 
 def test_an_angle_keeps_digits_within_a_turn():
     assert number(1e15, "rad", "separation") == 1e15 and number(1e16, "m", "radius") == 1e16
-    with pytest.raises(jv.InputError, match=r"^apart is 1e\+16 rad; it must be below 4\.5e\+15 rad"):
+    with pytest.raises(jv.InputError, match=r"^separation is 1e\+16 rad; it must be below 4\.5e\+15 rad"):
         number(1e16, "rad", "separation")
 
 
