@@ -1,0 +1,90 @@
+"""Runs of several exciters against equations written by hand and integrated by SciPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxvib as jv
+
+M, K, C, G, END = 80.0, 4e4, 300.0, 9.81, 2.0
+UNBALANCE, INERTIA, STALL, NO_LOAD = (0.3, 0.2), (0.06, 0.05), (9.0, 7.0), (100.0, 90.0)
+DIRECTION = (1, -1)
+
+
+def motor(k, stall=None):
+    drive = jv.DCMotor(NO_LOAD[k], stall_torque=STALL[k] if stall is None else stall, inertia=INERTIA[k])
+    return jv.Exciter(drive=drive, unbalance=UNBALANCE[k], direction=DIRECTION[k])
+
+
+MACHINE = jv.one_mass(mass=M, stiffness=K, damping=C)
+SCENE = jv.Scene(MACHINE, exciters=[motor(0), motor(1)], effects=jv.Gravity())
+
+
+def by_hand(stall=STALL, end=END):
+    """States (y, theta_1, theta_2, and their rates) at the end; both motors start from rest at the angle 0."""
+
+    def rates(_, x):
+        y, v = x[0], x[3]
+        theta, turn = x[1:3], x[4:6]
+        mass, force = np.diag([M, *INERTIA]), np.array([-K * y - C * v, 0.0, 0.0])
+        for k in range(2):
+            s, c = np.sin(theta[k]), np.cos(theta[k])
+            mass[0, 1 + k] = mass[1 + k, 0] = UNBALANCE[k] * c
+            force[0] += UNBALANCE[k] * turn[k] ** 2 * s
+            torque = DIRECTION[k] * stall[k] * (1.0 - DIRECTION[k] * turn[k] / NO_LOAD[k])
+            force[1 + k] += torque - UNBALANCE[k] * G * c
+        return np.concatenate([x[3:], np.linalg.solve(mass, force)])
+
+    return solve_ivp(rates, (0.0, end), np.zeros(6), method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+def flat(state, at=()):
+    rotors = np.array([[np.asarray(x)[at] for x in own.rotor] for own in state.exciters])
+    return np.array([state.displacement[at][0], *rotors[:, 0], state.velocity[at][0], *rotors[:, 1]])
+
+
+def test_a_run_of_two_motors_is_that_of_the_equations_by_hand():
+    run = jv.simulate(SCENE, END, save="window")
+    np.testing.assert_allclose(flat(run.window.state, -1), by_hand(), rtol=1e-6, atol=1e-6)
+    assert float(run.error) < 1e-6
+    np.testing.assert_allclose(run.omega, np.mean(np.asarray(run.load_speed) * DIRECTION), rtol=1e-14)
+    turned = [np.ptp(angle) / (run.window.time[-1] - run.window.time[0]) for angle in run.window.rotor_angles]
+    np.testing.assert_allclose(np.abs(run.load_speed), turned, rtol=0.05)
+    assert "rotors at" in run.summary() and run.load_speed[0] > 0.0 > run.load_speed[1]
+
+
+def test_an_ensemble_of_two_motors_is_that_of_the_equations_by_hand():
+    stalls = jnp.asarray([5.0, 9.0, 14.0])
+    many = jv.ensemble(
+        lambda stall: jv.Scene(MACHINE, exciters=[motor(0, stall), motor(1)], effects=jv.Gravity()),
+        stalls,
+        END,
+        stepsize_controller=jv.EqualSteps(800),
+    )
+    for k, stall in enumerate(stalls):
+        end = jax.tree.map(lambda leaf, k=k: leaf[k], many.state)
+        np.testing.assert_allclose(flat(end), by_hand((float(stall), STALL[1])), rtol=1e-6, atol=1e-6)
+    assert many.load_speed.shape == (3, 2) and not bool(jnp.any(many.detached))
+
+
+def test_saved_runs_of_several_exciters_are_read_back(tmp_path):
+    run = jv.simulate(SCENE, 0.5, samples=16, estimate=False)
+    again = jv.load(run.save(tmp_path / "run"))
+    jax.tree.map(np.testing.assert_array_equal, again.trajectory, run.trajectory)
+    data = run.to_xarray()
+    assert {"displacement", "rotor_angle_1", "rotor_speed_2", "load_speed"} < set(data)
+    assert data["load"].values.tolist() == ["1", "2"]
+
+
+@pytest.mark.parametrize("start", ["rest", "spin_up"])
+def test_named_starts_hold_for_every_exciter(start):
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    exciters = [jv.Exciter(loads, jv.ConstantSpeed(40.0)), jv.Exciter(loads, jv.ConstantSpeed(30.0), direction=-1)]
+    run = jv.simulate(jv.Scene(MACHINE, exciters=exciters), 1.0, start=start, samples=4, estimate=False)
+    begin = [own.angle[0][0] for own in run.trajectory.state.exciters]
+    np.testing.assert_allclose(begin, [loads.rest()[0] + np.radians([-0.5, 0.5])] * 2)
+    speeds = [float(speed[0]) for speed in run.trajectory.rotor_speeds]
+    assert speeds == ([40.0, -30.0] if start == "rest" else [0.0, 0.0])
+    np.testing.assert_allclose([speed[-1] for speed in run.trajectory.rotor_speeds], [40.0, -30.0])
