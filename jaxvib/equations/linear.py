@@ -101,8 +101,8 @@ class LinearModel(Model):
         return self.mount.rows[0].T @ turning(self.mount)
 
     def damping(self, speed: Array) -> Array:
-        """C + n G (nd, nd) N s/m at the rotor's `speed` n, rad/s."""
-        damping, gyroscopic = self.carrier.damping, self.mount.gyroscopic
+        """C + n G (nd, nd) N s/m at the rotor's `speed` n, rad/s, or the mean speed of several rotors."""
+        damping, gyroscopic = self.carrier.damping, self.mounts[0].gyroscopic
         return damping if gyroscopic is None else damping + speed * gyroscopic
 
     def dynamic_stiffness(self, omega: Array, speed: Array | None = None) -> Array:

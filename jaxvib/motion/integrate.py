@@ -19,7 +19,7 @@ from jaxvib.equations.model import assemble
 from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_term
-from jaxvib.machine.effects.terms import LoadInteraction
+from jaxvib.machine.effects.terms import LoadInteraction, RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -289,8 +289,22 @@ _MAX_TURNS = 1e15
 
 
 def whole_turns(scene: Scene, stretch: float) -> float:
-    """Longest time within `stretch`, s, that is a whole number of turns of a rotor with constant speed; at least one turn."""
-    turn = 2.0 * math.pi / float(scene.drive.speed)
+    """Longest time within `stretch`, s, after which rotors of constant speed are where they were; at least one turn.
+
+    Only rotors out of balance count if there are several, and no rotor of a motor, whose angle is a state. **Raises**
+    `InputError` for rotors out of balance at different speeds.
+    """
+    one = len(scene.exciters) == 1
+    counted = [
+        e for e in scene.exciters if e.drive.ideal and (one or e.carries != ("loads",) or has_term(e.effects, RotorImbalance))
+    ]
+    speeds = sorted({float(exciter.drive.speed) for exciter in counted})
+    if not speeds:
+        return stretch
+    if len(speeds) > 1:
+        problem = f"turn unbalances at {speeds} rad/s, which are never again where they were; simulate, or use motors"
+        raise InputError("exciters", problem)
+    turn = 2.0 * math.pi / speeds[0]
     turns = stretch / turn
     if turns > _MAX_TURNS:
         raise InputError(

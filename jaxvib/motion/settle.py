@@ -156,10 +156,12 @@ def _plan_settle(
     """Validate the arguments of `settle` and choose its stretches. **Raises** `InputError`."""
     require_known(scene, "scene", "settle", "transform jam_orbit or simulate instead")
     scene = validate_scene(scene)
-    if not scene.drive.constant:
-        raise InputError("drive", f"is {quoted(scene.drive.kind)}; a motion settles under a constant speed: use ConstantSpeed")
+    for k, exciter in enumerate(scene.exciters):
+        if not exciter.drive.constant and (exciter.drive.ideal or scene.is_plain):
+            problem = "a motion settles under a constant speed: use ConstantSpeed"
+            raise InputError(f"{scene.place_of(k)}drive", f"is {quoted(exciter.drive.kind)}; {problem}")
     count(periods, "periods")
-    double = scene.drive.speed.dtype.itemsize >= 8
+    double = scene.top_speed.dtype.itemsize >= 8
     usual = 1e-6 if double else 1e-3
     # Stretches of whole turns: an imbalance continues at the angle at which it was.
     length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
@@ -167,7 +169,7 @@ def _plan_settle(
     is_jam = isinstance(start, str) and start == "jam"
     separation = START_SEPARATION if separation is None and is_jam else separation
     steps = Tolerance(1e-9 if double else 1e-5) if steps is None else steps
-    if is_jam and not jams_of.is_ready(scene):
+    if is_jam and scene.is_plain and not jams_of.is_ready(scene):
         rest = initial_state(scene)
         prepare_run(plan_stretch(scene, length, rest, steps, throw=throw))
         prepare_separation(scene, rest, WINDOW)
@@ -202,7 +204,8 @@ def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
             measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
             if len(measured) >= plan.remembered and _steady_in_the_mean(np.array(measured[-plan.remembered :])):
                 return _judged(run, "beating"), True
-            if drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.usual):
+            is_plain = plan.first.scene.is_plain
+            if is_plain and drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.usual):
                 regimes.append(run.regime)
                 if _is_creeping(regimes[-_CREEPS:]):
                     return _judged(run, "creeping"), True
@@ -219,8 +222,8 @@ def _judged(run: Run, name: str) -> Run:
 
 @cached
 def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
-    model = linear_model(scene)
-    return model.mass, model.carrier.stiffness, model.damping(scene.drive.speed)
+    model, speeds = linear_model(scene), [exciter.direction * exciter.drive.speed for exciter in scene.exciters]
+    return model.mass, model.carrier.stiffness, model.damping(sum(speeds[1:], speeds[0]) / len(speeds))
 
 
 def _slowest_decay(scene: Scene) -> float:

@@ -329,12 +329,12 @@ def last_state(scene: Scene, run: Run) -> State:
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, has_common_turns = wrap_angles(scene, last.displacement.dtype)
 
-    def inside(own: ExciterState) -> list[Array]:
+    def inside(own: ExciterState) -> ExciterState:
         first = np.ravel(own.angle[0])[0] if own.angle else 0.0
-        return [x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in own.angle]
+        angle = tuple(x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in own.angle)
+        return ExciterState(angle, own.rate, own.rotor, own.spin)
 
-    angles = [angle for own in last.exciters for angle in inside(own)]
-    last = eqx.tree_at(lambda y: [angle for own in y.exciters for angle in own.angle], last, angles)
+    last = State(last.displacement, last.velocity, exciters=tuple(map(inside, last.exciters)))
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), last)
 
 

@@ -88,3 +88,25 @@ def test_named_starts_hold_for_every_exciter(start):
     speeds = [float(speed[0]) for speed in run.trajectory.rotor_speeds]
     assert speeds == ([40.0, -30.0] if start == "rest" else [0.0, 0.0])
     np.testing.assert_allclose([speed[-1] for speed in run.trajectory.rotor_speeds], [40.0, -30.0])
+
+
+def test_two_half_motors_settle_as_one_at_the_closed_form():
+    """Below the resonance they stay in step: S Omega^2 / |D| and, to leading order, L(Omega) = c S^2 Omega^5 / (2 |D|^2)."""
+    machine, total, top, stall = jv.one_mass(mass=100.0, stiffness=4e5, damping=2000.0), 0.2, 40.0, 10.0
+
+    def half(share):
+        drive = jv.DCMotor(top, stall_torque=stall * share, inertia=0.5 * share)
+        return jv.Exciter(drive=drive, unbalance=total * share)
+
+    one, two = (jv.settle(jv.Scene(machine, exciters=each), drift=1e-6) for each in ([half(1.0)], [half(0.5)] * 2))
+    np.testing.assert_allclose([two.omega, two.amplitude[0]], [one.omega, one.amplitude[0]], rtol=1e-6)
+    omega = float(one.omega)
+    size = abs(4e5 - 100.0 * omega**2 + 2000.0j * omega)
+    np.testing.assert_allclose(one.amplitude[0], total * omega**2 / size, rtol=5e-3)
+    np.testing.assert_allclose(stall * (1.0 - omega / top), 2000.0 * total**2 * omega**5 / (2.0 * size**2), rtol=5e-3)
+
+
+def test_settle_refuses_unbalances_at_different_speeds():
+    exciters = [jv.Exciter(drive=jv.ConstantSpeed(speed), unbalance=0.1) for speed in (40.0, 30.0)]
+    with pytest.raises(jv.InputError, match=r"exciters turn unbalances at \[30.0, 40.0\] rad/s"):
+        jv.settle(jv.Scene(MACHINE, exciters=exciters))
