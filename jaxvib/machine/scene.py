@@ -19,7 +19,7 @@ from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, Roto
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
-from jaxvib.units import Number, number
+from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known
 
 __all__ = ["Exciter", "Scene", "read_effects", "require_comparable"]
@@ -86,8 +86,9 @@ class Exciter(Part):
         self.loads, self.drive, self.effects, self.direction = loads, drive, effects, int(direction)
         self.unbalance = None if unbalance is None else read_numbers(Exciter, "", unbalance=unbalance)["unbalance"]
         self.carries = ("loads",) * (loads is not None) + ("unbalance",) * (unbalance is not None)
-        self.platform = at if isinstance(at, int) else None
-        self.position = None if at is None or isinstance(at, int) else number(at, "m", "at")
+        is_platform = isinstance(at, (int, np.integer))
+        self.platform = count(at, "at") if is_platform else None
+        self.position = None if at is None or is_platform else number(at, "m", "at")
 
     @property
     def is_plain(self) -> bool:

@@ -121,6 +121,7 @@ BAD = {
     "neither": (lambda: two(unbalance=None), r"loads is None; .* or give an unbalance"),
     "no drive": (lambda: two(drive=None), r"drive is None; it must be a Drive"),
     "platform": (lambda: two(at=3), r"at is 3; the machine has platforms 1 to 2"),
+    "truth value": (lambda: two(at=True), r"at is True; it must be a whole number"),
     "distance": (lambda: two(at="2 mm"), r"at is a distance along a rotor's axis; name a platform instead"),
     "friction without loads": (lambda: two(effects=jv.DryFriction(0.01, 0.02)), r"acts on loads, which this exciter does not"),
     "shared effect": (lambda: jv.Exciter(LOADS, DRIVE, effects=jv.Gravity()), "effects.gravity acts on the whole machine"),
