@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -138,7 +137,8 @@ class RunComparison(NamedTuple):
         if isinstance(self.start, State):
             with contextlib.suppress(InputError):  # the state is of a scene with another effect
                 return with_spin(scene, self.start)
-            return with_spin(scene, replace(self.start, spin=None))
+            start = self.start
+            return with_spin(scene, State(start.displacement, start.velocity, start.angle, start.rate, start.rotor))
         if self.start == "turning":
             return turning_state(scene)
         return initial_state(scene, "rest")
