@@ -45,7 +45,7 @@ def flat(state, at=()):
     return np.array([state.displacement[at][0], *rotors[:, 0], state.velocity[at][0], *rotors[:, 1]])
 
 
-def test_a_run_of_two_motors_is_that_of_the_equations_by_hand():
+def test_a_run_of_two_motors_obeys_the_equations_by_hand():
     run = jv.simulate(SCENE, END, save="window")
     np.testing.assert_allclose(flat(run.window.state, -1), by_hand(), rtol=1e-6, atol=1e-6)
     assert float(run.error) < 1e-6
@@ -55,7 +55,7 @@ def test_a_run_of_two_motors_is_that_of_the_equations_by_hand():
     assert "rotors at" in run.summary() and run.load_speed[0] > 0.0 > run.load_speed[1]
 
 
-def test_an_ensemble_of_two_motors_is_that_of_the_equations_by_hand():
+def test_ensembles_of_two_motors_obey_the_equations_by_hand():
     stalls = jnp.asarray([5.0, 9.0, 14.0])
     many = jv.ensemble(
         lambda stall: jv.Scene(MACHINE, exciters=[motor(0, stall), motor(1)], effects=jv.Gravity()),
@@ -90,7 +90,7 @@ def test_named_starts_hold_for_every_exciter(start):
     np.testing.assert_allclose([speed[-1] for speed in run.trajectory.rotor_speeds], [40.0, -30.0])
 
 
-def test_two_half_motors_settle_as_one_at_the_closed_form():
+def test_two_half_motors_settle_as_one():
     """Below the resonance they stay in step: S Omega^2 / |D| and, to leading order, L(Omega) = c S^2 Omega^5 / (2 |D|^2)."""
     machine, total, top, stall = jv.one_mass(mass=100.0, stiffness=4e5, damping=2000.0), 0.2, 40.0, 10.0
 
