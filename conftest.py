@@ -1,7 +1,6 @@
 """Float64, strict promotion of ranks: what a test relies on is said here, never by importing jaxvib."""
 
 import contextlib
-import functools
 import gc
 import hashlib
 import importlib
@@ -49,12 +48,6 @@ def pytest_configure(config):
         os.utime(PROGRAMS)
         for old in sorted(PROGRAMS.parent.iterdir(), key=lambda place: place.stat().st_mtime)[:-4]:
             shutil.rmtree(old)
-    # Each run-time check that is traced asks of every frame of the stack whether its file is one of some thirty.
-    with contextlib.suppress(ImportError, AttributeError):  # a JAX that does it otherwise
-        frames = importlib.import_module("jax._src.traceback_util")
-        frames.include_filename = functools.cache(frames.include_filename)
-    # Where an operation was called from is written into no program.
-    jax.config.update("jax_traceback_in_locations_limit", 0)
     # JAX makes a context of MLIR, with all its dialects, for each program that it lowers: a sixth of the suite's time. One that
     # is in use, by a program within which another one is lowered, is left alone.
     with contextlib.suppress(ImportError, AttributeError):

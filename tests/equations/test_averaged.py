@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
 from scenes import machines, published, scene
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.equations.averaged import Amplitudes, _with_conjugate, amplitudes_of, averaged_field
@@ -40,7 +39,7 @@ def test_averaged_is_the_mean_of_the_full_equations_over_a_turn(machine, load):
     slow = Amplitudes(y, v, jnp.asarray(rng.uniform(20.0, 30.0, n)), jnp.asarray(phase - np.mean(phase)))
     angles = jnp.arange(16) * 2.0 * jnp.pi / 16
 
-    @stored_jit
+    @eqx.filter_jit
     def derivatives():
         def at(theta):
             wave = jnp.exp(1j * theta)
@@ -65,7 +64,7 @@ def test_equilibria_are_the_leading_order_jams(machine):
     """The averaged equations are at rest at the jams of `jam_rotor_speed`."""
     s = scene(machine, "balls")
 
-    @stored_jit
+    @eqx.filter_jit
     def at(omega):
         jammed = eqx.tree_at(lambda x: x.drive.speed, s, jam_rotor_speed(s, omega))
         y = steady_displacement(s, omega)
@@ -81,7 +80,7 @@ def test_equilibria_are_the_leading_order_jams(machine):
         assert float(jnp.max(jnp.abs(change.rate))) < 1e-10 * float(free)
 
 
-@stored_jit
+@eqx.filter_jit
 def slope_at(s, jam):
     """The Jacobian of the averaged equations of two platforms and one load."""
 
@@ -115,7 +114,7 @@ def test_a_state_and_its_amplitudes_are_the_same_motion():
     rings while they rest, with the energy that the state has."""
     s = scene("two_mass", "balls")
     theta = 0.8
-    back = stored_jit(lambda state: amplitudes_of(s, state))
+    back = eqx.filter_jit(lambda state: amplitudes_of(s, state))
     for omega in (75.0, 12.0):
         y = steady_displacement(s, omega)
         z = y * jnp.exp(1j * theta)

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import loads, machines, published, scene
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.equations.exciter import ExciterDynamics
@@ -22,7 +21,7 @@ def random_state(s, seed=0):
     return jv.State(draw(nd), draw(nd), (3.0 * draw(n),), (50.0 * draw(n),))
 
 
-evaluate = stored_jit(lambda s, state: jv.vector_field(s)(0.0, state))
+evaluate = eqx.filter_jit(lambda s, state: jv.vector_field(s)(0.0, state))
 
 
 def euler_lagrange(s, state, gravity):
@@ -69,7 +68,7 @@ def euler_lagrange(s, state, gravity):
 @functools.cache
 def accelerations_of(machine, load):
     """One program for a machine and its loads, with gravity and without."""
-    return stored_jit(functools.partial(euler_lagrange, scene(machine, load)))
+    return eqx.filter_jit(functools.partial(euler_lagrange, scene(machine, load)))
 
 
 @pytest.mark.parametrize("effects", [(), (jv.Gravity(),)], ids=["plain", "gravity"])
@@ -246,7 +245,7 @@ def test_two_directional_port_is_euler_lagrange(load):
         [-(matrices[1] + 40.0 * matrices[3]) @ v[:3], jnp.broadcast_to(s.loads.drag * r**2, (n,)) * (40.0 - v[3:])]
     )
 
-    @stored_jit
+    @eqx.filter_jit
     def accelerations(x, v):
         along = jax.jvp(lambda y: jax.grad(kinetic, 1)(y, v), (x,), (v,))[1]
         return jnp.linalg.solve(

@@ -23,7 +23,6 @@ from random_scenes import (
     two_platforms,
     varied,
 )
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.machine.effects.base import has_term
@@ -33,7 +32,7 @@ from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scal
 SCENES = {"two platforms": two_platforms(), "motor": motor_driven()}
 
 
-@stored_jit
+@eqx.filter_jit
 def look(scene, state, t):
     """Rates of change, what is left of the energy balance, and the size of its terms."""
     field = jv.vector_field(scene)(t, state)
@@ -117,7 +116,7 @@ def derivatives():
         found = jv.simulate(restore(flat), 1.0, start=start, save="window", max_steps=2048, stepsize_controller=steps)
         return jnp.sum(found.window.state.displacement[-1] * jnp.asarray([1e3, 2e3]))
 
-    return base, {name: stored_jit(jax.value_and_grad(f)) for name, f in (("jam", jam), ("run", run))}
+    return base, {name: eqx.filter_jit(jax.value_and_grad(f)) for name, f in (("jam", jam), ("run", run))}
 
 
 @pytest.mark.parametrize("quantity", ["jam", pytest.param("run", marks=pytest.mark.slow)])

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from lagrange import residual
 from rotors import CASES, MASS, STATIONS, case, machine, pendulums, rotor_state
-from stored_jit import stored_jit
 
 import jaxvib as jv
 
@@ -14,7 +13,7 @@ import jaxvib as jv
 @pytest.mark.parametrize("name", CASES)
 def test_equations_are_lagranges(name):
     s, t = case(name), jnp.asarray(0.7)
-    left = stored_jit(lambda state: residual(s, t, state, jv.vector_field(s)(t, state)))
+    left = eqx.filter_jit(lambda state: residual(s, t, state, jv.vector_field(s)(t, state)))
     for seed in range(2):
         np.testing.assert_allclose(left(rotor_state(s, seed)), 0.0, atol=2e-12)
 

@@ -1,10 +1,10 @@
 """Balls that spin freely on their contact, and slide before they roll: against a rigid ball in space, closed forms, energy."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stored_jit import stored_jit
 from torus import MASS, OWN, RADIUS, SPEED, balls, published, scene, some_state
 from torus.rigid_ball import RigidBall
 
@@ -18,7 +18,7 @@ BOTH = (jv.FreeSpin(), jv.Sliding(0.1))
 GAP = 0.0025
 RIGID = RigidBall(MASS, OWN, RADIUS, GAP, SPEED, 9.81)
 
-evaluate = stored_jit(lambda s, t, state: jv.vector_field(s)(t, state))
+evaluate = eqx.filter_jit(lambda s, t, state: jv.vector_field(s)(t, state))
 
 
 def one_ball(*effects):
@@ -118,7 +118,7 @@ def test_power_balances_the_energy_of_balls_that_spin_and_slide(effects):
     """The rotor moves, with all kinds of friction: sliding, and in the last case sticking while a slip ends."""
     s = scene((*published(1e-4), *effects), drag=0.2)
 
-    @stored_jit
+    @eqx.filter_jit
     def growth(t, state):
         change = jv.vector_field(s)(t, state)
         return jax.jvp(lambda t, y: energy(s, y, t), (t, state), (jnp.ones_like(t), change))[1], *power(s, t, state)
@@ -140,7 +140,7 @@ def test_derivatives_with_spin_and_sliding_are_differences():
     rng = np.random.default_rng(0)
     sizes = [rng.normal(size=np.shape(leaf)) * np.maximum(np.abs(leaf), 1e-3) for leaf in leaves]
 
-    @stored_jit
+    @eqx.filter_jit
     def field(leaves):
         change = jv.vector_field(jax.tree.unflatten(rest, leaves)[0])(0.2, jax.tree.unflatten(rest, leaves)[1])
         return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((change.velocity, change.rate, change.spin))])

@@ -3,12 +3,12 @@
 import dataclasses
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from stored_jit import stored_jit
 from torus import (
     MASS,
     OWN,
@@ -28,7 +28,7 @@ from jaxvib.results.status import status_names
 
 HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
 
-evaluate = stored_jit(lambda s, t, state: jv.vector_field(s)(t, state))
+evaluate = eqx.filter_jit(lambda s, t, state: jv.vector_field(s)(t, state))
 
 
 @pytest.mark.parametrize("direction", ["none", "along", "each"])
@@ -36,7 +36,7 @@ def test_equations_are_lagranges(direction):
     effects = published(direction=direction) if direction != "none" else ()
     s = scene(effects, drag=0.3)
     friction, gravity = ((4e-5, direction, 0.01), 9.81) if effects else (0.0, 0.0)
-    expected = stored_jit(lambda t, state: lagrangian_accelerations(s, t, state, friction, gravity))
+    expected = eqx.filter_jit(lambda t, state: lagrangian_accelerations(s, t, state, friction, gravity))
     for seed in range(4):
         state, t = some_state(seed), jnp.asarray(0.3)
         field, right = evaluate(s, t, state), expected(t, state)
@@ -48,7 +48,7 @@ def test_a_balls_own_rotation_is_that_of_newton_and_euler():
     """Against the ball's three-dimensional motion, on a rotor so heavy that it does not move aside."""
     machine = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
     s = jv.Scene(machine, balls(1), jv.ConstantSpeed(SPEED), (jv.Gravity(along="axis"),))
-    expected = stored_jit(functools.partial(rolling_ball_accelerations, 0.0025, OWN, SPEED, 9.81))
+    expected = eqx.filter_jit(functools.partial(rolling_ball_accelerations, 0.0025, OWN, SPEED, 9.81))
     for seed in range(4):
         state = some_state(seed, count=1)
         state = jv.State(jnp.zeros(2), jnp.zeros(2), state.angle, state.rate)
@@ -63,7 +63,7 @@ def test_a_balls_own_rotation_is_that_of_newton_and_euler():
 def test_power_balances_the_energy(direction):
     s = scene(published(1e-4, direction), drag=0.2)
 
-    @stored_jit
+    @eqx.filter_jit
     def growth(t, state):
         change = jv.vector_field(s)(t, state)
         rate = jax.jvp(lambda t, y: jv.energy(s, y, t), (t, state), (jnp.ones_like(t), change))[1]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import published, scene, some_state
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
@@ -112,7 +111,7 @@ def test_accuracy_looks_at_numbers():
         return jv.simulate(eqx.tree_at(lambda x: x.drive.speed, s, n), 1.0, stepsize_controller=jv.Accuracy(1e-4)).omega
 
     with pytest.raises(jv.InputError, match="use Tolerance"):
-        stored_jit(omega)(jnp.asarray(2.0))
+        eqx.filter_jit(omega)(jnp.asarray(2.0))
 
 
 @pytest.mark.parametrize("double", [True, False], ids=["float64", "float32"])

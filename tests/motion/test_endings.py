@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published, scene
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -42,7 +41,7 @@ def test_what_the_integrator_says_is_the_status(result, status):
 def test_a_lane_whose_start_does_not_exist_says_so():
     s = published(eps=1e-3).scene()
 
-    @stored_jit
+    @eqx.filter_jit
     @eqx.filter_vmap
     def batch(speed):
         there = eqx.tree_at(lambda x: x.drive.speed, s, speed)
@@ -74,7 +73,7 @@ def test_nonfinite_run_does_not_delay_the_others():
         run = jv.simulate(there, 20.0, save="window")
         return run.status == jv.RunStatus.refused, run.steps, run.omega
 
-    bad, steps, omega = stored_jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan, 1.1]))
+    bad, steps, omega = eqx.filter_jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan, 1.1]))
     assert bad.tolist() == [False, True, False] and np.isfinite(omega).tolist() == [True, False, True]
     assert int(jnp.max(steps)) < 2000
     with pytest.raises(jv.InputError, match=r"scene\.machine\.link_stiffness is nan; a finite number is needed"):

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published, scene
-from stored_jit import stored_jit
 
 import jaxvib as jv
 
@@ -58,7 +57,7 @@ def jam_outputs(s, mode=3):
 
 def with_value(derivative, f):
     """One program for a derivative of f and for its value: what differences of f need is compiled already."""
-    return stored_jit(derivative(lambda x: (f(x),) * 2, has_aux=True))
+    return eqx.filter_jit(derivative(lambda x: (f(x),) * 2, has_aux=True))
 
 
 def central(f, x, h):
@@ -81,7 +80,7 @@ def test_implicit_gradient_is_the_finite_difference(case):
     """Forward, reverse, jitted: all numbers of the machine, loads and drive; the step 1e-5 leaves an error of 1e-6."""
     outputs, x = case
     both = with_value(jax.jacfwd, outputs)
-    forward, reverse = both(x)[0], stored_jit(jax.jacrev(outputs))(x)
+    forward, reverse = both(x)[0], eqx.filter_jit(jax.jacrev(outputs))(x)
     scale = jnp.max(jnp.abs(forward), axis=1, keepdims=True)
     np.testing.assert_allclose(forward / scale, reverse / scale, atol=1e-12)
     difference = central(lambda x: both(x)[1], x, 1e-5)
@@ -91,7 +90,7 @@ def test_implicit_gradient_is_the_finite_difference(case):
 
 def test_gradient_of_a_batch_is_the_batch_of_gradients():
     outputs, x = jam_outputs(published(natural=(0.3, 0.36)).scene())
-    force = stored_jit(jax.grad(lambda v: outputs(v)[-1]))
+    force = eqx.filter_jit(jax.grad(lambda v: outputs(v)[-1]))
     batch = x[None, :] * jnp.asarray([0.99, 1.0, 1.01])[:, None]
     np.testing.assert_allclose(jax.vmap(force)(batch), jnp.stack([force(v) for v in batch]), rtol=1e-9)
 
@@ -111,7 +110,7 @@ def test_hessian_is_the_finite_difference_of_the_gradient():
     np.testing.assert_allclose(exact, difference, rtol=1e-5, atol=1e-6 * float(jnp.max(jnp.abs(exact))))
 
 
-@stored_jit
+@eqx.filter_jit
 @eqx.filter_value_and_grad
 def everything(values, s, mode):
     moved = with_numbers(s, values)
@@ -192,7 +191,7 @@ def test_forward_gradient_through_time_is_the_implicit_one():
     """The jam is reached; the two differ by the order of the loads' share of the mass, eps = 2e-3."""
     both, x = with_value(jax.jacfwd, through_time(diffrax.ForwardMode(), 1000.0)), jnp.ones(6)
     gradient = both(x)[0]
-    np.testing.assert_allclose(relative(gradient), relative(stored_jit(jax.jacfwd(from_algebra))(x)), atol=10 * EPS)
+    np.testing.assert_allclose(relative(gradient), relative(eqx.filter_jit(jax.jacfwd(from_algebra))(x)), atol=10 * EPS)
     # The difference of two runs: steps that come out otherwise leave 1e-9 tolerance / 1e-3 step = 1e-6 of noise or more.
     ahead = (both(x.at[4].add(1e-3))[1] - both(x.at[4].add(-1e-3))[1]) / 2e-3
     np.testing.assert_allclose(gradient[:, 4], ahead, atol=1e-4 * float(jnp.max(jnp.abs(gradient))))
@@ -206,8 +205,8 @@ def last_state(run):
 
 def test_reverse_gradient_through_time_is_the_forward_one():
     x = jnp.ones(6)
-    forward = stored_jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 60.0, last_state)))(x)
-    reverse = stored_jit(jax.jacrev(through_time(None, 60.0, last_state)))(x)
+    forward = eqx.filter_jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 60.0, last_state)))(x)
+    reverse = eqx.filter_jit(jax.jacrev(through_time(None, 60.0, last_state)))(x)
     np.testing.assert_allclose(relative(reverse), relative(forward), atol=1e-11)
 
 
@@ -223,7 +222,7 @@ def test_reverse_gradient_of_many_loads_is_the_forward_one():
         return run.window.state.displacement[-1, 0]
 
     forward, reverse = (
-        stored_jit(way(lambda k, adjoint=adjoint: end(k, adjoint)))(s.machine.stiffness)
+        eqx.filter_jit(way(lambda k, adjoint=adjoint: end(k, adjoint)))(s.machine.stiffness)
         for way, adjoint in ((jax.jacfwd, diffrax.ForwardMode()), (jax.grad, None))
     )
     assert jnp.all(forward != 0.0)
@@ -237,12 +236,12 @@ def test_every_gradient_through_time_is_the_finite_difference():
     def both(run):
         return jnp.concatenate([last_state(run), run.amplitude, run.foundation_force[None]])
 
-    forward = stored_jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 1000.0, both)))(x)
-    reverse = stored_jit(jax.jacrev(through_time(None, 1000.0, both)))(x)
+    forward = eqx.filter_jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 1000.0, both)))(x)
+    reverse = eqx.filter_jit(jax.jacrev(through_time(None, 1000.0, both)))(x)
     np.testing.assert_allclose(relative(reverse)[:-3], relative(forward)[:-3], atol=1e-10)
     np.testing.assert_allclose(relative(reverse)[-3:], relative(forward)[-3:], atol=1e-5)
     forward = forward[-3:]
-    difference = central(stored_jit(through_time(diffrax.ForwardMode(), 1000.0)), x, 1e-3)
+    difference = central(eqx.filter_jit(through_time(diffrax.ForwardMode(), 1000.0)), x, 1e-3)
     scale = jnp.max(jnp.abs(forward), axis=1, keepdims=True)
     np.testing.assert_allclose(forward / scale, difference / scale, atol=1e-3)
     np.testing.assert_allclose(relative(forward), relative(jax.jacfwd(from_algebra)(x)), atol=10 * EPS)

@@ -12,7 +12,6 @@ import pytest
 import torus
 from scenes import published, scene, some_state
 from small_machine import small_machine, small_run, small_start
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate
@@ -89,7 +88,7 @@ def test_batch_over_rotor_speeds_is_a_loop():
         run = jv.simulate(moved, 5.0, start=small_start(), save="window", max_steps=4096)
         return run.amplitude, run.omega, run.steps
 
-    batch = stored_jit(jax.vmap(one))(speeds)
+    batch = eqx.filter_jit(jax.vmap(one))(speeds)
     for k, n in enumerate(speeds):
         for a, b in zip(batch, one(n), strict=True):
             np.testing.assert_allclose(a[k], b, rtol=1e-8)

@@ -1,15 +1,15 @@
 """The step-size control of the engine."""
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stored_jit import stored_jit
 
 from jaxvib.ode.control import PIController, moved_on
 
 
-@stored_jit
+@eqx.filter_jit
 def decay(max_steps):
     control = PIController(jnp.asarray(1e-9), jnp.asarray(1.0), jnp.asarray(1.0), max_steps)
     term = diffrax.ODETerm(lambda t, y, args: -y)

@@ -3,11 +3,11 @@
 import functools
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stored_jit import stored_jit
 
 from jaxvib.ode.batching import multi_tangent_jvp
 from jaxvib.ode.dopri8 import UnrolledDopri8
@@ -62,7 +62,7 @@ def motion(point, *, arrays=False, slopes=True, adaptive=True, adjoint=diffrax.F
 def test_derivatives_in_all_directions_are_those_in_each(arrays, adaptive):
     """Nine directions, more than a vector holds; they move the length of the steps too."""
     ours, plain = (
-        stored_jit(jax.jacfwd(lambda p, s=slopes: motion(p, arrays=arrays, slopes=s, adaptive=adaptive)))(POINT)
+        eqx.filter_jit(jax.jacfwd(lambda p, s=slopes: motion(p, arrays=arrays, slopes=s, adaptive=adaptive)))(POINT)
         for slopes in (True, False)
     )
     assert np.max(np.abs(plain)) > 0.1
@@ -71,8 +71,8 @@ def test_derivatives_in_all_directions_are_those_in_each(arrays, adaptive):
 
 def test_derivatives_are_finite_differences():
     """Equal steps: a smooth function of the point. Central differences of 1e-5: their own error is about 1e-9."""
-    ours = stored_jit(jax.jacfwd(lambda p: motion(p, adaptive=False)))(POINT)
-    value = stored_jit(lambda p: motion(p, adaptive=False))
+    ours = eqx.filter_jit(jax.jacfwd(lambda p: motion(p, adaptive=False)))(POINT)
+    value = eqx.filter_jit(lambda p: motion(p, adaptive=False))
     differences = [(value(POINT + m) - value(POINT - m)) / 2e-5 for m in 1e-5 * jnp.eye(9)]
     assert_close(ours, jnp.stack(differences, axis=-1), atol=1e-8)
 
@@ -81,11 +81,11 @@ def test_batches_inside_and_outside():
     """The controller follows an error of 1e-6, a difference of numbers of the order of 1 that is good to 2e-10 of itself; its
     derivative, by which steps move with the point, to some 1e-9, however the same operations are put together."""
     points = jnp.stack([POINT + move for move in (0.0, 0.05, 0.1)])
-    alone = stored_jit(jax.jacfwd(motion))
+    alone = eqx.filter_jit(jax.jacfwd(motion))
     single = jnp.stack([alone(p) for p in points])
-    of_each = stored_jit(jax.vmap(jax.jacfwd(motion)))(points)
+    of_each = eqx.filter_jit(jax.vmap(jax.jacfwd(motion)))(points)
     assert_close(of_each, single, rtol=1e-8, atol=1e-9)
-    of_all = stored_jit(jax.jacfwd(jax.vmap(motion)))(points)
+    of_all = eqx.filter_jit(jax.jacfwd(jax.vmap(motion)))(points)
     assert_close(jnp.stack([of_all[i, :, i] for i in range(3)]), single, rtol=1e-8, atol=1e-9)
     assert np.all(np.asarray(of_all[0, :, 1]) == 0.0)
 
@@ -98,15 +98,15 @@ def test_a_batch_in_lanes_is_its_runs_one_by_one(arrays, slopes):
         return motion(p, arrays=arrays, slopes=slopes)
 
     points = jnp.stack([POINT + move for move in (0.0, 0.05, 0.1, 0.2)])
-    alone = stored_jit(run)
+    alone = eqx.filter_jit(run)
     each = jnp.stack([alone(p) for p in points])
     assert np.max(np.abs(each - each[:1])) > 1e-2
-    assert_close(stored_jit(jax.vmap(run))(points), each, rtol=1e-11, atol=1e-12)
-    assert_close(stored_jit(jax.vmap(jax.vmap(run)))(points.reshape(2, 2, 9)).reshape(4, -1), each, rtol=1e-11)
+    assert_close(eqx.filter_jit(jax.vmap(run))(points), each, rtol=1e-11, atol=1e-12)
+    assert_close(eqx.filter_jit(jax.vmap(jax.vmap(run)))(points.reshape(2, 2, 9)).reshape(4, -1), each, rtol=1e-11)
     with_force = lambda force: run(POINT.at[0].set(force))  # noqa: E731
     forces = jnp.asarray([0.7, 0.9])
     each = jnp.stack([alone(POINT.at[0].set(force)) for force in forces])
-    assert_close(stored_jit(jax.vmap(with_force))(forces), each, rtol=1e-11)
+    assert_close(eqx.filter_jit(jax.vmap(with_force))(forces), each, rtol=1e-11)
 
 
 def test_reverse_derivatives_of_a_batch_are_those_of_its_runs():
@@ -114,23 +114,23 @@ def test_reverse_derivatives_of_a_batch_are_those_of_its_runs():
         return jnp.sum(motion(p, slopes=False, adaptive=False, adjoint=diffrax.RecursiveCheckpointAdjoint()) ** 2)
 
     points = jnp.stack([POINT, POINT + 0.1])
-    ours = stored_jit(jax.vmap(jax.grad(size)))(points)
-    forward = stored_jit(jax.jacfwd(lambda p: jnp.sum(motion(p, adaptive=False) ** 2)))
+    ours = eqx.filter_jit(jax.vmap(jax.grad(size)))(points)
+    forward = eqx.filter_jit(jax.jacfwd(lambda p: jnp.sum(motion(p, adaptive=False) ** 2)))
     assert_close(ours, jnp.stack([forward(p) for p in points]), rtol=1e-9)
 
 
 def test_second_derivatives():
     ours, plain = (
-        stored_jit(jax.jacfwd(jax.jacfwd(lambda p, s=slopes: motion(p, slopes=s, adaptive=False)[-1])))(POINT)
+        eqx.filter_jit(jax.jacfwd(jax.jacfwd(lambda p, s=slopes: motion(p, slopes=s, adaptive=False)[-1])))(POINT)
         for slopes in (True, False)
     )
     assert_close(ours, plain, rtol=1e-9, atol=1e-10)
 
 
 def test_one_direction_alone_and_values_alone():
-    value, slope = stored_jit(lambda p: jax.jvp(motion, (p,), (jnp.ones(9),)))(POINT)
-    assert_close(slope, jnp.sum(stored_jit(jax.jacfwd(motion))(POINT), axis=1), rtol=1e-10, atol=1e-11)
-    assert_close(value, stored_jit(lambda p: motion(p, slopes=False))(POINT), rtol=1e-13)
+    value, slope = eqx.filter_jit(lambda p: jax.jvp(motion, (p,), (jnp.ones(9),)))(POINT)
+    assert_close(slope, jnp.sum(eqx.filter_jit(jax.jacfwd(motion))(POINT), axis=1), rtol=1e-10, atol=1e-11)
+    assert_close(value, eqx.filter_jit(lambda p: motion(p, slopes=False))(POINT), rtol=1e-13)
 
 
 def test_directions_in_a_batch_of_which_only_a_part_differs():

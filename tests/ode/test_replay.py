@@ -1,11 +1,11 @@
 """Reverse derivatives through adaptive steps: those of the steps that were taken, to rounding."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stored_jit import stored_jit
 
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
@@ -65,29 +65,29 @@ def run(args, *, solver=None, again=plain, jump=0.0, adjoint=None, controller=No
 @pytest.fixture(scope="module")
 def right():
     """Forward derivatives through the very steps, prescribed."""
-    times = stored_jit(lambda args: run(args, noted=True, adjoint=diffrax.ForwardMode()))(ARGS)
+    times = eqx.filter_jit(lambda args: run(args, noted=True, adjoint=diffrax.ForwardMode()))(ARGS)
     steps = diffrax.StepTo(jnp.concatenate([jnp.zeros(1), times[jnp.isfinite(times)]]))
-    return jnp.stack(stored_jit(jax.jacfwd(lambda args: run(args, adjoint=diffrax.ForwardMode(), controller=steps)))(ARGS))
+    return jnp.stack(eqx.filter_jit(jax.jacfwd(lambda args: run(args, adjoint=diffrax.ForwardMode(), controller=steps)))(ARGS))
 
 
 def test_derivatives_are_those_of_the_steps_taken(right):
     """Also where roundings differ when the run is computed again: 1e-13 in each evaluation, some 1e-11 over 80 swings."""
     for again, bound in ((plain, 1e-12), (rounded, 1e-10)):
-        reverse = jnp.stack(stored_jit(jax.jacrev(lambda args, again=again: run(args, again=again)))(ARGS))
+        reverse = jnp.stack(eqx.filter_jit(jax.jacrev(lambda args, again=again: run(args, again=again)))(ARGS))
         np.testing.assert_allclose(reverse, right, atol=bound * float(jnp.max(jnp.abs(right))))
 
 
 def test_steps_chosen_again_are_other_steps(right):
     """Recorded steps are needed because choosing steps again amplifies roundings many thousand times."""
     adjoint = diffrax.RecursiveCheckpointAdjoint()
-    reverse = jnp.stack(stored_jit(jax.jacrev(lambda args: run(args, again=rounded, adjoint=adjoint)))(ARGS))
+    reverse = jnp.stack(eqx.filter_jit(jax.jacrev(lambda args: run(args, again=rounded, adjoint=adjoint)))(ARGS))
     assert float(jnp.max(jnp.abs(reverse - right))) > 1e-7 * float(jnp.max(jnp.abs(right)))
 
 
 def test_steps_end_where_the_field_jumps():
     """A step over the jump, or on from it with the rates of before, would be off by 1e-2."""
-    forward = stored_jit(jax.jacfwd(lambda args: run(args, jump=0.5, end=20.0, adjoint=diffrax.ForwardMode())))(ARGS)
-    reverse = stored_jit(jax.jacrev(lambda args: run(args, jump=0.5, end=20.0)))(ARGS)
+    forward = eqx.filter_jit(jax.jacfwd(lambda args: run(args, jump=0.5, end=20.0, adjoint=diffrax.ForwardMode())))(ARGS)
+    reverse = eqx.filter_jit(jax.jacrev(lambda args: run(args, jump=0.5, end=20.0)))(ARGS)
     np.testing.assert_allclose(reverse, forward, atol=1e-10)
 
 
@@ -99,16 +99,16 @@ def test_every_lane_of_a_batch_has_its_own_steps(solver):
     def slopes(factor):
         return jax.grad(lambda args: run((args, ARGS[1]), solver=solver, end=10.0 * factor)[0])(factor * ARGS[0])
 
-    each = jnp.stack([stored_jit(slopes)(factor) for factor in factors])
-    np.testing.assert_allclose(stored_jit(jax.vmap(slopes))(factors), each, rtol=1e-10)
+    each = jnp.stack([eqx.filter_jit(slopes)(factor) for factor in factors])
+    np.testing.assert_allclose(eqx.filter_jit(jax.vmap(slopes))(factors), each, rtol=1e-10)
 
 
 def test_any_adaptive_controller_will_do():
     def value(args, adjoint=None):
         return run(args, end=30.0, controller=diffrax.PIDController(rtol=1e-7, atol=1e-7), adjoint=adjoint)
 
-    forward = stored_jit(jax.jacfwd(lambda args: value(args, diffrax.ForwardMode())))(ARGS)
-    np.testing.assert_allclose(stored_jit(jax.jacrev(value))(ARGS), forward, atol=1e-9)
+    forward = eqx.filter_jit(jax.jacfwd(lambda args: value(args, diffrax.ForwardMode())))(ARGS)
+    np.testing.assert_allclose(eqx.filter_jit(jax.jacrev(value))(ARGS), forward, atol=1e-9)
 
 
 @pytest.mark.parametrize("controller", [diffrax.ConstantStepSize(), diffrax.StepTo(jnp.linspace(0.0, 30.0, 301))])
@@ -116,14 +116,14 @@ def test_given_steps_need_no_noting(controller):
     def value(args, adjoint=None):
         return run(args, end=30.0, controller=controller, adjoint=adjoint)
 
-    forward = stored_jit(jax.jacfwd(lambda args: value(args, diffrax.ForwardMode())))(ARGS)
-    np.testing.assert_allclose(stored_jit(jax.jacrev(value))(ARGS), forward, atol=1e-12)
+    forward = eqx.filter_jit(jax.jacfwd(lambda args: value(args, diffrax.ForwardMode())))(ARGS)
+    np.testing.assert_allclose(eqx.filter_jit(jax.jacrev(value))(ARGS), forward, atol=1e-12)
 
 
 @pytest.mark.parametrize("max_steps", [2**17, 2**20])
 def test_states_that_were_not_noted_are_computed_again(right, max_steps):
     """Only every 2nd and 16th state is recorded; the last stretch is shorter."""
-    reverse = jnp.stack(stored_jit(jax.jacrev(lambda args: run(args, max_steps=max_steps)))(ARGS))
+    reverse = jnp.stack(eqx.filter_jit(jax.jacrev(lambda args: run(args, max_steps=max_steps)))(ARGS))
     np.testing.assert_allclose(reverse, right, atol=1e-12 * float(jnp.max(jnp.abs(right))))
 
 
@@ -137,9 +137,9 @@ def test_states_within_the_first_step_have_derivatives():
         return jnp.stack(solution.ys[0])
 
     start = (jnp.asarray(1.0), jnp.asarray(0.5))
-    reverse = jnp.stack(stored_jit(jax.jacrev(value))(start), axis=-1)
+    reverse = jnp.stack(eqx.filter_jit(jax.jacrev(value))(start), axis=-1)
     np.testing.assert_array_equal(reverse[:, 0], np.eye(2))
-    forward = jnp.stack(stored_jit(jax.jacfwd(lambda y0: value(y0, diffrax.ForwardMode())))(start), axis=-1)
+    forward = jnp.stack(eqx.filter_jit(jax.jacfwd(lambda y0: value(y0, diffrax.ForwardMode())))(start), axis=-1)
     np.testing.assert_allclose(reverse, forward, atol=1e-13)
 
 
@@ -151,8 +151,8 @@ def test_slopes_by_the_end_and_by_constant_steps(controller):
         return run(ARGS, end=end, controller=controller, first_step=share, adjoint=adjoint)
 
     given = (jnp.asarray(30.0), jnp.asarray(1.6))  # steps so long that their error is felt
-    by_end, by_step = stored_jit(jax.jacrev(value, argnums=(0, 1)))(*given)
-    forward = stored_jit(jax.jacfwd(lambda end, share: value(end, share, diffrax.ForwardMode()), argnums=(0, 1)))(*given)
+    by_end, by_step = eqx.filter_jit(jax.jacrev(value, argnums=(0, 1)))(*given)
+    forward = eqx.filter_jit(jax.jacfwd(lambda end, share: value(end, share, diffrax.ForwardMode()), argnums=(0, 1)))(*given)
     np.testing.assert_allclose(by_end, forward[0], atol=1e-6)
     if isinstance(controller, diffrax.ConstantStepSize):
         assert float(jnp.max(jnp.abs(forward[1]))) > 1e-4

@@ -1,11 +1,11 @@
 """A stiff method of order 4."""
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from stored_jit import stored_jit
 
 from jaxvib.ode.rodas4 import Rodas4
 
@@ -15,7 +15,7 @@ def stiff(t, y, args):
     return jnp.stack([-args * (y[0] - jnp.cos(t)) - jnp.sin(t), y[0] * y[1] * (1.0 - y[1]) + 0.1 * jnp.sin(2.0 * t)])
 
 
-@stored_jit
+@eqx.filter_jit
 def rodas(rate, step, times):
     return diffrax.diffeqsolve(
         diffrax.ODETerm(stiff),

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import scene
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.machine.numbers.named import find_number, put_numbers
@@ -135,7 +134,7 @@ def test_the_middle_platform_rests_at_the_anti_resonance():
 @pytest.mark.slow
 def test_the_spring_that_is_exchanged_is_the_best_of_a_scan():
     found = retune(SCENE, force_per_amplitude(mode=3), starts=8)
-    asked = stored_jit(force_per_amplitude(mode=3).__call__)
+    asked = eqx.filter_jit(force_per_amplitude(mode=3).__call__)
     least = {}
     for name, _ in found:
         spring = find_number(SCENE, name, "free")

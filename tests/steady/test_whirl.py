@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from papers.machines import published_rotor
 from scenes import scene as platforms
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.whirl import _held
@@ -79,7 +78,7 @@ def test_gradients_of_whirl_speeds():
         return jnp.concatenate([jv.whirl(changed).speed[0], jv.critical_speeds(changed).speed])
 
     at, step = jnp.asarray(0.093), 1e-5
-    forward, reverse = stored_jit(jax.jacfwd(speeds))(at), stored_jit(jax.jacrev(speeds))(at)
+    forward, reverse = eqx.filter_jit(jax.jacfwd(speeds))(at), eqx.filter_jit(jax.jacrev(speeds))(at)
     numeric = (speeds(at + step) - speeds(at - step)) / (2.0 * step)
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-7)
     # Rounding of a speed, 1e-11, over the step: 1e-6; the difference's own error is smaller.

@@ -7,7 +7,6 @@ import numpy as np
 from scenes import scene
 from scipy.optimize import brentq
 from small_machine import small_run
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.equations.model import assemble
@@ -32,7 +31,7 @@ def test_measure_reads_a_known_motion():
     def field(_, y):
         return jv.State(y.velocity, -(w**2) * (y.displacement - 0.7), y.rate, (jnp.zeros(n),))
 
-    measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
+    measured = eqx.filter_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
     force = np.abs(np.sum((np.asarray(s.machine.stiffness) + 1j * w * np.asarray(s.machine.damping)) * a * np.exp(1j * c)))
     np.testing.assert_allclose(measured.amplitude, a, rtol=1e-12)
     np.testing.assert_allclose(measured.foundation_force, force, rtol=1e-12)
@@ -56,7 +55,7 @@ def test_loads_that_speed_up_drift_by_what_they_gain():
     def field(_, y):
         return jv.State(y.velocity, -(w**2) * y.displacement, y.rate, (jnp.full(3, e),))
 
-    measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
+    measured = eqx.filter_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
     np.testing.assert_allclose(measured.drift, e * 5.0 / 4.0 / (w + e * 2.5), rtol=0.05)
 
 
@@ -92,10 +91,10 @@ def test_derivatives_of_an_amplitude_move_its_extrema_along():
 
     p = 0.12
     value, slope, curvature = exactly(p)
-    np.testing.assert_allclose(stored_jit(amplitude)(p), value, rtol=1e-12)
+    np.testing.assert_allclose(eqx.filter_jit(amplitude)(p), value, rtol=1e-12)
     for way in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(stored_jit(way(amplitude))(p), slope, rtol=1e-11)
-        np.testing.assert_allclose(stored_jit(jax.jacfwd(way(amplitude)))(p), curvature, rtol=1e-9)
+        np.testing.assert_allclose(eqx.filter_jit(way(amplitude))(p), slope, rtol=1e-11)
+        np.testing.assert_allclose(eqx.filter_jit(jax.jacfwd(way(amplitude)))(p), curvature, rtol=1e-9)
 
 
 def test_a_growing_motion_is_not_settled():
@@ -114,7 +113,7 @@ def test_a_change_of_the_loads_speed_is_told_relative_to_it():
     def field(_, y):
         return jv.State(y.velocity, -2500.0 * y.displacement, y.rate, (jnp.full(n, 0.5 * 0.01 * 50.0 / 10.0),))
 
-    measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
+    measured = eqx.filter_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
     # Speeds grow evenly: their mean over the second half is that at 15 s, over all of it that at 10 s, but for part of a turn.
     np.testing.assert_allclose(measured.drift, 0.0025 / 1.005, rtol=0.02)
     assert not bool(measured.settled)
@@ -175,5 +174,5 @@ def test_a_force_that_changes_alone_is_a_drift():
         # Far below the loads' centrifugal force, length * mass * n^2, a change is relative to 1e-4 of that.
         length = jnp.asarray(least / 1e-4 / mass / 120.0**2)
         unit = eqx.tree_at(lambda u: u.displacement, natural_units(s), length)
-        measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, unit)
+        measured = eqx.filter_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, unit)
         np.testing.assert_allclose(measured.drift, share, rtol=0.02)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from papers.machines import published_rotor
 from scenes import published
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import Trajectory
@@ -168,7 +167,7 @@ def test_stiff_dry_friction_by_an_implicit_solver():
 def test_regime_under_jit_and_vmap():
     s, stretch = made([0.0, 0.1, -0.1, 0.05], 170.0)
     once = jv.regime(s, stretch)
-    many = stored_jit(
+    many = eqx.filter_jit(
         jax.vmap(lambda k: jv.regime(s, eqx.tree_at(lambda x: x.state.rate[0], stretch, k * stretch.state.rate[0])))
     )
     found = many(jnp.array([1.0, 2.0]))

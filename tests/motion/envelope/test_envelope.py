@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.equations.model import assemble
@@ -54,7 +53,7 @@ def test_envelope_of_an_isotropic_rotor_is_exact():
     assert float(jnp.min(jnp.max(jnp.abs(full.state.displacement), axis=0))) > 1e-3
 
 
-@stored_jit
+@eqx.filter_jit
 def both(s, speed, end):
     """Brought up over the first 0.6 of the time: the full equations and the averaged ones."""
     s = spun_up(s, speed, 0.6 * end)
@@ -86,7 +85,7 @@ def test_error_is_of_first_order_in_the_mass_of_the_loads(make, speed, slow_time
     """After the same slow time, half the mass, half the error."""
     errors = []
     for eps in masses:
-        full, slow = both(make(eps, speed), speed, slow_time / eps)
+        full, slow = both(make(eps, speed), jnp.asarray(speed), jnp.asarray(slow_time / eps))
         errors.append(np.abs(measured(slow) / measured(full) - 1.0)[parts])
         assert np.max(errors[-1]) < 5.0 * eps
         if not bool(full.drift > 1e-3):
@@ -103,7 +102,7 @@ def test_capture_and_passage_are_those_of_the_full_equations(make, passing):
     end = 4000.0
     for speed, caught in ((1.4, True), (passing, False)):
         s = make(2e-3, speed)
-        full, slow = both(s, speed, end)
+        full, slow = both(s, jnp.asarray(speed), jnp.asarray(end))
         resonance = float(jv.natural_frequencies(s)[-1])
         assert (float(full.omega) < 1.1 * resonance) == (float(slow.omega) < 1.1 * resonance) == caught
         np.testing.assert_allclose(measured(slow), measured(full), rtol=1e-2)
@@ -135,13 +134,13 @@ def test_gradients_by_three_routes():
         run = jv.envelope(spun_up(moved, 1.5 * x[7], 300.0), 500.0, adjoint=adjoint, **given)
         return run.amplitude @ jnp.asarray([30.0, 50.0]) + 20.0 * run.foundation_force + run.omega
 
-    @stored_jit
+    @eqx.filter_jit
     def forward(x):
         return jax.jvp(functools.partial(output, adjoint=diffrax.ForwardMode()), (x,), (along,))
 
     x = jnp.ones(8)
     _, slope = forward(x)
-    value, gradient = stored_jit(jax.value_and_grad(output))(x)
+    value, gradient = eqx.filter_jit(jax.value_and_grad(output))(x)
     np.testing.assert_allclose(gradient @ along, slope, rtol=1e-9)
     assert np.isfinite(gradient).all() and (np.abs(gradient) > 1e-3 * float(value)).all()
     up, down = (forward(x + h * along)[0] for h in (1e-4, -1e-4))
@@ -207,7 +206,7 @@ def test_a_batch_with_a_jam_that_is_absent_says_so():
         at = eqx.tree_at(lambda x: x.drive.speed, s, speed)
         return jv.envelope(at, 100.0, start="jam", mode=1, save="window")
 
-    runs = stored_jit(jax.vmap(run))(speeds)
+    runs = eqx.filter_jit(jax.vmap(run))(speeds)
     assert (runs.status == jv.EnvelopeStatus.done).tolist() == [True, False]
     assert (runs.status == jv.EnvelopeStatus.no_start).tolist() == [False, True]
     assert runs.trajectory is None and float(runs.drift[0]) < 1e-6
@@ -312,5 +311,5 @@ def test_a_lane_that_is_not_finite_ends_at_once():
         run = jv.envelope(there, 60.0, start="spin_up", save="window")
         return run.status == jv.EnvelopeStatus.refused, run.steps
 
-    bad, steps = stored_jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan]))
+    bad, steps = eqx.filter_jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan]))
     assert bad.tolist() == [False, True] and int(jnp.max(steps)) < 1000

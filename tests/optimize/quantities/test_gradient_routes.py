@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.study.accuracy.gradient_check import _DIFFERENCE_STEPS, _SAFETY, _extrapolated, _scale
@@ -80,14 +79,14 @@ class Routes:
 
     def __init__(self, quantities, modes=("forward", "reverse"), whole=True):
         self.quantities, self.keys = quantities, report_keys(quantities, machine(0))
-        self.near = stored_jit(self.speeds)
+        self.near = eqx.filter_jit(self.speeds)
         by = {"forward": jax.jacfwd, "reverse": jax.jacrev}
         self.routes = {}
         for how, kept in [("whole branch", False)] * whole + [("followed", True)] * ("reverse" in modes):
             for mode in modes:
-                self.routes[f"{how}, {mode}"] = stored_jit(lambda s, near, kept=kept, mode=mode: by[mode](
+                self.routes[f"{how}, {mode}"] = eqx.filter_jit(lambda s, near, kept=kept, mode=mode: by[mode](
                     lambda e: self.read(s, near if kept else None, e))(jnp.zeros(6)))  # fmt: skip
-        self.value = stored_jit(lambda s, near, e: self.read(s, None if whole else near, e))
+        self.value = eqx.filter_jit(lambda s, near, e: self.read(s, None if whole else near, e))
 
     def read(self, scene, near, shares):
         evaluation = Evaluation(moved(scene, shares), near)

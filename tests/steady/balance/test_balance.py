@@ -13,7 +13,6 @@ from gyroscopic_rotor import rotor
 from hard_cases.reference_integration import multipliers
 from hard_cases.reference_model import reference_model
 from scenes import machines
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.balance import states
@@ -162,7 +161,7 @@ def unbalance_after(s, speeds, times, errors):
     """Share of the loads' m R that is unbalanced at the end, of runs that start near the balanced motion (diffrax)."""
     angles = jnp.asarray(jv.balanced_states(s).angles[0])
 
-    @stored_jit
+    @eqx.filter_jit
     @jax.vmap
     def run(speed, until, error):
         rate, nd, n = flat_field(eqx.tree_at(lambda x: x.drive.speed, s, speed))

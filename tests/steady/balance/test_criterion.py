@@ -10,7 +10,6 @@ import scipy.optimize
 from closed_forms import one_mass_speeds, three_mass_speeds, two_mass_functional, two_mass_speeds
 from gyroscopic_rotor import rotor
 from scenes import BALLS, machines, scene
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.results.status import status_name
@@ -109,7 +108,7 @@ def test_order_of_ten_thousand_three_mass_machines():
     values["link_stiffness"] = rng.uniform(0.1, 9.0, (count, 3))
     base = scene("three_mass")
 
-    @stored_jit
+    @eqx.filter_jit
     @jax.vmap
     def speeds(values):
         machine = eqx.tree_at(lambda m: tuple(getattr(m, name) for name in values), base.machine, tuple(values.values()))
@@ -231,8 +230,8 @@ def speeds_of(values, name):
     return (speeds, r.shapes), speeds
 
 
-forward = stored_jit(jax.jacfwd(speeds_of, has_aux=True))
-reverse = stored_jit(jax.jacrev(speeds_of, has_aux=True))
+forward = eqx.filter_jit(jax.jacfwd(speeds_of, has_aux=True))
+reverse = eqx.filter_jit(jax.jacrev(speeds_of, has_aux=True))
 
 
 @pytest.mark.parametrize("name", ["two_mass", "three_mass"])

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 from load_speeds import all_load_speeds
 from scenes import published
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.equations.linear import linear_model
 from jaxvib.steady.jams import folds
 from jaxvib.steady.jams.folds import jam_rotor_speed, piece_modes, without_ripples
 
-rotor_speeds = stored_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
+rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
 
 
-many_modes = stored_jit(eqx.filter_vmap(jv.jam_modes))
+many_modes = eqx.filter_jit(eqx.filter_vmap(jv.jam_modes))
 
 
 def stacked(scenes):
@@ -123,7 +122,7 @@ def test_at_a_fold_the_status_says_so_and_nothing_overflows():
         modes = jv.jam_modes(eqx.tree_at(lambda x: x.drive.speed, s, n))
         return modes.omega, modes
 
-    forward = stored_jit(lambda n: jax.jvp(omega, (n,), (jnp.ones_like(n),), has_aux=True))
+    forward = eqx.filter_jit(lambda n: jax.jvp(omega, (n,), (jnp.ones_like(n),), has_aux=True))
     for fold, speed in enumerate(forward(s.drive.speed)[2].folds.rotor_speed):
         inside = -1.0 if fold % 2 == 0 else 1.0
         at = [forward(speed * (1.0 + step * inside)) for step in (0.0, 1e-13, 1e-6, 1e-6 + 1e-9, 1e-6 - 1e-9, -1e-3)]
@@ -145,7 +144,7 @@ def test_folds_are_differentiable():
         f = jv.jam_modes(eqx.tree_at(lambda x: x.machine.stiffness, s, k)).folds
         return (jnp.concatenate([f.omega, f.rotor_speed]),) * 2
 
-    both = stored_jit(jax.jacfwd(folds, has_aux=True))
+    both = eqx.filter_jit(jax.jacfwd(folds, has_aux=True))
     k, h = s.machine.stiffness, 1e-6
     exact, _ = both(k)
     for i in range(2):

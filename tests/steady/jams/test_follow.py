@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scenes import scene
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.equations.linear import jammed_model
@@ -32,7 +31,7 @@ def test_followed_jams_are_those_of_the_whole_branch():
     exact = jax.jacrev(whole)(k)
     for mode in modes.mode_numbers():
         near = modes.omega[mode - 1] * (0.99 if mode % 2 else 1.001)
-        value, slope = stored_jit(jax.value_and_grad(force))(k, mode, near)
+        value, slope = eqx.filter_jit(jax.value_and_grad(force))(k, mode, near)
         np.testing.assert_allclose(value, modes.foundation_force[mode - 1], rtol=1e-8)
         np.testing.assert_allclose(slope, exact[mode - 1], rtol=1e-6)
 
@@ -50,7 +49,7 @@ def test_followed_folds_are_those_of_the_whole_branch():
         return follow_fold(stiffer(k), near)[1]
 
     for omega, n in zip(folds.omega, folds.rotor_speed, strict=True):
-        value, slope = stored_jit(jax.value_and_grad(speed))(k, omega * 1.0005)
+        value, slope = eqx.filter_jit(jax.value_and_grad(speed))(k, omega * 1.0005)
         np.testing.assert_allclose(value, n, rtol=1e-9)
         # Step 1e-6: truncation 1e-9, rounding 1e-9 of the value; the fold's place moves with k.
         step = 1e-6 * k[0]

@@ -7,19 +7,18 @@ import numpy as np
 import pytest
 from load_speeds import all_load_speeds, complex_response, unbalance_and_drag
 from scenes import loads, machines, published
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.jams.folds import jam_rotor_speed
 
 
-@stored_jit
+@eqx.filter_jit
 @eqx.filter_vmap(in_axes=(None, 0))
 def modes_at(s, speed):
     return jv.jam_modes(eqx.tree_at(lambda x: x.drive.speed, s, speed))
 
 
-rotor_speeds = stored_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
+rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
 
 
 def name(jam):
@@ -245,7 +244,7 @@ def test_derivatives_at_known_jams_equal_those_of_the_search(friction):
         return jnp.nansum(weights * numbers) + (jams.folds.rotor_speed[1] if fold else 0.0)
 
     for fold in (False,) if friction else (False, True):
-        ours, theirs = jax.grad(total)(s, fold), stored_jit(jax.grad(total))(s, fold)
+        ours, theirs = jax.grad(total)(s, fold), eqx.filter_jit(jax.grad(total))(s, fold)
         for (path, a), b in zip(jax.tree.leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-7, err_msg=f"{path}")
             assert np.all(np.isfinite(a))

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scenes import machines
 from scenes import scene as platforms
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.numerics.linalg import eliminate
@@ -119,7 +118,7 @@ def turning_frame(scene, jam):
 
     rest = (jam.displacement.real, (1j * w * jam.displacement).real, jam.phase, jnp.full(n, w))
     at = jnp.concatenate(rest)
-    return stored_jit(lambda x: (flow(x), jax.jacfwd(flow)(x)))(at)
+    return eqx.filter_jit(lambda x: (flow(x), jax.jacfwd(flow)(x)))(at)
 
 
 @pytest.mark.parametrize("which", ["rotor together", "rotor opposite", "rotor unequal", "planar heavy"])
@@ -219,9 +218,9 @@ def test_derivatives_are_the_implicit_function_theorems():
         return (jnp.concatenate([jam.omega[None], jnp.sin(jam.phase[1:]), 1e3 * jam.amplitude]),) * 2
 
     at = (jnp.asarray(1.24e-2), jnp.asarray(21.56), jnp.asarray(0.05))
-    both = stored_jit(jax.jacfwd(answer, argnums=(0, 1, 2), has_aux=True))
+    both = eqx.filter_jit(jax.jacfwd(answer, argnums=(0, 1, 2), has_aux=True))
     forward, _ = both(*at)
-    reverse, _ = stored_jit(jax.jacrev(answer, argnums=(0, 1, 2), has_aux=True))(*at)
+    reverse, _ = eqx.filter_jit(jax.jacrev(answer, argnums=(0, 1, 2), has_aux=True))(*at)
     for k in range(3):
         up, down = ([x * (1.0 + s * (i == k)) for i, x in enumerate(at)] for s in (1e-5, -1e-5))
         difference = (both(*up)[1] - both(*down)[1]) / (2e-5 * at[k])

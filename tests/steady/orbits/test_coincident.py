@@ -10,7 +10,6 @@ from jax.flatten_util import ravel_pytree
 from periodic import integrate, monodromy, ordered
 from scenes import assembled, machines, scene
 from scipy.integrate import solve_ivp
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
@@ -79,14 +78,14 @@ def test_gradient_with_gyroscopic_coupling_by_differences():
     """Central differences of relative step 1e-5, noise floor 1e-8."""
     flat, restore = ravel_pytree(rotor(0.093, (1.1e6, 0.8e6), mass=0.8))
 
-    @stored_jit
+    @eqx.filter_jit
     @jax.value_and_grad
     def f(x):
         motion = periodic_motion(assembled(restore(x)), grid_of(8, True), "omega", jnp.asarray(135.0), jnp.asarray(140.0))
         return motion.rotor_speed + motion.deviation[0, 1]
 
     direction = jnp.asarray(flat * np.random.default_rng(0).normal(size=flat.shape))
-    forward = stored_jit(lambda x: jax.jvp(lambda x: f(x)[0], (x,), (direction,))[1])(flat)
+    forward = eqx.filter_jit(lambda x: jax.jvp(lambda x: f(x)[0], (x,), (direction,))[1])(flat)
     h = 1e-5
     np.testing.assert_allclose((f(flat + h * direction)[0] - f(flat - h * direction)[0]) / (2 * h), forward, rtol=1e-5)
     np.testing.assert_allclose(jnp.vdot(f(flat)[1], direction), forward, rtol=1e-9)
@@ -122,7 +121,7 @@ def test_loads_side_by_side_follow_the_lagrangian_of_a_rigid_arc():
         kinetic = 25.0 * v[0] ** 2 + jnp.sum(0.25 * (up**2 + across**2)) + 3 * 0.4 * 0.25 * (0.1 * v[1]) ** 2
         return kinetic - 2e4 * x[0] ** 2 - jnp.sum(0.5 * g * 0.1 * jnp.sin(x[1] + places))
 
-    @stored_jit
+    @eqx.filter_jit
     def field(y):
         x, v = y[:2], y[2:]
         mass = jax.hessian(lagrangian, 1)(x, v)

@@ -8,7 +8,6 @@ import pytest
 from gyroscopic_rotor import rotor
 from periodic import integrate, monodromy, ordered
 from scenes import assembled, machines
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.machine.effects.base import has_half_turn
@@ -92,12 +91,12 @@ def test_dry_friction_keeps_the_half_turn_and_gravity_does_not():
     # On a whole period, where the symmetry is not put in, it comes out.
     model, grid = assembled(alike(dry())), grid_of(33, False)
 
-    @stored_jit
+    @eqx.filter_jit
     def solved(omega, rotor_speed):
         motion = periodic_motion(model, grid, "omega", omega, rotor_speed)
         return motion.deviation, branch_tangent(model, grid, motion).residual
 
-    deviation, residual = solved(26.5, 45.0)
+    deviation, residual = solved(jnp.asarray(26.5), jnp.asarray(45.0))
     harmonics = np.fft.rfft(deviation[0])
     assert np.max(np.abs(harmonics[1::2])) < 1e-10 * np.max(np.abs(harmonics))
     assert float(residual) < 1e-12
@@ -106,7 +105,7 @@ def test_dry_friction_keeps_the_half_turn_and_gravity_does_not():
 def test_gradient_by_the_coefficient_by_differences():
     """Central differences of relative step 1e-4, noise floor 1e-8."""
 
-    @stored_jit
+    @eqx.filter_jit
     @jax.value_and_grad
     def f(coefficient):
         scene = alike(dry(coefficient), jv.Gravity())
@@ -116,7 +115,7 @@ def test_gradient_by_the_coefficient_by_differences():
     x, h = jnp.asarray(0.1), 1e-5
     _, reverse = f(x)
     np.testing.assert_allclose((f(x + h)[0] - f(x - h)[0]) / (2.0 * h), reverse, rtol=1e-6)
-    np.testing.assert_allclose(stored_jit(jax.jacfwd(lambda x: f(x)[0]))(x), reverse, rtol=1e-9)
+    np.testing.assert_allclose(eqx.filter_jit(jax.jacfwd(lambda x: f(x)[0]))(x), reverse, rtol=1e-9)
 
 
 def test_friction_of_loads_side_by_side_depends_on_their_place():

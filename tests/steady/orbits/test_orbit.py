@@ -13,7 +13,6 @@ from periodic import integrate
 from scenes import assembled, machines, published
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
@@ -144,7 +143,7 @@ def test_stable_motion_stays_and_unstable_one_leaves():
     assert np.max(np.abs(integrate(scene, away, 60))) > 0.1
 
 
-@stored_jit
+@eqx.filter_jit
 def many(scene, omega, points):
     model = assembled(scene)
 
@@ -185,7 +184,7 @@ def test_jams_are_found_from_distant_load_speeds():
         known = periodic_motion(model, grid, "omega", motion.omega, jam_rotor_speed(scene, motion.omega))
         return branch_tangent(model, grid, motion).residual, known.rotor_speed
 
-    residual, speed = stored_jit(jax.vmap(found))(jnp.linspace(0.5, 2.0, 31))
+    residual, speed = eqx.filter_jit(jax.vmap(found))(jnp.linspace(0.5, 2.0, 31))
     assert np.max(residual) < 1e-12
     np.testing.assert_allclose(speed, 3.0, rtol=1e-9)
 
@@ -212,7 +211,7 @@ def numbers_of(orbit):
     return jnp.concatenate([jnp.ravel(part) for part in parts])
 
 
-@stored_jit
+@eqx.filter_jit
 @jax.grad
 def weighted_gradient(scene, near, weights):
     """Reverse-mode gradient of weighted numbers of a jam at the scene's rotor speed."""
@@ -226,7 +225,7 @@ def test_gradients_forward_reverse_and_by_differences():
     rng = np.random.default_rng(0)
     along_x = jnp.asarray(flat * rng.normal(size=flat.shape))
 
-    @stored_jit
+    @eqx.filter_jit
     def f(x):
         return jax.jvp(lambda x: numbers_of(jv.jam_orbit(restore(x), near=0.97, points=16)), (x,), (along_x,))
 
@@ -294,7 +293,7 @@ def test_derivatives_at_a_known_orbit_equal_those_of_the_search():
         numbers = (orbit.omega, orbit.foundation_force, orbit.displacement_harmonics, orbit.slope)
         return sum(w * jnp.nansum(jnp.abs(x) ** 2) for w, x in zip((0.3, 0.7, -0.4, 2.0), numbers, strict=True))
 
-    ours, theirs = jax.grad(total)(scene, 3), stored_jit(jax.grad(total))(scene, 3)
+    ours, theirs = jax.grad(total)(scene, 3), eqx.filter_jit(jax.grad(total))(scene, 3)
     for (path, a), b in zip(jax.tree.leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-12, err_msg=f"{path}")
     absent = jax.grad(total)(scene, 1)

@@ -13,7 +13,6 @@ from jax.flatten_util import ravel_pytree
 from periodic import monodromy, ordered
 from scenes import machines, published
 from scipy.integrate import solve_ivp
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.orbits.diagram import SpecialPoint
@@ -171,7 +170,7 @@ def test_load_mass_at_which_odd_modes_lose_stability(kind, between, omega, eps):
 @pytest.mark.slow
 def test_gradient_of_the_largest_multiplier():
     flat, restore = ravel_pytree(gravity())
-    f = stored_jit(lambda x: jv.jam_orbit(restore(x), omega=60.0, points=33).multiplier)
+    f = eqx.filter_jit(lambda x: jv.jam_orbit(restore(x), omega=60.0, points=33).multiplier)
     direction = jnp.asarray(flat * np.random.default_rng(0).normal(size=flat.shape))
     forward, reverse = jax.jvp(f, (flat,), (direction,))[1], jax.grad(f)(flat)
     h = 1e-4
@@ -242,13 +241,13 @@ def test_stiff_multipliers_are_those_of_scipys_radau(scene):
 
 def test_multipliers_of_unknown_scenes_hold_for_much_drag():
     """Under `jit`, where no number tells how many steps are enough."""
-    value = stored_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
+    value = eqx.filter_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
     for drag in (1.0, 1000.0, 1e6):
         np.testing.assert_allclose(value(drag), jv.jam_orbit(stiff(drag), omega=45.0).multiplier, rtol=1e-9)
 
 
 def test_stiff_multipliers_have_derivatives_of_differences():
-    f = stored_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
+    f = eqx.filter_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
     reverse, h = jax.grad(f)(1000.0), 0.1
     np.testing.assert_allclose(reverse, (f(1000.0 + h) - f(1000.0 - h)) / (2.0 * h), rtol=1e-5)
 

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from plugins.effect import SealFriction
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
@@ -176,7 +175,7 @@ def test_gyroscopic_coupling_is_taken_out():
     thin = eqx.tree_at(lambda s: s.machine.polar_inertia, ROTOR, 0.0 * ROTOR.machine.polar_inertia)
     rng = np.random.default_rng(1)
     state = jv.State(*(jnp.asarray(1e-3 * rng.normal(size=4)) for _ in range(2)), (jnp.arange(4.0),), (jnp.full(4, 100.0),))
-    field = stored_jit(lambda scene: jv.vector_field(scene)(jnp.asarray(1.0), state))
+    field = eqx.filter_jit(lambda scene: jv.vector_field(scene)(jnp.asarray(1.0), state))
     ours, theirs = field(taken.scene), field(thin)
     np.testing.assert_allclose(ours.velocity, theirs.velocity, rtol=1e-12)
     np.testing.assert_allclose(ours.rate[0], theirs.rate[0], rtol=1e-12)
@@ -260,7 +259,7 @@ def test_gravity_in_the_radial_load_follows_the_paper():
     loads = jv.pendulums(count=1, mass=0.05, radius=0.08, drag=0.0)
     heavy, light = (jv.Scene(still, loads, jv.ConstantSpeed(460.0), e) for e in ((jv.Gravity(),), ()))
 
-    @stored_jit
+    @eqx.filter_jit
     def share(omega):
         def load(scene, phi):
             state = jv.State(jnp.zeros(1), jnp.zeros(1), (phi[None],), (omega[None],))

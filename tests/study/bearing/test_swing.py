@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from stored_jit import stored_jit
 from swings import ROD, T, scipy_swing
 
 import jaxvib as jv
@@ -84,9 +83,9 @@ def test_derivatives_of_the_swing():
         given = dict(angle=x[0], rate=x[1], viscous=x[2], dry=x[3], width=5e-3, adjoint=adjoint)
         return jv.swing(ROD, t, stepsize_controller=jv.Tolerance(1e-11), **given).angle
 
-    forward = stored_jit(jax.jacfwd(lambda x: angles(x, diffrax.ForwardMode())))(at)
+    forward = eqx.filter_jit(jax.jacfwd(lambda x: angles(x, diffrax.ForwardMode())))(at)
     steps = 1e-4 * jnp.diag(at)
-    around = stored_jit(jax.vmap(angles))(jnp.concatenate([at[None, :] + steps, at[None, :] - steps]))
+    around = eqx.filter_jit(jax.vmap(angles))(jnp.concatenate([at[None, :] + steps, at[None, :] - steps]))
     difference = (around[:4] - around[4:]) / (2.0 * jnp.diagonal(steps)[:, None])
     for k in range(4):
         np.testing.assert_allclose(forward[:, k], difference[k], atol=3e-5 * np.max(np.abs(difference[k])), equal_nan=False)
@@ -122,7 +121,7 @@ def test_too_few_steps_have_a_status():
     assert bool(swing.status == jv.SwingStatus.max_steps_reached) and np.isnan(swing.angle[-1])
 
 
-@stored_jit
+@eqx.filter_jit
 @jax.vmap
 def swings_with_slopes(x):
     def swing(x):

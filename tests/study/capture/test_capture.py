@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from papers.machines import published_torus
 from papers.printed_torus import printed_torus
-from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
@@ -160,9 +159,9 @@ def outcome(change, adjoint=None):
 
 
 def test_derivatives_of_capture_time_and_remaining_imbalance():
-    evaluate = stored_jit(outcome)
+    evaluate = eqx.filter_jit(outcome)
     assert 0.01 < float(evaluate(AT)[0]) < 1.0 and len(NUMBERS) == 14
-    forward = np.asarray(stored_jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT))
+    forward = np.asarray(eqx.filter_jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT))
     for k, name in enumerate([*NUMBERS, "initial speed"]):
         by = AT.at[k].set(STEP)
         difference = (np.asarray(evaluate(AT + by)) - np.asarray(evaluate(AT - by))) / (2.0 * STEP)
@@ -172,8 +171,8 @@ def test_derivatives_of_capture_time_and_remaining_imbalance():
 
 @pytest.mark.slow
 def test_reverse_derivatives_are_the_forward_ones():
-    forward = stored_jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT)
-    np.testing.assert_allclose(stored_jit(jax.jacrev(outcome))(AT), forward, rtol=1e-7, atol=1e-9)
+    forward = eqx.filter_jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT)
+    np.testing.assert_allclose(eqx.filter_jit(jax.jacrev(outcome))(AT), forward, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize(
