@@ -50,9 +50,18 @@ def platforms(*effects: jv.Effect) -> jv.Scene:
     return jv.Scene(machine, loads(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0), effects)
 
 
-def planar() -> jv.Scene:
+def planar(count: int = 2) -> jv.Scene:
     machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
-    return jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.14), jv.ConstantSpeed(460.0))
+    return jv.Scene(machine, jv.pendulums(count=count, mass=0.1 / count, radius=0.08, drag=0.14), jv.ConstantSpeed(460.0))
+
+
+def chain(n: int) -> jv.Scene:
+    """A chain of n platforms."""
+    machine = jv.network(
+        mass=[100.0] * n, stiffness=[2e4] * n, damping=[30.0] * n, links=[(k, k + 1) for k in range(1, n)],
+        link_stiffness=[2e5] * (n - 1), link_damping=[30.0] * (n - 1), exciter=n,
+    )  # fmt: skip
+    return jv.Scene(machine, jv.balls(count=2, mass=0.3, radius=0.1, drag=0.5), jv.ConstantSpeed(120.0))
 
 
 def run_of(scene: jv.Scene, until: float, start: Any = "rest") -> Call:
@@ -131,6 +140,8 @@ RUNS: dict[str, Callable[[], Call]] = {
     "1000 designs": designs,
     "envelope": lambda: lambda: jv.envelope(published(eps=1e-3), 1000.0).foundation_force,
     "jam_modes": lambda: lambda: jv.jam_modes(platforms()).foundation_force,
+    "jam_modes of 20 platforms": lambda: lambda: jv.jam_modes(chain(20)).foundation_force,
+    "phase_jams of 8 equal loads": lambda: lambda: jv.phase_jams(planar(8)).omega,
 }
 """Questions that are timed in units of a native run; the first call of each is not counted."""
 
