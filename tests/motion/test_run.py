@@ -72,8 +72,8 @@ def test_loads_run_together_that_have_one_angle_all_the_time():
     """Several of them, but for what rounding may have grown to: with any two apart at one instant they are not together."""
     once = np.linspace(0.0, 100.0, 5)[:, None] + np.zeros(3)
     parted = once + np.eye(5, 3) * 1e-3
-    assert bool(_is_coincident(once)) and bool(_is_coincident(once + np.eye(5, 3) * 1e-9))
-    assert not bool(_is_coincident(parted)) and not bool(_is_coincident(once[:, :1]))
+    assert bool(_is_coincident([once])) and bool(_is_coincident([once + np.eye(5, 3) * 1e-9]))
+    assert not bool(_is_coincident([parted])) and not bool(_is_coincident([once[:, :1]]))
 
 
 def test_the_summary_names_the_loads_that_left_their_track(run):
