@@ -9,8 +9,9 @@ from jaxvib.runtime.cpu import prepare_cpu
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
 from jaxvib.machine.mount import Mount
-from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
-from jaxvib.machine.rotor import planar_rotor, rotor
+from jaxvib.machine.structures.plane_body import plane_body, support
+from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.structures.rotor import planar_rotor, rotor
 
 # Loads
 from jaxvib.machine.loads import Loads, balls, pendulums, rollers
@@ -124,6 +125,8 @@ __all__ = [
     "Mount",
     "one_mass",
     "two_mass",
+    "plane_body",
+    "support",
     "three_mass",
     "network",
     "rotor",

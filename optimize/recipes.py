@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.units import Number, count
 from optimize.files import Design
 from optimize.quantities.jams import amplitude, fold_margin, force_per_amplitude, jam_frequency

@@ -49,6 +49,7 @@ class Dynamics(eqx.Module):
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
     - `input_matrix` M^-1 P^T (nd, nP), acceleration per force on the rows; `accelerance` P M^-1 P^T (nP, nP); `rows` P (nP, nd)
     - `mass` M (nd, nd) if P has more rows than there are coordinates, otherwise None
+    - `turns`: for each exciter the row (1, nd) of the turn of its housing, None if it does not turn
     - `exciters`, see `RotorDynamics`; `supports`, a place for each `SupportForce`
     """
 
@@ -59,6 +60,7 @@ class Dynamics(eqx.Module):
     accelerance: Array
     rows: Array
     mass: Array | None
+    turns: tuple[Array | None, ...]
     exciters: tuple[RotorDynamics, ...]
     supports: tuple[_Support, ...]
 
@@ -73,7 +75,9 @@ class Dynamics(eqx.Module):
         pairs = list(zip(self.exciters, state.exciters, strict=True))
         speeds = [exciter.drive.rotor_speed(t, own.rotor) for exciter, own in pairs]
         unforced = self._unforced(state, speeds)
-        motions = [exciter.motion(t, own, speed) for (exciter, own), speed in zip(pairs, speeds, strict=True)]
+        housings = [None if turn is None else times(turn, state.velocity)[0] for turn in self.turns]
+        cases = zip(pairs, speeds, housings, strict=True)
+        motions = [exciter.motion(t, own, speed, housing) for (exciter, own), speed, housing in cases]
 
         def solve(contacts: Sequence[ContactSolution]) -> tuple[list[tuple[Eliminated, list[Array]]], Array]:
             cases = zip(self.exciters, motions, contacts, strict=True)
@@ -175,7 +179,10 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
     """Return `vector_field` of a scene that is assembled already; `solve` gives x of a x = b, a the mass matrix."""
     scene, carrier, gyroscopic = model.scene, model.carrier, model.mounts[0].gyroscopic
     exciters = tuple(map(_exciter_dynamics, scene.exciters, model.mounts, itertools.repeat(scene.effects)))
-    moving = [row for exciter, mount in zip(exciters, model.mounts, strict=True) for row in mount.rows[: exciter.row_count]]
+    turns = tuple(None if mount.turn is None else mount.turn[None] for mount in model.mounts)
+    moving = []
+    for exciter, mount, turn in zip(exciters, model.mounts, turns, strict=True):
+        moving += [*mount.rows[: exciter.row_count], *([] if turn is None else [turn])]
     rows = moving[0] if len(moving) == 1 else jnp.concatenate(moving)
     parts = [carrier.stiffness, carrier.damping, rows.T, *(place.T for place in model.supports)]
     if gyroscopic is not None:
@@ -190,6 +197,7 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
         accelerance=rows @ input_matrix,
         rows=rows,
         mass=carrier.mass if rows.shape[0] > rows.shape[1] else None,
+        turns=turns,
         exciters=exciters,
         supports=tuple(map(_Support, model.supports, rest)),
     )
@@ -202,4 +210,5 @@ def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]
     row_count = len(mount.rows) if has_term(effects, RotorImbalance) else len(mount.levers)
     if loads is None:
         return RotorDynamics(*rotor, effects, mount.axes, row_count)
-    return ExciterDynamics(*rotor, tuple(effect.prepare(loads) for effect in effects), mount.axes, row_count, loads)
+    effects = tuple(effect.prepare(loads) for effect in effects)
+    return ExciterDynamics(*rotor, effects, mount.axes, row_count, loads)

@@ -56,7 +56,8 @@ class Motion(NamedTuple):
 
     **Attributes**: `state`; the rotor's `speed`; `imbalance` of the rotor, see `RotorDynamics._imbalance`; `kinematics` of the
     loads; `drag` (count,), the torque of the rotor on them; `weight`, the torque of gravity on the unbalance, None without one;
-    `rolling`, the forces on loads that all roll.
+    `rolling`, the forces on loads that all roll; `housing`, the speed at which the housing turns with the machine, None if it
+    does not.
     """
 
     state: ExciterState
@@ -66,6 +67,7 @@ class Motion(NamedTuple):
     drag: Array
     weight: Array | None
     rolling: ContactSolution
+    housing: Array | None
 
 
 class Eliminated(NamedTuple):
@@ -110,17 +112,18 @@ class RotorDynamics(eqx.Module):
         """True if an effect lets loads slide."""
         return False
 
-    def motion(self, t: Array, state: ExciterState, speed: Array) -> Motion:
+    def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return everything that is known before the accelerations, the rotor turning at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
         drag, weight = jnp.zeros_like(speed), self.weight(t, state)
-        return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact)
+        return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact, housing)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Solve for the own accelerations of the exciter. The friction of `contact` is linear in the accelerations."""
         n = self.row_count * len(self.axes)
         added_mass: list[list[Array | float]] = [[0.0] * n for _ in range(n)]
-        return Eliminated((), {}, *self._add_rotor(motion, added_mass, [0.0] * n, motion.drag, {}))
+        rotor = self._add_rotor(motion, added_mass, [0.0] * n, motion.drag, {})
+        return self._add_housing(motion, Eliminated((), {}, *rotor), motion.drag, {})
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
         """Return the accelerations of the points that carry the loads, from those of the mount's rows."""
@@ -149,25 +152,52 @@ class RotorDynamics(eqx.Module):
         coupling: Axes,
     ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
         """Return added mass and reaction with the rotor's imbalance, and the rotor's own acceleration as in `Eliminated`."""
-        motor = self.drive.torque_and_inertia(motion.speed)
+        motor = self._motor(motion)
         if motor is None:
             if motion.imbalance is not None:
                 reaction = [g + b for g, b in zip(reaction, motion.imbalance[1], strict=True)]
             return added_mass, reaction, None
         torque, inertia = motor
-        free = torque - self._total(drag)
-        free = (free if motion.weight is None else free - motion.weight) / inertia
-        row = [jnp.zeros_like(free)] * len(reaction)
-        if coupling:
-            by_loads = [self._total(coupling[i], lever) / inertia for lever in self.levers for i in self.axes]
-            row = by_loads + row[len(by_loads) :]
+        taken, felt = self._taken_torque(motion, drag, coupling)
+        free = (torque - taken) / inertia
+        row = [f / inertia for f in felt] + [jnp.zeros_like(free)] * (len(reaction) - len(felt))
         if motion.imbalance is None:
             return added_mass, reaction, (free, row)
         along, bend = motion.imbalance
-        row = [r + d / inertia for r, d in zip(row, along, strict=True)]
         added_mass = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(added_mass, along, strict=True)]
         reaction = [g + b + d * free for g, b, d in zip(reaction, bend, along, strict=True)]
         return added_mass, reaction, (free, row)
+
+    def _motor(self, motion: Motion) -> tuple[Array, Array] | None:
+        """Return the torque of a motor, at its speed relative to the housing, and its inertia; None under an ideal drive."""
+        return self.drive.torque_and_inertia(motion.speed if motion.housing is None else motion.speed - motion.housing)
+
+    def _taken_torque(self, motion: Motion, drag: Array, coupling: Axes) -> tuple[Array, list[Array]]:
+        """Return the torque that loads, gravity and imbalance take from the rotor: the first + the second . a, N m.
+
+        The second has an entry for each of the first rows of the mount, the others feel nothing.
+        """
+        taken = self._total(drag)
+        taken = taken if motion.weight is None else taken + motion.weight
+        by_loads = [self._total(coupling[i], lever) for lever in self.levers for i in self.axes] if coupling else []
+        if motion.imbalance is None:
+            return taken, by_loads
+        along = motion.imbalance[0]
+        return taken, [f + d for f, d in zip(by_loads, along, strict=False)] + along[len(by_loads) :]
+
+    def _add_housing(self, motion: Motion, part: Eliminated, drag: Array, coupling: Axes) -> Eliminated:
+        """Add the row of the housing's turn, on which the torque of the drive reacts."""
+        if motion.housing is None:
+            return part
+        motor, n = self._motor(motion), len(part.reaction)
+        if motor is None:
+            torque, row = self._taken_torque(motion, drag, coupling)
+        else:
+            torque, row = motor[0], []
+        zero = jnp.zeros_like(torque)
+        added_mass = [[*line, zero] for line in part.added_mass] + [row + [zero] * (n + 1 - len(row))]
+        rotor = None if part.rotor is None else (part.rotor[0], [*part.rotor[1], zero])
+        return part._replace(added_mass=added_mass, reaction=[*part.reaction, torque], rotor=rotor)
 
     def _imbalance(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
         """Return d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2: d(theta) is the imbalance on each row."""
@@ -220,7 +250,7 @@ class ExciterDynamics(RotorDynamics):
         """True if an effect lets loads slide."""
         return has_term(self.effects, SlipRelease)
 
-    def motion(self, t: Array, state: ExciterState, speed: Array) -> Motion:
+    def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return everything that is known before the accelerations, the rotor turning at `speed`."""
         imbalance = self._imbalance(t, state)
         found = kinematics(self.loads, state.angle, state.rate)
@@ -230,7 +260,7 @@ class ExciterDynamics(RotorDynamics):
         rubbing = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
         friction = [each.signed({}) if each.normal is None else each for each in rubbing]
         contact = ContactSolution(self.loads.inertia_factor(), force, friction)
-        return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact)
+        return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact, housing)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Solve loads and rotor for their own accelerations. The friction of `contact` is linear in the accelerations."""
@@ -247,7 +277,8 @@ class ExciterDynamics(RotorDynamics):
         accelerance = {axis: solve(tuple(row)) for axis, row in rows.items()}
         added_mass, reaction = self._felt_by_mount(found, free, accelerance)
         added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag, coupling[0])
-        return Eliminated(free, accelerance, added_mass, reaction, rotor)
+        part = Eliminated(free, accelerance, added_mass, reaction, rotor)
+        return self._add_housing(motion, part, drag, coupling[0])
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
         """Return the accelerations of the points that carry the loads, from those of the mount's rows."""

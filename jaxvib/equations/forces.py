@@ -186,13 +186,14 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
             braking, spun, losses = _load_power(dynamics, own, own_change, mount.load_rates(change.velocity), speed)
             given.append(spun)
             lost += losses
-        motor = dynamics.drive.torque_and_inertia(speed)
+        driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
+        motor = dynamics.drive.torque_and_inertia(driven)
         if motor is not None:
-            given.append(speed * motor[0])
+            given.append(driven * motor[0])
             continue
         torque = braking + _imbalance_rate(exciter, mount, turn) @ change.velocity
         weight = dynamics.weight(t, own)
-        given.append(speed * (torque if weight is None else torque + weight))
+        given.append(driven * (torque if weight is None else torque + weight))
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         x, v = rows @ state.displacement, rows @ state.velocity
         if term.resistance is not None:

@@ -337,6 +337,9 @@ def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     loads, drive = scene.loads, scene.drive
+    if scene.mounting().turn is not None:
+        problem = "turns with the housing of its exciter, which this theory leaves out: simulate, settle or ensemble follow it"
+        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
     if not loads.circular:
         holds = "this holds for loads on a circle (property circular): ball, roller, pendulum"
         raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {holds}; simulate others")

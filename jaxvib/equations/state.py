@@ -67,6 +67,11 @@ class State(eqx.Module):
     - `exciters`: instead of these, an `ExciterState` for each exciter
 
     **Attributes**: `displacement`, `velocity` and `exciters`. Those of the only exciter are `angle`, `rate`, `rotor`, `spin`.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> state = jv.State(jnp.zeros(2), jnp.zeros(2), angle=(jnp.zeros(3),), rate=(jnp.full(3, 60.0),))
+    >>> len(state.exciters), state.rate[0].tolist()
+    (1, [60.0, 60.0, 60.0])
     """
 
     displacement: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))

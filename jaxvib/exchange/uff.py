@@ -154,7 +154,7 @@ def _nodes(scene: Scene) -> list[_Node]:
     if machine.places == "platform":
         places = [(k + 1, float(k)) for k in range(machine.structure().mass.shape[0])]
     elif machine.places == "shaft":
-        supports = [position for position, *_ in machine.supports() or []]
+        supports = [position for position, *_ in machine.shaft_supports() or []]
         stations = np.asarray(mount.distances(scene.loads.count)).tolist()
         places = [(jnp.asarray(s, scene.drive.speed.dtype), s) for s in sorted({0.0, *supports, *stations})]
     else:

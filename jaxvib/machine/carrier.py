@@ -88,6 +88,7 @@ class Machine(Part):
 
     - "platform": by the number of the platform
     - "shaft": by the distance along a rotor's axis from its mass centre, m
+    - "plane": by the point (x, y) of a body, m from its centre of mass
     - "point": not at all, because the exciter's place is the only one
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
@@ -99,9 +100,9 @@ class Machine(Part):
     ...     def carrier(self):
     ...         mass, stiffness, no = self.mass[None, None], self.stiffness[None, None], jnp.zeros((1, 1))
     ...         return jv.Carrier(mass, no, stiffness, foundation_stiffness=stiffness, foundation_damping=no,
-    coordinates=("y1",))
+    ...                           coordinates=("y1",))
     ...
-    ...     def mount(self):
+    ...     def mount(self, at=None):
     ...         return jv.Mount(rows=(jnp.ones((1, 1)),), axes=(1,))
     >>> loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0)
     >>> machine = Table(mass=jnp.asarray(49.5), stiffness=jnp.asarray(5e3))
@@ -111,7 +112,7 @@ class Machine(Part):
     """
 
     kind: eqx.AbstractVar[str]
-    places: ClassVar[Literal["platform", "shaft", "point"]] = "point"
+    places: ClassVar[Literal["platform", "shaft", "plane", "point"]] = "point"
 
     @abc.abstractmethod
     def carrier(self) -> Carrier:
@@ -145,7 +146,7 @@ class Machine(Part):
             raise InputError(name, problem)
         return self.mount().rows[0]
 
-    def supports(self) -> list[tuple[float, float, float]] | None:
+    def shaft_supports(self) -> list[tuple[float, float, float]] | None:
         """Return the supports along a rotor's axis, for a drawing; None if the matrices contain everything for a drawing.
 
         **Returns** a list with the distance from the mass centre (m), the stiffness (N/m) and the damping (N s/m) of each
@@ -158,7 +159,7 @@ class Machine(Part):
         return _shapes(self)[0]
 
     def mounting(self, at: Place = None) -> Mount:
-        """Directions and shapes of an exciter's mount, without its numbers."""
+        """Return the directions and shapes of the mount of an exciter at the place `at`, without its numbers."""
         return _shapes(self, at)[1]
 
 

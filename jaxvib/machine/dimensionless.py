@@ -12,8 +12,8 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.units import Number, Numbers, number, numbers
 from jaxvib.units import count as whole
 

@@ -19,10 +19,11 @@ from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, 
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
-from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
-from jaxvib.machine.rotor import TEMPLATES as ROTORS
-from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.structures.plane_body import PlaneSupport, plane_body, support
+from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.structures.rotor import TEMPLATES as ROTORS
+from jaxvib.machine.structures.rotor import planar_rotor, rotor
 from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units.known import require_known, when_known
@@ -49,6 +50,7 @@ _MACHINES = {
     "two_mass": two_mass,
     "three_mass": three_mass,
     "network": network,
+    "plane_body": plane_body,
     "planar_rotor": planar_rotor,
     "rotor": rotor,
 }
@@ -285,7 +287,18 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
-    return build(**values)
+    return build(**{name: _built_list(value, prefix + name) if name == "supports" else value for name, value in values.items()})
+
+
+def _built_list(tables: object, section: str) -> object:
+    """Return the supports of a list of tables; other values are for the constructor."""
+    if not isinstance(tables, list) or not all(isinstance(each, Mapping) for each in tables):
+        return tables
+    supports = []
+    for k, table in enumerate(tables):
+        with within(f"{section}[{k}]."):
+            supports.append(build_part(support, table, ""))
+    return supports
 
 
 def rebuild_part(part: Any, section: str) -> Any:
@@ -332,7 +345,7 @@ def _part_table(section: str, part: Any) -> Tables:
 def _exciter_table(exciter: Exciter) -> Tables:
     at = exciter.position if exciter.platform is None else exciter.platform
     own = {"at": at, "unbalance": exciter.unbalance}
-    table = {name: np.asarray(value).item() for name, value in own.items() if value is not None}
+    table = {name: np.asarray(value).tolist() for name, value in own.items() if value is not None}
     parts = {name: part for name in ("loads", "drive") if (part := getattr(exciter, name)) is not None}
     table |= {"direction": exciter.direction, **{name: _part_table(name, part) for name, part in parts.items()}}
     return {**table, "effects": _effect_tables(exciter.effects)} if exciter.effects else table
@@ -356,7 +369,7 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
         if value is None:  # an option that is not set
             continue
         if isinstance(value, tuple):
-            fields[name] = [list(pair) for pair in value]
+            fields[name] = [_fields(each, support) if isinstance(each, PlaneSupport) else list(each) for each in value]
         elif isinstance(value, (int, str)):
             fields[name] = value
         else:

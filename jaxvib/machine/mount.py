@@ -11,9 +11,9 @@ from jax import Array
 
 __all__ = ["Mount", "Place", "scaled"]
 
-Place = int | float | Array | None
-"""Place on a machine: the number of a platform, or the distance along a rotor's axis from its mass centre, m; None is the
-default place of the machine."""
+Place = int | float | Sequence[float] | Array | None
+"""Place on a machine: the number of a platform, the distance along a rotor's axis from its mass centre, m, or the point (x, y)
+of a body in a plane, m; None is the default place of the machine."""
 
 
 class Mount(eqx.Module):
@@ -31,6 +31,7 @@ class Mount(eqx.Module):
     - `rotor_levers`: the same for the rotor's mass centre, scalars
     - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one.
       typical: 0.01 to 0.5 kg m^2, the polar inertia of the rotor
+    - `turn` c (nd,): the exciter's housing turns by c q, and the torque of the drive reacts on it; None if it does not turn
 
     >>> import jaxvib as jv
     >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
@@ -45,6 +46,7 @@ class Mount(eqx.Module):
     levers: tuple[Array | None, ...] = (None,)
     rotor_levers: tuple[Array | None, ...] = (None,)
     gyroscopic: Array | None = None
+    turn: Array | None = None
 
     @property
     def tilt(self) -> Array | None:

@@ -19,7 +19,7 @@ from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, Roto
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
-from jaxvib.units import Number, count, number
+from jaxvib.units import Number, count, number, numbers
 from jaxvib.units.known import when_known
 
 __all__ = ["Exciter", "Scene", "read_effects", "require_comparable"]
@@ -36,9 +36,9 @@ class Exciter(Part):
     - `loads` from `balls`, `rollers`, `pendulums`; None without loads
     - `drive`, a `Motor` or an `IdealDrive`; the inertia of a motor includes the unbalance
     - `unbalance` S, kg m: static moment m r about the exciter's axis of a mass that turns with the rotor, greater than 0. The
-      mass m is part of the machine's mass. Typical values are 0.1 to 10 kg m
-    - `at`: place on the machine, a platform number or the distance along a rotor's axis from its mass centre, m (a float or
-      text); None for the default of the machine
+      mass m is part of the machine's mass; typical: 0.1 to 10 kg m
+    - `at`: place on the machine, a platform number, the distance along a rotor's axis from its mass centre, m (a float or
+      text), or the point (x, y) of a body in a plane, m; None for the default of the machine
     - `direction` of rotation: +1 anticlockwise, -1 clockwise. Angles and speeds of a state are anticlockwise in both cases
     - `effects` of the rotor and its loads such as `StaticImbalance` or `DryFriction`
 
@@ -68,7 +68,7 @@ class Exciter(Part):
         drive: Drive | None = None,
         *,
         unbalance: Number | None = None,
-        at: int | Number | None = None,
+        at: int | Number | Sequence[Number] | None = None,
         direction: int = 1,
         effects: Effect | Sequence[Effect] = (),
     ):
@@ -88,7 +88,7 @@ class Exciter(Part):
         self.carries = ("loads",) * (loads is not None) + ("unbalance",) * (unbalance is not None)
         is_platform = isinstance(at, (int, np.integer))
         self.platform = count(at, "at") if is_platform else None
-        self.position = None if at is None or is_platform else number(at, "m", "at")
+        self.position = None if at is None or is_platform else _read_position(at)
 
     @property
     def is_plain(self) -> bool:
@@ -215,16 +215,16 @@ class Scene(Part):
             raise InputError("scene.exciters[0].direction", "is -1; this is for anticlockwise rotors, simulate others")
         return self.exciter
 
-    def mount(self, at: Place = None) -> Mount:
+    def mount(self) -> Mount:
         """Return the mount of the only exciter."""
         return self.machine.mount(self.exciter.at)
 
     def mounting(self) -> Mount:
-        """Directions and shapes of the only exciter's mount, without its numbers."""
+        """Return the directions and shapes of the only exciter's mount, without its numbers."""
         return self.machine.mounting(self.exciter.at)
 
     def replace(self, **parts: Any) -> Scene:
-        """Return the scene with another `machine`, or with other `loads`, `drive` or `effects` of its only exciter.
+        """Return the scene with other `parts`: its `machine`, or the `loads`, `drive` or `effects` of its only exciter.
 
         >>> import jaxvib as jv
         >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -241,6 +241,11 @@ class Scene(Part):
     def place_of(self, k: int) -> str:
         """Return the place of exciter `k` before the names of its parts: "exciters[1]." or, for the only one, ""."""
         return f"exciters[{k}]." if len(self.exciters) > 1 else ""
+
+
+def _read_position(at: Any) -> Array:
+    """Distance along an axis, or point (x, y)."""
+    return numbers(at, "m", "at", 2) if isinstance(at, (list, tuple)) or np.ndim(at) > 0 else number(at, "m", "at")
 
 
 def _require_stations(machine: Machine, exciter: Exciter) -> None:

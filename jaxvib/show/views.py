@@ -249,7 +249,7 @@ class ShaftView(View):
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
-        self.stands = scene.machine.supports() or []
+        self.stands = scene.machine.shaft_supports() or []
         self._rows = functools.cache(lambda s: np.asarray(scene.machine.rows_at(s)))
         self.stations = np.asarray(self.mount.distances(scene.loads.count), float)
         all_places = [0.0, *self.stations, *(s for s, _, _ in self.stands)]
@@ -327,7 +327,7 @@ class ShaftView(View):
 def view_of(scene: Scene) -> View:
     """The drawing of a scene, chosen by the places that its machine has."""
     machine = scene.machine
-    if machine.places == "point" and machine.mounting().axes != (0, 1):
+    if machine.places == "plane" or (machine.places == "point" and machine.mounting().axes != (0, 1)):
         problem = f"is {machine.kind!r}; machines are drawn that have platforms or a shaft, or that move across and up"
         raise InputError("machine.kind", problem)
     return {"platform": PlatformView, "shaft": ShaftView, "point": FrontView}[machine.places](scene)

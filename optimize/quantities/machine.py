@@ -15,8 +15,8 @@ from jaxvib.boundary import validated
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers.named import spec_of
-from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.machine.platforms import Platforms
+from jaxvib.machine.structures.platforms import Platforms
 
 
 def residual(s, t, state, field):

@@ -33,6 +33,9 @@ class _Support(Effect):
 
         **Raises** `InputError` for a place that the machine does not have.
         """
+        if machine.places == "plane":
+            problem = f"acts under a platform or around a rotor's axis, not on {quoted(machine.kind)}; leave it out"
+            raise InputError(f"effects.{self.kind}", problem)
         if self.position is None:
             return machine.rows_at(self.platform, f"effects.{self.kind}.platform")
         return machine.rows_at(self.position, f"effects.{self.kind}.position")

@@ -12,9 +12,9 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.files import DRIVES, EFFECTS
 from jaxvib.machine.loads import Loads, balls, pendulums
-from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
-from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.structures.rotor import planar_rotor, rotor
 from jaxvib.machine.torus import torus_balls
 from jaxvib.study.audit.compared import field_operations
 from jaxvib.units import Numbers

@@ -15,8 +15,8 @@ from hard_cases.reference_model import light_modes, light_speed, platforms, refe
 from hard_cases.shared import away, compared_state, final_state, jam_case, published, run_case
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import pendulums
-from jaxvib.machine.platforms import two_mass
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import two_mass
 from jaxvib.results.status import status_name
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 

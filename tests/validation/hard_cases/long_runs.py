@@ -20,8 +20,8 @@ from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, RunUp
 from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 from jaxvib.machine.loads import pendulums
-from jaxvib.machine.platforms import one_mass
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import one_mass
 from jaxvib.motion.growth import growth
 from jaxvib.motion.simulate import simulate
 from jaxvib.results.status import status_name

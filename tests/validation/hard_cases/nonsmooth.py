@@ -16,8 +16,8 @@ from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.supports import Stop
 from jaxvib.machine.loads import balls, pendulums
-from jaxvib.machine.platforms import one_mass
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import one_mass
 from jaxvib.motion.steps import Tolerance
 
 __all__ = ["CASES", "stop_law"]

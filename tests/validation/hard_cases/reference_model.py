@@ -16,8 +16,8 @@ from scipy.optimize import minimize_scalar, root_scalar
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import Platforms
 
 __all__ = ["ReferenceModel", "light_modes", "light_speed", "number_of", "platforms", "reference_model", "root"]
 

@@ -15,8 +15,8 @@ from hard_cases.shared import away, final_state, jam_case, light_force_slope, pu
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import balls
-from jaxvib.machine.platforms import three_mass
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import three_mass
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit

@@ -15,7 +15,7 @@ from jax import Array
 
 from jaxvib.equations.linear import natural_frequencies, steady_displacement
 from jaxvib.machine.dimensionless import Dimensionless
-from jaxvib.machine.platforms import Platforms
+from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.steady.jams.jam import JamModes, jam_modes
 from papers.printed import Misprint, PrintedNumber

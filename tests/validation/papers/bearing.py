@@ -17,8 +17,8 @@ from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.effects.base import Effect, Gravity
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.loads import pendulums
-from jaxvib.machine.platforms import one_mass
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.platforms import one_mass
 from jaxvib.study.bearing.decrement import ten_periods
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, swing

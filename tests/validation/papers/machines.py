@@ -11,8 +11,8 @@ from jaxvib.machine.drive import ConstantSpeed, RunUp
 from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.loads import pendulums
-from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.rotor import planar_rotor, rotor
 from jaxvib.machine.torus import torus_balls
 from jaxvib.study.maps.run_ups import RunUps, run_ups
 

@@ -11,8 +11,8 @@ from jax import Array
 from jaxvib.equations.state import State
 from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
-from jaxvib.machine.rotor import PlanarRotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.rotor import PlanarRotor
 from jaxvib.machine.torus import TorusBalls, in_torus
 from papers.machines import ECCENTRICITY
 

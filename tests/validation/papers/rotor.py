@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.machine.drive import ConstantSpeed
-from jaxvib.machine.rotor import Rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.structures.rotor import Rotor, rotor
 from jaxvib.steady.jams.phase_branch import PhaseBranch
 from jaxvib.steady.jams.phase_search import phase_branch
 from jaxvib.steady.jams.phases import phase_jam

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
@@ -104,16 +105,18 @@ class Rotor(Machine):
         """
         if isinstance(place, int):
             raise InputError(name, f"is {place}, which numbers a platform; on a rotor give a position, m from the mass centre")
+        if isinstance(place, Sequence) or (isinstance(place, jax.Array) and place.ndim > 0):
+            raise InputError(name, f"is {quoted(place)}, a point of a body; on a rotor give a position, m from the mass centre")
         across, tilt = self._directions()
         shared = self.stations if self.stations.ndim == 0 else None
-        distance = shared if place is None else place
+        distance = shared if place is None else jnp.asarray(place)
         return across if distance is None else across + distance * tilt
 
     def _directions(self) -> tuple[Array, Array]:
         """Return rows (2, 4) of the mass centre, and of the tilt of the axis."""
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
-    def supports(self) -> list[tuple[float, float, float]]:
+    def shaft_supports(self) -> list[tuple[float, float, float]]:
         """Return the two supports."""
         return list(zip(self.position.tolist(), self.stiffness.tolist(), self.damping.tolist(), strict=True))
 

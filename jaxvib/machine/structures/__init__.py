@@ -1,0 +1,1 @@
+"""Structures of machines: platforms, rotors, bodies in a plane."""
