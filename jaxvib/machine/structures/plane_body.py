@@ -56,7 +56,7 @@ def support(
     >>> jv.support(at=(1.2, -0.2), stiffness=("200 N/mm", "400 N/mm"), damping=(2e3, 4e3)).stiffness.tolist()
     [200000.0, 400000.0]
 
-    Source: statics of two linear springs.
+    Source: equilibrium of two linear springs.
     """
     return PlaneSupport(**read_numbers(PlaneSupport, "", at=at, stiffness=stiffness, damping=damping, angle=angle))
 
