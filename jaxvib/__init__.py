@@ -22,7 +22,7 @@ __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 def __getattr__(name: str) -> Any:
     """Return a public name; its module is imported at the first use, so that a command imports only what it needs."""
     if name == "__version__":
-        from importlib.metadata import version  # slow to import: only who asks pays
+        from importlib.metadata import version  # slow import
 
         return version("jaxvib")
     if name not in _HOMES:

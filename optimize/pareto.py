@@ -85,7 +85,7 @@ class Front(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.charts import front_chart  # slow to import: only who draws pays
+        from jaxvib.draw.charts import front_chart  # slow import
 
         labels, values = self._shown()
         return front_chart(values[1], values[0], across=labels[1], up=labels[0], ax=ax)

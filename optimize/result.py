@@ -242,7 +242,7 @@ class Synthesis(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.charts import before_after  # slow to import: only who draws pays
+        from jaxvib.draw.charts import before_after  # slow import
 
         shown = []
         for row in self.table:

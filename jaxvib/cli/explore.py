@@ -21,7 +21,7 @@ def explore(scene: Path, port: int, no_browser: bool) -> None:
     Runs until it is interrupted (Ctrl-C). Only this computer reaches the page, at an address with a random token, which
     is printed; other sites in your browser cannot. Needs: pip install '.[explore]' in the folder of jaxvib's sources"""
     from jaxvib.explore.pictures import prepare, prepare_counts
-    from jaxvib.explore.serve import require_free, require_marimo, serve  # only who explores pays
+    from jaxvib.explore.serve import require_free, require_marimo, serve  # slow import
 
     require_marimo()
     require_free(port)

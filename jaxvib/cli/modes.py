@@ -185,7 +185,7 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
 
 def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -> None:
     """The exact jams, those that light loads have and those that only the full equations have, and the special points."""
-    from jaxvib.steady.orbits.search import exact_mode_speeds  # needs the time integrator: only who asks pays
+    from jaxvib.steady.orbits.search import exact_mode_speeds  # slow import: it needs the time integrator
 
     light = jv.jam_modes(scene)
     numbers = sorted({*light.mode_numbers(), *exact_mode_speeds(scene)})

@@ -162,7 +162,7 @@ def diagram(scene: Scene, most: float) -> str:
     >>> "whirl speed, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0)
     True
     """
-    from jaxvib.explore.campbell import campbell  # slow to import: only who draws pays
+    from jaxvib.explore.campbell import campbell  # slow import
     from jaxvib.explore.chart import chart
 
     speed = float(scene.drive.speed)
@@ -193,6 +193,6 @@ def modes_of(scene: Scene) -> list[int]:
 
 def machine(scene: Scene, mode: int | None) -> str:
     """The machine as an SVG picture, moving in the jam mode of that number; at rest where there is none."""
-    from jaxvib.show.moving import moving, still  # slow to import: only who draws pays
+    from jaxvib.show.moving import moving, still  # slow import
 
     return still(scene) if mode is None else moving(scene, jax.device_get(jam_modes(scene)).select(mode))

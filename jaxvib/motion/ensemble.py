@@ -126,7 +126,7 @@ class Ensemble(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import points_chart  # slow import
         from jaxvib.draw.style import speed_scale
 
         speeds = speed_scale(unit) * np.asarray(self.load_speed)

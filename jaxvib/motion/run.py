@@ -186,7 +186,7 @@ class Run(AbstractMeasured, Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
-        from jaxvib.draw.motion.histories import time_histories  # slow to import: only who draws pays
+        from jaxvib.draw.motion.histories import time_histories  # slow import
 
         structure = self.scene.machine.structure()
         whole, end = (
@@ -216,7 +216,7 @@ class Run(AbstractMeasured, Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a machine that moves up and down only.
         """
-        from jaxvib.draw.motion.histories import last_periods  # slow to import: only who draws pays
+        from jaxvib.draw.motion.histories import last_periods  # slow import
         from jaxvib.draw.motion.spectra import path_chart
 
         machine = self.scene.machine

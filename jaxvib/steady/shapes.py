@@ -62,7 +62,7 @@ class ModeShapes(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.results import shapes_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import shapes_chart  # slow import
 
         return shapes_chart(np.asarray(self.frequency), np.asarray(self.shape), names=self.coordinates, unit=unit, ax=ax)
 

@@ -73,7 +73,7 @@ class CriticalSpeeds(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import speeds_chart  # slow import
 
         speed, forward = np.asarray(self.speed), np.asarray(self.forward)
         return speeds_chart([("forward", speed[forward]), ("backward", speed[~forward])], unit=unit, ax=ax)
@@ -121,7 +121,7 @@ class Whirl(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.whirl import campbell_diagram  # slow to import: only who draws pays
+        from jaxvib.draw.whirl import campbell_diagram  # slow import
 
         if at is not None and not np.isfinite(at):
             raise InputError("at", f"is {at:g} rad/s; it must be finite")

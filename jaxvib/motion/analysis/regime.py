@@ -143,7 +143,7 @@ class Regime(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
+        from jaxvib.draw.results import phase_circles  # slow import
 
         return phase_circles([(self.label, np.asarray(self.phase))], ax=ax)
 

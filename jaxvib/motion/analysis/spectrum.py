@@ -95,7 +95,7 @@ class Spectrum(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for other names.
         """
-        from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow to import: only who draws pays
+        from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow import
 
         if show not in ("displacement", "force"):
             raise InputError("show", f"is {quoted(show)}; it must be 'displacement' or 'force'")

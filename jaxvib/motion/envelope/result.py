@@ -117,7 +117,7 @@ class Envelope(AbstractMeasured, Result):
 
         **Arguments**: `unit` and `ax` as `Run.plot`.
         """
-        from jaxvib.draw.motion.histories import amplitude_histories  # slow to import: only who draws pays
+        from jaxvib.draw.motion.histories import amplitude_histories  # slow import
 
         kept, structure = self.window if self.trajectory is None else self.trajectory, self.scene.machine.structure()
         return amplitude_histories(

@@ -92,7 +92,7 @@ class Criterion(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import speeds_chart  # slow import
 
         rows = [("resonances", self.speeds.damped_resonances), ("additional", self.speeds.damped_additional)]
         spans = [("balancing", self.balancing), ("gathering", self.gathering)]

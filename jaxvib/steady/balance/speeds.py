@@ -100,7 +100,7 @@ class CharacteristicSpeeds(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import speeds_chart  # slow import
 
         rows = [("resonances", self.resonances), ("additional", self.additional)]
         rows += [("damped resonances", self.damped_resonances), ("damped additional", self.damped_additional)]

@@ -66,6 +66,6 @@ class BalancedStability(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.results import multiplier_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import multiplier_chart  # slow import
 
         return multiplier_chart(np.asarray(self.multipliers), ax=ax)

@@ -127,7 +127,7 @@ class BalancedStates(Result):
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """Plot the arrangements in the rotor's frame, a circle each. **Returns** a matplotlib figure, or the given `ax`."""
-        from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
+        from jaxvib.draw.results import phase_circles  # slow import
 
         return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)], ax=ax)
 

@@ -74,7 +74,7 @@ def plot_branch(
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel.
     """
-    from jaxvib.draw.charts import branch_diagram  # slow to import: only who draws pays
+    from jaxvib.draw.charts import branch_diagram  # slow import
 
     at = float(branch.scene.drive.speed)
     top = 4.0 / 3.0 * at if most is None else most

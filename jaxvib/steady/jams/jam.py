@@ -197,7 +197,7 @@ def _row(jams: Jam, row: Array | np.ndarray) -> Jam:
 
 
 def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, ax: Onto) -> Drawn:
-    from jaxvib.draw.results import modes_chart  # slow to import: only who draws pays
+    from jaxvib.draw.results import modes_chart  # slow import
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))
     among = None if resonances is None else np.asarray(resonances)

@@ -66,7 +66,7 @@ class PhaseBranch(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
+        from jaxvib.draw.phases import drag_diagram  # slow import
 
         alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
         times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag, times the scene's")

@@ -106,7 +106,7 @@ class PhaseJams(AbstractPhaseJam):
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit than "rad/s", "rpm", "Hz"
         (`unit`).
         """
-        from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
+        from jaxvib.draw.phases import drag_diagram  # slow import
 
         omega = np.asarray(self.omega)
         speeds = np.unique(np.concatenate([load_speeds(assemble_torque_balance(self.scene)), omega]))

@@ -117,7 +117,7 @@ class PhaseJam(AbstractPhaseJam):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
+        from jaxvib.draw.results import phase_circles  # slow import
 
         return phase_circles([(f"{float(self.omega):.4g} rad/s", np.asarray(self.phase))], ax=ax)
 

@@ -170,7 +170,7 @@ class Orbit(Result):
 
         **Returns** a matplotlib figure, or the given `ax`, which has three axes.
         """
-        from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import signals_chart  # slow import
 
         theta = np.linspace(0.0, 2.0 * np.pi, 721)
 

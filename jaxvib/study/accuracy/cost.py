@@ -111,7 +111,7 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
 
     Source: ours.
     """
-    from jaxvib.draw.comparison import CostPanel, cost_chart  # slow to import: only who draws pays
+    from jaxvib.draw.comparison import CostPanel, cost_chart  # slow import
 
     def panel(cost: Cost) -> CostPanel:
         names = list(dict.fromkeys(row[:3] for row in cost.rows))

@@ -147,7 +147,7 @@ class GradientCheck(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.comparison import steps_chart  # slow to import: only who draws pays
+        from jaxvib.draw.comparison import steps_chart  # slow import
 
         off = np.abs(self.sweep - self.gradient[0][:, None]) / _scale(self.difference)[:, None]
         best = np.abs(self.difference - self.gradient[0]) / _scale(self.difference)

@@ -64,7 +64,7 @@ class HarmonicConvergence(Result):
         **Returns** a matplotlib figure, or the given `ax`.
         """
         names = [f"{w:.4g} rad/s" for w in self.omega]
-        from jaxvib.draw.comparison import convergence_chart  # slow to import: only who draws pays
+        from jaxvib.draw.comparison import convergence_chart  # slow import
 
         return convergence_chart(self.harmonics, self.error, self.known, names=names, ax=ax)
 

@@ -69,7 +69,7 @@ class Tiers(Result):
             "amplitude": np.max(np.abs(self.leading.amplitude / self.exact.amplitude - 1.0), axis=1),
             "foundation force": np.abs(self.leading.foundation_force / self.exact.foundation_force - 1.0),
         }
-        from jaxvib.draw.comparison import tiers_chart  # slow to import: only who draws pays
+        from jaxvib.draw.comparison import tiers_chart  # slow import
 
         return tiers_chart(self.mass, differences, self.exact.stable, ax=ax)
 

@@ -97,7 +97,7 @@ class Audit(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
+        from jaxvib.draw.comparison import audit_chart  # slow import
 
         plain_names = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
         changes = {plain_names[name]: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}

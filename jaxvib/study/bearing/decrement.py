@@ -101,7 +101,7 @@ class Decrement(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import points_chart  # slow import
 
         return points_chart(self.estimates[:, None], across="pair of swings", up="mu1, N m s", ax=ax)
 

@@ -118,7 +118,7 @@ class Identified(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.record import record_chart  # slow to import: only who draws pays
+        from jaxvib.draw.record import record_chart  # slow import
 
         return record_chart(self.record.time, self.record.angle, self.fitted, self.noise, ax=ax)
 

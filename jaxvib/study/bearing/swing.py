@@ -134,7 +134,7 @@ class Swing(Result):
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """Plot angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure, or the given `ax`."""
-        from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
+        from jaxvib.draw.results import signals_chart  # slow import
 
         angle, rate = (np.asarray(x)[:, None] for x in (self.angle, self.rate))
         signals = [("angle, deg", np.rad2deg(angle), ["angle"]), ("rate, rad/s", rate, ["rate"])]

@@ -125,7 +125,7 @@ class Capture(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.capture import threshold_chart  # slow to import: only who draws pays
+        from jaxvib.draw.capture import threshold_chart  # slow import
 
         return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold), ax=ax)
 

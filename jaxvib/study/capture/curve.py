@@ -70,7 +70,7 @@ class ThresholdCurve(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.capture import curve_chart  # slow to import: only who draws pays
+        from jaxvib.draw.capture import curve_chart  # slow import
 
         return curve_chart(self.value, self.threshold, self.uncertainty, self.least, ax=ax)
 

@@ -70,7 +70,7 @@ class CriterionMap(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
-        from jaxvib.draw.criterion import agreement_maps  # slow to import: only who draws pays
+        from jaxvib.draw.criterion import agreement_maps  # slow import
 
         maps = [(f"drag x {d:.3g}", growth < 0.0) for d, growth in zip(self.drag_factor, self.growth, strict=True)]
         return agreement_maps(self.speeds, self.mass_factor, self.predicted, maps, unit=unit, ax=ax)

@@ -63,7 +63,7 @@ class StabilityMap(Result):
         for x, points in zip(self.value, self.special, strict=True):
             for point in points:
                 marks.setdefault(MARKS.get(point.kind, point.kind), []).append((point.omega, float(x)))
-        from jaxvib.draw.comparison import stability_chart  # slow to import: only who draws pays
+        from jaxvib.draw.comparison import stability_chart  # slow import
 
         return stability_chart(
             self.value, self.omega, self.stable, {k: np.array(v) for k, v in marks.items()}, label=label, unit=unit, ax=ax
