@@ -1,10 +1,10 @@
 """One exciter of a machine: its loads and its rotor, eliminated from the equations of motion.
 
-With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c a load obeys u'' = H^-1 (r - E a), a the
-acceleration of the point that carries it. It pushes that point with -(W a + g), W = m 1 - m J H^-1 E, g = m (J H^-1 r + c).
-E is m J^T, less the part of a friction that is proportional to the normal force of the load. A motor's rotor that is out of
-balance is one more such body. The sums over all loads, with their levers on the rows of the mount, are the added mass and the
-reaction of the exciter: the machine feels nothing else of it.
+With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, a load obeys u'' = H^-1 (r - E a). Here a is
+the acceleration of the point that carries the load, and E is m J^T minus the part of a friction that is proportional to the
+normal force of the load. The load exerts the force -(W a + g) on that point, with W = m 1 - m J H^-1 E and
+g = m (J H^-1 r + c). The unbalanced rotor of a motor is one more such body. The added mass and the reaction of the exciter
+are the sums over all loads, with their levers on the rows of the mount. The exciter acts on the machine through nothing else.
 """
 
 from __future__ import annotations
@@ -48,16 +48,21 @@ from jaxvib.numerics.linalg import small_inverse
 __all__ = ["Eliminated", "ExciterDynamics", "Motion", "RotorDynamics"]
 
 Axes = dict[int, Array]
-"""A vector (count,) for each axis, 0 across and 1 up."""
+"""Vectors (count,) by axis: 0 across, 1 up."""
 
 
 class Motion(NamedTuple):
-    """Motion of an exciter that is known before the accelerations.
+    """State of an exciter and the quantities that follow from it without the accelerations.
 
-    **Attributes**: `state`; the rotor's `speed`; `imbalance` of the rotor, see `RotorDynamics._imbalance`; `kinematics` of the
-    loads; `drag` (count,), the torque of the rotor on them; `weight`, the torque of gravity on the unbalance, None without one;
-    `rolling`, the forces on loads that all roll; `housing`, the speed at which the housing turns with the machine, None if it
-    does not.
+    **Attributes**
+
+    - `state`, and the rotor's `speed`
+    - `imbalance` of the rotor, see `RotorDynamics._imbalance`
+    - `kinematics` of the loads
+    - `drag` (count,): torque of the rotor on the loads
+    - `weight`: torque of gravity on the unbalance; None without an unbalance
+    - `rolling`: forces on the loads if all of them roll
+    - `housing`: speed at which the housing turns with the machine; None if it does not turn
     """
 
     state: ExciterState
@@ -71,11 +76,14 @@ class Motion(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """An exciter without the accelerations of its own parts; a are those of the rows of the mount.
+    """Exciter whose own accelerations are expressed by a, the accelerations of the mount's rows.
 
-    **Attributes**: loads move with u'' = `rate_without_carrier` - `accelerance` . a_j, a_j at each load, by axis; the exciter
-    pushes the rows with -(`added_mass` a + `reaction`); the rotor of a motor moves with theta'' = `rotor`[0] - `rotor`[1] . a,
-    None under an ideal drive.
+    **Attributes**
+
+    - `rate_without_carrier`, `accelerance`: loads move with u'' = `rate_without_carrier` - `accelerance` . a_j, where a_j is
+      the acceleration at each load, by axis
+    - `added_mass`, `reaction`: the force of the exciter on the rows is -(`added_mass` a + `reaction`)
+    - `rotor`: the rotor of a motor moves with theta'' = `rotor`[0] - `rotor`[1] . a; None under an ideal drive
     """
 
     rate_without_carrier: tuple[Array, ...]
@@ -85,7 +93,7 @@ class Eliminated(NamedTuple):
     rotor: tuple[Array, list[Array]] | None
 
     def change(self, a: Axes) -> tuple[Array, ...]:
-        """Return u'' from the accelerations of the points that carry the loads."""
+        """Return u'' from `a`, the accelerations of the points that carry the loads."""
         return tuple(
             f - sum(self.accelerance[axis][i] * x for axis, x in a.items()) for i, f in enumerate(self.rate_without_carrier)
         )
@@ -94,9 +102,14 @@ class Eliminated(NamedTuple):
 class RotorDynamics(eqx.Module):
     """Rotor of an exciter without loads.
 
-    **Attributes**: `levers` of the loads and `rotor_levers`, see `Mount`; `drive` in the direction of the exciter; `unbalance`
-    about the axis, kg m, or None; `effects`, prepared for the loads; `axes` of the mount; `row_count`, the number of entries of
-    the mount's rows that move loads or an unbalanced rotor.
+    **Attributes**
+
+    - `levers` of the loads and `rotor_levers`, see `Mount`
+    - `drive` in the direction of the exciter
+    - `unbalance` about the axis, kg m, or None
+    - `effects`, prepared for the loads
+    - `axes` of the mount
+    - `row_count`: number of entries of the mount's rows that move loads or an unbalanced rotor
     """
 
     levers: tuple[Array | None, ...]
@@ -113,30 +126,30 @@ class RotorDynamics(eqx.Module):
         return False
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
-        """Return everything that is known before the accelerations, the rotor turning at `speed`."""
+        """Return the quantities that do not need the accelerations, for a rotor that turns at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
         drag, weight = jnp.zeros_like(speed), self.weight(t, state)
         return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact, housing)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
-        """Solve for the own accelerations of the exciter. The friction of `contact` is linear in the accelerations."""
+        """Express the exciter's own accelerations by those of the mount. `contact` has friction linear in the accelerations."""
         n = self.row_count * len(self.axes)
         added_mass: list[list[Array | float]] = [[0.0] * n for _ in range(n)]
         rotor = self._add_rotor(motion, added_mass, [0.0] * n, motion.drag, {})
         return self._add_housing(motion, Eliminated((), {}, *rotor), motion.drag, {})
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
-        """Return the accelerations of the points that carry the loads, from those of the mount's rows."""
+        """Return the accelerations of the points that carry the loads from those of the mount's rows."""
         return {}
 
     def slide(self, motion: Motion, contact: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ContactSolution:
-        """Decide which loads slide, by the forces that their contacts need in the motion in which all of them roll."""
+        """Decide which loads slide, from the contact forces that the motion needs if all loads roll."""
         return contact
 
     def rates(self, motion: Motion, rolling: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ExciterState:
-        """Return the time derivative of the exciter's state, from the accelerations of the mount's rows.
+        """Return the time derivative of the exciter's state from the accelerations of the mount's rows.
 
-        `rolling`, the forces on loads that all roll, says how the slip of each load changes.
+        `rolling` contains the forces on the loads if all of them roll; the rate of each load's slip follows from it.
         """
         return ExciterState(rotor=self._rotor_rates(motion, part, a))
 
@@ -151,7 +164,10 @@ class RotorDynamics(eqx.Module):
         drag: Array,
         coupling: Axes,
     ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
-        """Return added mass and reaction with the rotor's imbalance, and the rotor's own acceleration as in `Eliminated`."""
+        """Add the rotor's imbalance to the added mass and the reaction.
+
+        **Returns** both, and the acceleration of the rotor, see `Eliminated.rotor`.
+        """
         motor = self._motor(motion)
         if motor is None:
             if motion.imbalance is not None:
@@ -173,9 +189,9 @@ class RotorDynamics(eqx.Module):
         return self.drive.torque_and_inertia(motion.speed if motion.housing is None else motion.speed - motion.housing)
 
     def _taken_torque(self, motion: Motion, drag: Array, coupling: Axes) -> tuple[Array, list[Array]]:
-        """Return the torque that loads, gravity and imbalance take from the rotor: the first + the second . a, N m.
+        """Return (T, c) of the torque T + c . a, N m, that loads, gravity and imbalance take from the rotor.
 
-        The second has an entry for each of the first rows of the mount, the others feel nothing.
+        c has an entry for each of the first rows of the mount; the torque does not depend on the other rows.
         """
         taken = self._total(drag)
         taken = taken if motion.weight is None else taken + motion.weight
@@ -186,7 +202,7 @@ class RotorDynamics(eqx.Module):
         return taken, [f + d for f, d in zip(by_loads, along, strict=False)] + along[len(by_loads) :]
 
     def _add_housing(self, motion: Motion, part: Eliminated, drag: Array, coupling: Axes) -> Eliminated:
-        """Add the row of the housing's turn, on which the torque of the drive reacts."""
+        """Add the row of the housing's rotation, which takes the reaction torque of the drive."""
         if motion.housing is None:
             return part
         motor, n = self._motor(motion), len(part.reaction)
@@ -200,7 +216,10 @@ class RotorDynamics(eqx.Module):
         return part._replace(added_mass=added_mass, reaction=[*part.reaction, torque], rotor=rotor)
 
     def _imbalance(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
-        """Return d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2: d(theta) is the imbalance on each row."""
+        """Return two derivatives of d(theta), the imbalance on each row of the mount; None without an imbalance.
+
+        The first is d'. The second is d'' theta'^2 under a motor, and the second time derivative of d under an ideal drive.
+        """
         terms = terms_of(self.effects, RotorImbalance)
         if not terms and self.unbalance is None:
             return None
@@ -229,7 +248,7 @@ class RotorDynamics(eqx.Module):
         return list(along), push
 
     def weight(self, t: Array, state: ExciterState) -> Array | None:
-        """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's angle."""
+        """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's rotation; None without either."""
         g = total_gravity(self.effects)
         if self.unbalance is None or 1 not in g:
             return None
@@ -251,7 +270,7 @@ class ExciterDynamics(RotorDynamics):
         return has_term(self.effects, SlipRelease)
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
-        """Return everything that is known before the accelerations, the rotor turning at `speed`."""
+        """Return the quantities that do not need the accelerations, for a rotor that turns at `speed`."""
         imbalance = self._imbalance(t, state)
         found = kinematics(self.loads, state.angle, state.rate)
         drag, force = self._forces(state, speed)
@@ -263,7 +282,10 @@ class ExciterDynamics(RotorDynamics):
         return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact, housing)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
-        """Solve loads and rotor for their own accelerations. The friction of `contact` is linear in the accelerations."""
+        """Express the accelerations of loads and rotor by those of the mount.
+
+        The friction of `contact` is linear in the accelerations.
+        """
         loads, axes, found = self.loads, self.axes, motion.kinematics
         drag, force, coupling = self._add_friction(motion.drag, contact)
         m = loads.mass
@@ -281,14 +303,14 @@ class ExciterDynamics(RotorDynamics):
         return self._add_housing(motion, part, drag, coupling[0])
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
-        """Return the accelerations of the points that carry the loads, from those of the mount's rows."""
+        """Return the accelerations of the points that carry the loads from those of the mount's rows."""
         n = len(self.axes)
         moved = (a[k : k + n] for k in range(0, len(a), n))
         terms = [[scaled(lever, x) for x in row] for lever, row in zip(self.levers, moved, strict=False)]
         return {axis: total(row[k] for row in terms) for k, axis in enumerate(self.axes)}
 
     def slide(self, motion: Motion, contact: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ContactSolution:
-        """Decide which loads slide, by the forces that their contacts need in the motion in which all of them roll."""
+        """Decide which loads slide, from the contact forces that the motion needs if all loads roll."""
         slip, state = self._slip(motion.state), motion.state
         if slip is None:
             return contact
@@ -316,13 +338,13 @@ class ExciterDynamics(RotorDynamics):
         return ExciterState(state.rate, change, rotor, spin)
 
     def centre_forces(self, state: ExciterState, speed: Array) -> list[Array]:
-        """Return the generalised forces at the centres of the loads, without those of their contacts, N m of an angle."""
+        """Return the generalised forces at the centres of the loads, without contact forces; N m for an angle."""
         return self._forces(state, speed, rotation=False)[1]
 
     def _forces(self, state: ExciterState, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
-        """Return the torque of the drag, and the generalised forces on the loads except friction.
+        """Return the torque of the drag, and the generalised forces on the loads without friction.
 
-        Without `rotation` the forces that turn a load about its own centre are left out.
+        If `rotation` is False, the forces that turn a load about its own centre are left out.
         """
         loads = self.loads
         torque = loads.resistance(state.angle, state.rate, speed)
@@ -340,8 +362,10 @@ class ExciterDynamics(RotorDynamics):
         return torque[0], force
 
     def _add_friction(self, drag: Array, contact: ContactSolution) -> tuple[Array, list[Array], list[Axes]]:
-        """Return drag and forces with the friction that does not depend on accelerations, and for each coordinate of a load
-        the friction per acceleration, by axis; {} if there is none."""
+        """Add the friction that does not depend on the accelerations to the drag and to the forces.
+
+        **Returns** both, and for each coordinate of a load the friction per acceleration, by axis; {} without such friction.
+        """
         force, coupling = list(contact.force), [dict[int, Array]() for _ in contact.force]
         for each in contact.friction:
             rubs = [lever * each.reaction for lever in (each.lever, *each.others)]
@@ -355,8 +379,10 @@ class ExciterDynamics(RotorDynamics):
     def _felt_by_mount(
         self, found: Kinematics, free: tuple[Array, ...], accelerance: Mapping[int, tuple[Array, ...]]
     ) -> tuple[list[list[Array | float]], list[Array | float]]:
-        """Return added mass and reaction of the loads. A row of the mount feels each load by the lever of the load there; rows
-        that move no load feel none."""
+        """Return added mass and reaction of the loads.
+
+        Each load acts on a row of the mount with its lever on that row, and not on rows that move no load.
+        """
         m, axes, levers = self.loads.mass, self.axes, self.levers
         across = {axis: [column[axis] for column in found.columns] for axis in axes}
         own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(across[i], accelerance[k]) for i in axes for k in axes}
@@ -374,7 +400,7 @@ class ExciterDynamics(RotorDynamics):
     def _slip_change(
         self, motion: Motion, slip: tuple[Array, ...], rolling: ContactSolution, change: tuple[Array, ...], at_loads: Axes
     ) -> tuple[Array, ...]:
-        """Return the rate of each slip: the force that rolling lacks over the inertia of a load's rotation."""
+        """Return the rate of each slip: the missing force of rolling divided by the inertia of a load's rotation."""
         force, state, loads = list(rolling.force), motion.state, self.loads
         for each in rolling.friction:
             for i, f in enumerate(each.linear(at_loads)):
@@ -407,16 +433,19 @@ class ExciterDynamics(RotorDynamics):
 
 
 def depends_on_acceleration(contact: ContactSolution) -> bool:
-    """True if a friction follows a normal force that depends on the accelerations."""
+    """True if a friction is proportional to a normal force that depends on the accelerations."""
     return any(each.normal is not None for each in contact.friction)
 
 
 def without_coupling(contact: ContactSolution) -> ContactSolution:
-    """Leave out friction that depends on the accelerations."""
+    """Return the contact without the friction that depends on the accelerations."""
     return contact._replace(friction=[each for each in contact.friction if each.normal is None])
 
 
 def signed(contact: ContactSolution, at_loads: Axes) -> ContactSolution:
-    """Make friction linear in the accelerations: its normal force has the sign that it has at `at_loads`."""
+    """Return the contact with friction that is linear in the accelerations.
+
+    Each normal force keeps the sign that it has at the accelerations `at_loads`.
+    """
     found: list[Friction] = [each if each.normal is None else each.signed(at_loads) for each in contact.friction]
     return contact._replace(friction=found)

@@ -1,4 +1,4 @@
-"""The linear carrier with its loads on it: natural frequencies, dynamic stiffness, answer to loads that turn together."""
+"""Linear carrier with its loads: natural frequencies, dynamic stiffness, response to loads that turn together."""
 
 from __future__ import annotations
 
@@ -65,31 +65,34 @@ __all__ = [
 
 
 TURNING_TERMS = (GravityField, LoadPotential, LoadInteraction, RotorImbalance)
-"""Terms that theories of turning loads include: the carrier stays linear, and the mean torque on loads that turn together is 0
-over a turn, to leading order of their mass."""
+"""Terms that theories of turning loads include.
+
+With them the carrier stays linear, and their mean torque over a turn on loads that turn together is 0 to leading order of the
+loads' mass.
+"""
 
 JAM_TERMS = (*TURNING_TERMS, ContactFriction)
 """Terms that theories of jams include."""
 
 
 _DIRECT = 3
-"""Number of coordinates up to which equations are written out, see `small_solve`."""
+"""Largest number of coordinates for which `small_solve` writes the equations out."""
 
 
 class FrequencyStatus(eqx.Enumeration):
-    """Outcome of a computation of natural frequencies; the members are the sentences a user reads."""
+    """Outcome of a computation of natural frequencies; each member is the sentence that a user reads."""
 
     done = "the answer was computed"
     lost_digits = "rounding hides a natural frequency: use double precision, or stiffnesses and masses that differ less"
 
 
 class LinearModel(Model):
-    """A model with the loads on it as masses that move with the machine.
+    """Model whose loads are masses that move with the machine.
 
         D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
 
-    **Attributes**, besides those of `Model`: `mass` M (nd, nd) kg, each load's at its own place; `modal`, its modal form, see
-    `JammedModel.decomposed`.
+    **Attributes**, in addition to those of `Model`: `mass` M (nd, nd) kg, with each load at its own place; `modal`, the modal
+    form of the model, see `JammedModel.decomposed`.
     """
 
     mass: Array
@@ -97,38 +100,41 @@ class LinearModel(Model):
 
     @property
     def direction(self) -> Array:
-        """B^T e (nd,) complex: the force on the coordinates of a unit force that turns at the mount is Re(B^T e exp(i w t))."""
+        """B^T e (nd,) complex. A unit force that turns at the mount acts on the coordinates with Re(B^T e exp(i w t))."""
         return self.mount.rows[0].T @ turning(self.mount)
 
     def damping(self, speed: Array) -> Array:
-        """C + n G (nd, nd) N s/m at the rotor's `speed` n, rad/s, or the mean speed of several rotors."""
+        """Return C + n G (nd, nd) N s/m at the rotor's `speed` n, rad/s, or at the mean speed of several rotors."""
         damping, gyroscopic = self.carrier.damping, self.mounts[0].gyroscopic
         return damping if gyroscopic is None else damping + speed * gyroscopic
 
     def dynamic_stiffness(self, omega: Array, speed: Array | None = None) -> Array:
-        """D(w) (nd, nd) complex, N/m: force per displacement at frequency `omega` (scalar, rad/s).
+        """Return D(w) (nd, nd) complex, N/m: force per displacement at the frequency `omega` w (scalar, rad/s).
 
-        n is the rotor's `speed`, rad/s; if None, loads and rotor turn together at w.
+        n is the rotor's `speed`, rad/s. If it is None, the rotor turns with the loads at w.
         """
         damping = self.damping(omega if speed is None else speed)
         return jax.lax.complex(self.carrier.stiffness - omega**2 * self.mass, omega * damping)
 
     def dissipated(self, velocity: Array) -> Array:
-        """Mean power, W, that the carrier's damping takes from a periodic motion: sum_k V_k^H C V_k / 2.
+        """Return the mean power, W, that the carrier's damping dissipates in a periodic motion: sum_k V_k^H C V_k / 2.
 
-        **Arguments**: `velocity` V (nd, K) or (nd,), complex amplitudes of the coordinates' rates.
+        **Arguments**: `velocity` V (nd, K) or (nd,), the complex amplitudes of the coordinates' rates.
         """
         return jnp.vdot(velocity, self.carrier.damping @ velocity).real / 2.0
 
     def modes(self) -> tuple[Array, Array]:
-        """Undamped natural frequencies (nd,) rad/s, ascending, and mass-normalised mode shapes (nd, nd), a column a mode."""
+        """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mode shapes (nd, nd).
+
+        Each column is one mode, normalised by the mass matrix.
+        """
         square, inverse = relative_to(self.mass, self.carrier.stiffness)
         values, vectors = hermitian_modes(square)
         return root_or_zero(values), inverse.T @ vectors
 
 
 def linear_model(scene: Scene) -> LinearModel:
-    """Return the model of a scene with the loads on it, see `LinearModel`."""
+    """Return the linear model of a scene with its loads, see `LinearModel`."""
     model = assemble(scene)
     mass = model.carrier.mass
     for exciter, mount in zip(scene.exciters, model.mounts, strict=True):
@@ -144,10 +150,12 @@ def linear_model(scene: Scene) -> LinearModel:
 
 
 class JammedModel(LinearModel):
-    """A linear model whose loads are jammed: checked, and what is the same at all load speeds computed, once a question.
+    """Linear model of a scene with jammed loads.
 
-    **Attributes**, besides those of `LinearModel`: `unbalance` S of the coincident loads, kg m; `drag` sum b_W R^2,
-    N m s; `force_direction` (nd,) complex, the `direction` of their force.
+    The scene is validated, and the quantities that are the same at all load speeds are computed, once for each analysis.
+
+    **Attributes**, in addition to those of `LinearModel`: `unbalance` S of the coincident loads, kg m; `drag` sum b_W R^2,
+    N m s; `force_direction` (nd,) complex, the `direction` of the loads' force.
     """
 
     unbalance: Array
@@ -156,15 +164,15 @@ class JammedModel(LinearModel):
 
     @property
     def loads(self) -> CircularLoads:
-        """The scene's loads."""
+        """Loads of the scene."""
         return cast(CircularLoads, self.scene.loads)
 
     def force(self, omega: Array) -> Array:
-        """Amplitudes (nd,), N, of the force of loads that turn at `omega` on the coordinates."""
+        """Return the amplitudes (nd,), N, of the force on the coordinates of loads that turn at `omega`."""
         return self.unbalance * omega**2 * self.force_direction
 
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
-        """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
+        """Return `steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
         if self.mount.gyroscopic is not None and speed is None:
             problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
@@ -173,7 +181,7 @@ class JammedModel(LinearModel):
             return small_solve(self.dynamic_stiffness(omega, speed), self.force(omega))
 
         def product(y: Array) -> Array:
-            """D(w) y: the matrices, of which derivatives are taken, not their eigenvectors."""
+            """Return D(w) y from the matrices: derivatives are those of the matrices, not of their eigenvectors."""
             carrier = self.carrier
             elastic, inertia, viscous = (_real_times(a, y) for a in (carrier.stiffness, self.mass, carrier.damping))
             return elastic - omega**2 * inertia + 1j * omega * viscous
@@ -186,14 +194,17 @@ class JammedModel(LinearModel):
     def forward_acceleration(self, omega: Array) -> Array:
         """Return w^2 e^H B Y (scalar, m/s^2) at the load speed `omega`: minus the forward circular acceleration of the mount.
 
-        In modal form, if the model has one, it costs O(nd) and has no derivatives by numbers of the scene.
+        If the model has a modal form, the cost is O(nd), and derivatives with respect to numbers of the scene are missing.
         """
         if self.modal is None:
             return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))
         return self.modal.receptance(omega, self.unbalance * omega**4)
 
     def decomposed(self) -> JammedModel:
-        """This model with its modal form, for many load speeds; up to 3 coordinates a solution takes no longer."""
+        """Return this model with its modal form, which is faster for many load speeds.
+
+        Models of up to 3 coordinates are returned without it, because a direct solution takes no longer.
+        """
         if self.mass.shape[0] <= _DIRECT or self.mount.gyroscopic is not None:
             return self
         frozen = jax.lax.stop_gradient(self)
@@ -205,12 +216,12 @@ class JammedModel(LinearModel):
 
 
 def _real_times(matrix: Array, vector: Array) -> Array:
-    """Real matrix times complex vector, at half the cost of a complex matrix."""
+    """Return the product of a real matrix and a complex vector, at half the cost of that with a complex matrix."""
     return jax.lax.complex(matrix @ vector.real, matrix @ vector.imag)
 
 
 def jammed_model(scene: Scene) -> JammedModel:
-    """The scene's carrier with jammed loads on it, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
+    """Return the carrier of a scene with its jammed loads, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
     loads, model = jammed_loads(scene), linear_model(scene)
     linear = model.scene, model.carrier, model.mounts, model.supports, model.mass
     return JammedModel(*linear, loads.unbalance(), loads.drag_sum(), model.direction)
@@ -246,13 +257,13 @@ def natural_frequencies(scene: Scene) -> Array:
 
 
 def estimated_frequencies(scene: Scene) -> Array:
-    """`natural_frequencies` with the digits that rounding leaves: for marks in figures and choices of step sizes."""
+    """Return `natural_frequencies` without the error for lost digits, for marks in figures and choices of step sizes."""
     return _natural_frequencies(validate_scene(scene))[0]
 
 
 @cached
 def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
-    """Natural frequencies (nd,) rad/s, and which of them rounding hides."""
+    """Return the natural frequencies (nd,) rad/s, and for each True if rounding hides it."""
     model = linear_model(scene)
     frequencies, shapes = model.modes()
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
@@ -264,15 +275,15 @@ def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
 
 
 def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
-    """Complex amplitudes Y (nd,) m of the carrier under loads that turn together at `omega` (scalar, rad/s).
+    """Return the complex amplitudes Y (nd,) m of the carrier under loads that turn together at `omega` (scalar, rad/s).
 
         (K - w^2 (M + sum m_j B^T B) + i w (C + n G)) Y = S w^2 B^T e,     q(t) = Re(Y exp(i w t)),    S = sum m_j R_j
 
-    the angle of the loads being w t. It is the limit of light loads (eps -> 0) of a jam. The rotor's `speed` n, rad/s, is
-    needed if the carrier has a gyroscopic matrix G.
+    The angle of the loads is w t. The result is the limit of light loads (eps -> 0) of a jam. If the carrier has a gyroscopic
+    matrix G, the rotor's `speed` n, rad/s, is needed.
 
-    **Returns** (nd,) complex. **Raises** `InputError` for a carrier with a gyroscopic matrix where no speed is given, loads at
-    stations of their own, a motor in place of a given speed, and effects that this theory leaves out.
+    **Returns** (nd,) complex. **Raises** `InputError` for a carrier with a gyroscopic matrix if `speed` is None, for loads at
+    different stations, for a motor instead of an ideal drive, and for effects that this theory does not include.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
@@ -286,31 +297,34 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
 
 
 def turning(mount: Mount) -> Array:
-    """e (np,): a point that turns at a speed w with unit radius moves by Re(e exp(i w t)) in the mount's directions."""
+    """Return e (np,): a point on a unit circle with angle w t moves by Re(e exp(i w t)) in the mount's directions."""
     return jnp.asarray([(1.0, -1.0j)[axis] for axis in mount.axes])
 
 
 def peak_force(force: Array) -> Array:
-    """The root of the summed squares of the peaks of a force's directions, N, from its complex amplitudes (nb,) N."""
+    """Return the root of the sum of the squared peaks in all directions, N, of a force with complex amplitudes (nb,) N."""
     return magnitude(force[0]) if force.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(force) ** 2))
 
 
 def circular_loads(scene: Scene) -> CircularLoads:
-    """The scene's loads, where a formula holds for loads on a circle at one point of the machine only."""
+    """Return the loads of a scene, for a formula that holds only for loads on a circle at one point of the machine."""
     loads = turning_loads(scene)
     require_one_point(scene)
     return loads
 
 
 def jammed_loads(scene: Scene) -> CircularLoads:
-    """The same where a formula is that of jams: loads that slip on the rotor, with or without dry friction."""
+    """Return the loads of a scene, for a formula of jams: the loads slip on the rotor, with or without dry friction.
+
+    Otherwise the requirements are those of `circular_loads`.
+    """
     loads = turning_loads(scene, JAM_TERMS)
     require_one_point(scene)
     return loads
 
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
-    """**Raises** `InputError` where it is known that no load has drag, or of `each` that one has none."""
+    """**Raises** `InputError` if no load has drag or, with `each`, if one load has none. Traced numbers are not checked."""
 
     def check(drag: np.ndarray | float) -> None:
         if not (np.all if each else np.any)(np.asarray(drag) > 0.0):
@@ -320,7 +334,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 
 def require_one_point(scene: Scene) -> None:
-    """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
+    """**Raises** `InputError` if the loads have different stations along the machine's axis."""
     if not scene.mounting().at_one_point:
         problem = (
             "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
@@ -329,10 +343,10 @@ def require_one_point(scene: Scene) -> None:
 
 
 def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS) -> CircularLoads:
-    """Return the loads of a scene, for a theory of loads on circles that a drive of given speed turns.
+    """Return the loads of a scene, for a theory of loads on circles in a rotor of prescribed speed.
 
-    **Raises** `InputError` for loads that are not `circular` and a drive that is not `ideal`, naming the property, and for
-    effects with terms that are not among the `included` ones, naming these.
+    **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`, and names the property; for
+    effects with terms that are not `included`, and names these terms.
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
@@ -358,9 +372,10 @@ def require_terms(
     problem: str = "is|are not part of this theory",
     advice: str = "here, or simulate",
 ) -> None:
-    """Check that a theory includes every term of the `effects`.
+    """Require that a theory includes every term of the `effects`.
 
-    **Arguments**: `problem`, the sentence about other effects: a verb for one effect and, after |, for several, and the rest.
+    **Arguments**: `problem`, the sentence about other effects. It begins with the verb for one effect, then | and the verb
+    for several effects. `advice`: end of the sentence that advises to leave the effects out.
 
     **Raises** `InputError` that names all effects with other terms, and the types of these terms.
     """

@@ -67,11 +67,11 @@ SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "
 T = TypeVar("T")
 
 Tables: TypeAlias = dict[str, Any]
-"""Content of a file before its validation: tables, arrays, texts, numbers, by name."""
+"""Tables, arrays, texts and numbers of a file by name, before validation."""
 
 
 def suggest_name(name: str, allowed: list[str]) -> str:
-    """Return the end of an error message about a name: the most similar allowed name, and all allowed names."""
+    """Return the end of an error message about an unknown name: the most similar allowed name, and all allowed names."""
     near = difflib.get_close_matches(name, allowed, n=1)
     meant = f"did you mean {near[0]!r}? " if near else ""
     return f"{meant}allowed: {', '.join(allowed)}"
@@ -101,7 +101,7 @@ def _tables(text: str, name: str) -> Tables:
 
 
 def _require_plain(value: object, name: str) -> None:
-    """**Raises** `InputError` for control characters in names and texts, which a terminal would obey."""
+    """**Raises** `InputError` for control characters in names and texts, because a terminal would execute them."""
     if isinstance(value, Mapping):
         for key, entry in value.items():
             _require_plain(key, name)
@@ -123,7 +123,9 @@ _MARKS = {
 
 
 def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> InputError:
-    """Return the error for an unknown `name` in a file of a `kind`: a similar name, or the kind of file that it is instead.
+    """Return the error for an unknown `name` in a file of a `kind`.
+
+    The error suggests a similar name or, if the names belong to another kind of file, names that kind.
 
     >>> str(misplaced_name("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
     'machine is no part of a design file: this is a scene file'
@@ -278,7 +280,7 @@ def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -
 
 
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
-    """Return `build(**values)`. **Raises** `InputError` for unknown and missing names, as fields of `section`."""
+    """Return `build(**values)`. **Raises** `InputError` for unknown and missing names, which it names as `section.name`."""
     parameters = inspect.signature(build).parameters
     prefix = f"{section}." if section else ""
     for name in values:
@@ -291,7 +293,7 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
 
 
 def _built_list(tables: object, section: str) -> object:
-    """Return the supports of a list of tables; other values are for the constructor."""
+    """Return the supports of a list of tables. Other values are returned unchanged; the constructor validates them."""
     if not isinstance(tables, list) or not all(isinstance(each, Mapping) for each in tables):
         return tables
     supports = []
@@ -302,7 +304,7 @@ def _built_list(tables: object, section: str) -> object:
 
 
 def rebuild_part(part: Any, section: str) -> Any:
-    """Build a part of a scene again from its numbers, which validates them. Parts from outside the package are returned."""
+    """Build a part of a scene again from its numbers, which validates them. Return parts from outside the package unchanged."""
     build = {**_MACHINES, **_LOADS, **DRIVES, **EFFECTS}.get(part.kind)
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
@@ -373,9 +375,10 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
         elif isinstance(value, (int, str)):
             fields[name] = value
         else:
-            # A machine's single value is written as a number; one load's own value stays a list, apart from a shared one.
+            # An array with one value is written as a number for a machine. For loads it stays a list, because a list of one
+            # load's value differs from a value that all loads share.
             plain = when_known(partial(_plain, unwrap=isinstance(part, Machine)), value)
-            fields[name] = value if plain is None else plain  # a traced value is for the constructor, not for a file
+            fields[name] = value if plain is None else plain  # `rebuild_part` passes traced values to the constructor
     return fields
 
 
@@ -454,4 +457,4 @@ exciter = 4                           # the platform with the auto-balancer
     **ROTORS,
     "torus": TORUS,
 }
-"""Commented scene files for every kind of machine, and for a rotor with balls in a torus."""
+"""Scene files with comments for every kind of machine, and for a rotor with balls in a torus."""

@@ -40,9 +40,10 @@ BALL_RADIUS = unit("m", low=0.0, open_low=True, words="radius of each {load}")
 
 
 class NormalForce(NamedTuple):
-    """Normal force N = `reaction` + `normal` . a of each load on its track, a the acceleration of the point that carries it.
+    """Normal force N = `reaction` + `normal` . a of each load on its track.
 
-    `reaction` (count,) N; `normal` (across, up) in kg, (count,) each.
+    a is the acceleration of the point that carries the load. `reaction` (count,) is in N, `normal` (across, up) in kg, (count,)
+    each.
     """
 
     reaction: Array
@@ -54,12 +55,12 @@ class NormalForce(NamedTuple):
 
 
 class DrillingSpin(NamedTuple):
-    """Dynamics of the spin s of each load about the normal of its contact, relative to its track.
+    """Dynamics of the drilling spin s of each load: its spin about the normal of its contact, relative to its track.
 
     - `rate` s' (count,) rad/s^2 of a free spin
-    - `force`, generalised forces per s, a (count,) array for each coordinate
-    - `inertia`, kg m^2, of the energy inertia s^2/2
-    - `still`, s (count,) rad/s of a load that does not rotate in space
+    - `force`: generalised forces per s, a (count,) array for each coordinate
+    - `inertia`, kg m^2; the energy of the spin is inertia s^2/2
+    - `still`: the s (count,) rad/s of a load that does not rotate in space
     """
 
     rate: Array
@@ -132,7 +133,7 @@ class Loads(Part):
     def tangent_lengths(self) -> tuple[Array, ...] | None:
         """Return |dp/du_i| m if they are constant along the track and the tangents are orthogonal; otherwise None.
 
-        J^T J is then a constant diagonal matrix, and J^T (dJ/dt) u' = 0, J = dp/du: the equations need to compute neither.
+        With J = dp/du, J^T J is then a constant diagonal matrix and J^T (dJ/dt) u' = 0; the equations compute neither.
         """
         return None
 
@@ -185,7 +186,10 @@ class Loads(Part):
         return jnp.zeros((self.count,), dtype=jnp.result_type(self.mass))
 
     def natural_frequency(self, speed: Array) -> Array | None:
-        """Return the natural frequency of the loads, rad/s, which steps must resolve beside the rotor's `speed`; or None."""
+        """Return the natural frequency of the loads, rad/s, which steps must resolve in addition to the rotor's `speed`.
+
+        None if there is no such frequency.
+        """
         return None
 
 
@@ -309,20 +313,23 @@ def _circular(
 
 
 def _fit(loads: CircularLoads, r: Array) -> None:
-    """**Raises** `InputError` for loads with a radius that have no room side by side."""
+    """**Raises** `InputError` if the loads, of radius `r`, have no room side by side."""
     if not loads.alike:
         raise InputError("loads.ball_radius", "is for loads that share every number; give one mass, radius and drag for all")
     when_known(partial(require_side_by_side, loads.count), loads.radius, r)
 
 
 def side_by_side(count: int, ratio: Array) -> Array:
-    """Return (2 j - N + 1) arcsin(r/R), (count,) rad: angles about their middle of loads that touch, `ratio` r/R."""
+    """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of loads that touch, relative to their middle.
+
+    `ratio` is r/R.
+    """
     angle = jnp.arcsin(ratio)
     return jnp.arange(1 - count, count, 2, dtype=angle.dtype) * angle
 
 
 def require_side_by_side(count: int, radius: float, ball_radius: float) -> None:
-    """**Raises** `InputError` if `count` loads with a radius have no room side by side on a circle of `radius`, m."""
+    """**Raises** `InputError` if `count` loads of `ball_radius`, m, have no room side by side on a circle of `radius`, m."""
     most = radius * (1.0 if count == 1 else math.sin(math.pi / count))
     if not ball_radius < most:
         problem = f"{count} side by side on a circle of {radius:.6g} m have room below {most:.6g} m"

@@ -25,7 +25,7 @@ from jaxvib.units.known import when_known
 __all__ = ["Exciter", "Scene", "read_effects", "require_comparable"]
 
 _MIN_RATIO = 1e-15
-"""Ratio of two numbers below which double precision loses the smaller one in a sum."""
+"""Ratio of two numbers below which a sum in double precision loses the smaller one."""
 
 
 class Exciter(Part):
@@ -161,7 +161,7 @@ class Scene(Part):
             exciters = _read_exciters(exciters, loads, drive, rotating)
         self.machine, self.exciters, self.effects = machine, exciters, shared
         for term in terms_of(self.all_effects, SupportForce):
-            term.rows(machine)  # a place that the machine does not have is an error
+            term.rows(machine)  # raises for a place that the machine does not have
         for k, exciter in enumerate(exciters):
             if exciter.loads is not None:
                 for effect in shared:
@@ -192,13 +192,15 @@ class Scene(Part):
 
     @property
     def is_plain(self) -> bool:
-        """True for one exciter of loads on a balanced rotor that turns anticlockwise, the scenes of all theories."""
+        """True for one exciter with loads on a balanced rotor that turns anticlockwise. All theories include such scenes."""
         return len(self.exciters) == 1 and self.exciters[0].is_plain
 
     @property
     def loads(self) -> Loads:
-        """Loads of a scene with one exciter that turns anticlockwise and has no `unbalance`: theories that read this know no
-        others. **Raises** `InputError` otherwise."""
+        """Loads of a scene with one exciter that turns anticlockwise and has no `unbalance`.
+
+        **Raises** `InputError` for other scenes, which the theories that read this property do not include.
+        """
         exciter = self._anticlockwise()
         if exciter.loads is None or not exciter.is_plain:
             problem = "has an unbalance; this is for loads on a balanced rotor, simulate others"
@@ -244,12 +246,12 @@ class Scene(Part):
 
 
 def _read_position(at: Any) -> Array:
-    """Distance along an axis, or point (x, y)."""
+    """Return a distance along an axis, or a point (x, y), in m."""
     return numbers(at, "m", "at", 2) if isinstance(at, (list, tuple)) or np.ndim(at) > 0 else number(at, "m", "at")
 
 
 def _require_stations(machine: Machine, exciter: Exciter) -> None:
-    """**Raises** `InputError` for a place that the machine does not have, and for another number of stations than of loads."""
+    """**Raises** `InputError` for a place that the machine does not have, and if there are not as many stations as loads."""
     loads = exciter.loads
     for levers in machine.mounting(exciter.at).levers:
         if levers is not None and (loads is None or levers.shape != (loads.count,)):
@@ -273,7 +275,7 @@ def _require_fit(machine: Machine, exciter: Exciter) -> None:
 
 
 def _acts_on_machine(effect: Effect) -> bool:
-    """True if an effect acts on the whole machine, otherwise it acts on one rotor and its loads."""
+    """True if an effect acts on the whole machine, False if it acts on one rotor and its loads."""
     return has_term([effect], GravityField, SupportForce)
 
 
@@ -285,7 +287,7 @@ def _require_part(name: str, part: object, kind: type, example: str) -> None:
 def _read_exciters(
     exciters: Sequence[Exciter], loads: Loads | None, drive: Drive | None, effects: tuple[Effect, ...]
 ) -> tuple[Exciter, ...]:
-    """Return the exciters of a scene. `effects` of the rotor are those of the only one."""
+    """Return the exciters of a scene. The `effects` of a rotor are added to the only exciter."""
     if loads is not None or drive is not None:
         raise InputError("exciters", "are given beside loads or drive; give these to an Exciter")
     if not isinstance(exciters, (tuple, list)) or len(exciters) == 0:
@@ -301,7 +303,10 @@ def _read_exciters(
 
 
 def read_effects(effects: object) -> tuple[Effect, ...]:
-    """Return effects in the order of scene files. **Raises** `InputError` for others and for effects that occur twice."""
+    """Return effects in the order of scene files.
+
+    **Raises** `InputError` for values that are not effects, and for effects that occur twice but may occur only once.
+    """
     if isinstance(effects, Effect):
         effects = (effects,)
     if not isinstance(effects, (tuple, list)):
@@ -318,15 +323,15 @@ def read_effects(effects: object) -> tuple[Effect, ...]:
 
 
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
-    """**Raises** `InputError` if rounding loses one of two numbers that are known.
+    """**Raises** `InputError` if rounding loses one of two numbers that are added. Traced numbers are not checked.
 
-    This happens for loads too heavy or too light for the machine, and for drag too weak for their inertia.
+    This happens if the loads are too heavy or too light for the machine, or their drag is too weak for their inertia.
     """
     parts = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None), drive.speed
     when_known(functools.partial(_require_comparable, loads.count), *parts)
 
 
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # shares of the largest and least numbers there are
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # ratios of the largest and smallest floating-point numbers
 def _require_comparable(
     count: int, platforms: np.ndarray | float | None, mass: np.ndarray | float, drag: np.ndarray | float | None, speed: float
 ) -> None:
