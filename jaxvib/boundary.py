@@ -1,8 +1,9 @@
-"""Arguments of public functions, checked against the types that their signatures name.
+"""Checks of the arguments of public functions against the annotations of their signatures.
 
-One decorator stands at every public function and at the public methods of results, so that None in place of a scene, a word
-in place of a count or a list in place of a function ends in one sentence before anything is traced. What a type cannot say
-(bounds, units, names of numbers) the function itself checks.
+The decorator `validated` is applied to every public function and to the public methods of results. An argument of a wrong type,
+such as None in place of a scene, a text in place of a count or a list in place of a function, therefore raises an error with a
+message of one sentence before anything is traced. Each function itself checks the properties that a type does not express:
+bounds, units and names of numbers.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from jaxvib.errors import InputError, quoted, require_path
 __all__ = ["call_user", "is_real", "is_whole", "validated"]
 
 _MAX_ENTRIES = 10**7
-"""The longest list whose entries are looked at one by one."""
+"""Largest length of a list; longer lists are refused, since each entry is checked."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -49,10 +50,10 @@ _EXAMPLES = {
     "tolerances": "for example {'machine.stiffness': 0.05}, a share of 5 %",
     "changes": "for example {'drive.speed': '1200 rpm'}",
 }
-"""Examples of classes, and of arguments by their names."""
+"""Examples for error messages, by the name of a class or of an argument."""
 
 _MAX_WHOLE = 2**63 - 1
-"""The largest whole number that an array holds."""
+"""Largest integer of a NumPy array (int64)."""
 
 
 def validated(function: F) -> F:
@@ -81,7 +82,7 @@ def validated(function: F) -> F:
             checks.update(_annotations(function, signature))
         try:
             bound = signature.bind(*args, **kwargs)
-        except TypeError:  # the function itself raises it
+        except TypeError:  # the call raises the same error with Python's message
             return function(*args, **kwargs)
         for name, value in bound.arguments.items():
             kind = checks[name]
@@ -106,7 +107,7 @@ def validated(function: F) -> F:
 
 
 def _require_known(arguments: Mapping[str, Any]) -> None:
-    """**Raises** `InputError` for the first argument that holds a traced number."""
+    """Raise `InputError` for the first argument that contains a traced number."""
     for name, value in arguments.items():
         if any(map(_is_traced, jax.tree.leaves(value))):
             holder = type(value).__name__ if name == "self" else name
@@ -115,16 +116,16 @@ def _require_known(arguments: Mapping[str, Any]) -> None:
 
 
 def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> dict[str, Any]:
-    """Return the annotations of the parameters; `Any` for those that only type checkers can resolve."""
+    """Return the annotations of the parameters, with `Any` for annotations that only type checkers can resolve."""
     found = {}
     for name, parameter in signature.parameters.items():
         kind = Any if parameter.annotation is parameter.empty else parameter.annotation
         names = dict(inspect.unwrap(function).__globals__)
-        for _ in range(6):  # an alias may hold a text itself, and some names are imported by type checkers only
+        for _ in range(6):  # the value of an alias may be a string too, and some names are imported by type checkers only
             if not isinstance(kind, str):
                 break
             try:
-                kind = eval(kind, names)  # the package's own annotations
+                kind = eval(kind, names)  # safe, since annotations are code of this package
             except NameError as error:
                 names[error.name or ""] = _DRAWN.get(error.name or "", Any)
             except (TypeError, AttributeError):
@@ -135,7 +136,7 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
 
 
 class _ByName(type):
-    """Classes of matplotlib, which is imported when something is drawn: their instances are recognized by name."""
+    """Metaclass that recognizes instances of matplotlib's classes by name, since matplotlib is imported only for figures."""
 
     def __instancecheck__(cls, value: object) -> bool:
         return any(each.__name__ == cls.__name__ for each in type(value).__mro__)
@@ -145,7 +146,7 @@ _DRAWN = {name: _ByName(name, (), {}) for name in ("Axes", "Figure")}
 
 
 def is_real(value: object) -> bool:
-    """Return True for a real number or an array of real numbers, traced ones included; Booleans and dates are none."""
+    """Return True for a real number or an array of real numbers, also a traced one, and False for Booleans and dates."""
     if type(value) is float or type(value) is int:
         return True
     kind = getattr(value, "dtype", None)
@@ -162,14 +163,14 @@ _NEEDS_VALUE = (
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
-"""Errors of JAX about code that needs the value of a traced number."""
+"""Errors that JAX raises if code needs the value of a traced number."""
 
 
 def call_user(function: Callable[..., Any], field: str, *arguments: object) -> Any:
     """Return the result of a user's function.
 
-    **Raises** `InputError` for a function that cannot be called with these arguments, or needs the value of a number that JAX
-    traces. The function's own errors pass unchanged.
+    **Raises** `InputError` if the function cannot be called with these arguments, or if it needs the value of a traced number.
+    Other errors of the function pass unchanged.
 
     >>> call_user(lambda scene: scene, "make", 1.0, 2.0)
     Traceback (most recent call last):
@@ -182,19 +183,19 @@ def call_user(function: Callable[..., Any], field: str, *arguments: object) -> A
         raise InputError(field, "needs the value of a number that JAX traces; compute with jax.numpy in it") from error
     except TypeError as error:
         inside = error.__traceback__ and error.__traceback__.tb_next
-        if inside is not None:  # raised in the function, not by the call
+        if inside is not None:  # raised inside the function, not by the call itself
             raise
         several = f"{len(arguments)} values" if len(arguments) != 1 else quoted(*arguments)
         raise InputError(field, f"cannot be called with {several} ({error})") from error
 
 
 def is_whole(value: object) -> bool:
-    """Return True for a whole number of Python or NumPy; Booleans and spans of time are none."""
+    """Return True for an integer of Python or NumPy, and False for Booleans and time differences (`numpy.timedelta64`)."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
 
 
 def _require(value: Any, kind: Any, field: str) -> None:
-    """**Raises** `InputError` for a value that is not of that kind."""
+    """Raise `InputError` if the value does not match the annotation `kind`."""
     kinds = _alternatives(kind)
     if any(_is_number_with_unit(each) for each in kinds):
         return
@@ -225,7 +226,10 @@ def _require(value: Any, kind: Any, field: str) -> None:
 
 
 def _alternatives(kind: Any) -> tuple[Any, ...]:
-    """Return the members of a union, or the annotation itself; NumPy 2.5 defines `ArrayLike` by `type`, an alias of a union."""
+    """Return the members of a union; for any other annotation, return the annotation itself.
+
+    NumPy 2.5 defines `ArrayLike` as an alias of a union by a `type` statement, which has the union as its `__value__`.
+    """
     kind = getattr(kind, "__value__", kind)
     if typing.get_origin(kind) in (Union, types.UnionType):
         return tuple(each for member in typing.get_args(kind) for each in _alternatives(member))
@@ -233,12 +237,12 @@ def _alternatives(kind: Any) -> tuple[Any, ...]:
 
 
 def _other_classes(kinds: Sequence[Any]) -> tuple[type, ...]:
-    """Return the classes that a path may have in its place."""
+    """Return the classes of the annotation other than those of paths and None."""
     return tuple(each for each in kinds if isinstance(each, type) and each not in (str, Path, os.PathLike, type(None)))
 
 
 def _is_number_with_unit(kind: Any) -> bool:
-    """Return True for a part of `jaxvib.units.Number`: the reader of units checks it."""
+    """Return True for the member `Quantity` of `jaxvib.units.Number`. Such values are checked when their unit is read."""
     return getattr(kind, "__name__", "") == "Quantity" and getattr(kind, "_is_protocol", False)
 
 
@@ -247,12 +251,12 @@ def _accepts_all(kind: Any) -> bool:
 
 
 def _problem(value: Any, kind: Any) -> str | InputError | None:
-    """Return None for a value of that kind, else the words for what is needed, or the problem with an entry."""
+    """Return None for a value that matches the annotation, otherwise the allowed values in words or the error of an entry."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if kind is None or kind is type(None):
         return None if value is None else "None"
     if origin is Literal:
-        if isinstance(value, tuple({type(each) for each in inner})):  # the function says which words it knows
+        if isinstance(value, tuple({type(each) for each in inner})):  # the function itself lists the allowed values
             return None
         return " or ".join(map(quoted, inner)) if len(inner) < 3 else f"one of {', '.join(map(str, inner))}"
     if kind is bool:
@@ -287,7 +291,7 @@ def _words(name: str) -> str:
 
 
 def _is_traced(value: Any) -> bool:
-    """Return True for a value that JAX is tracing, by public means: `runtime` lies above this module."""
+    """Return True for a traced value. Only public functions of JAX are used, since this module must not import `runtime`."""
     try:
         return isinstance(value, jax.Array) and not value.devices()
     except jax.errors.ConcretizationTypeError:
@@ -295,14 +299,14 @@ def _is_traced(value: Any) -> bool:
 
 
 def _has_array(kind: Any) -> bool:
-    """Return True if an array is the only list of numbers that is allowed."""
+    """Return True if the annotation allows arrays, but no lists, other containers or numbers with units."""
     kinds = _alternatives(kind)
     others = any(typing.get_origin(each) is not None or _is_number_with_unit(each) for each in kinds)
     return any(map(_is_array, kinds)) and not others
 
 
 def _is_list(kind: Any) -> bool:
-    """Return True if lists and tuples are allowed and arrays are not."""
+    """Return True if the annotation allows lists or tuples, but no arrays."""
     kinds = _alternatives(kind)
     origins = [typing.get_origin(each) for each in kinds]
     lists = any(isinstance(each, type) and issubclass(each, (Sequence, list, tuple)) for each in origins)
@@ -342,7 +346,7 @@ def _problem_of_array(value: Any) -> str | None:
 
 
 def _problem_of_tree(value: Any) -> str | None:
-    if isinstance(value, Iterator):  # JAX takes none for a tree
+    if isinstance(value, Iterator):  # JAX does not treat an iterator as a tree
         return "an array of numbers, or a tree of arrays"
     return next(filter(None, map(_problem_of_array, jax.tree.leaves(value))), None)
 

@@ -1,6 +1,6 @@
 """Private interfaces of JAX, Equinox, diffrax and XLA that the project uses, each with a fallback.
 
-tests/runtime/test_compat.py has a test for each, which fails when a new version changes it.
+Each has a test in tests/runtime/test_compat.py, which fails if a new version changes the interface.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ __all__ = [
 ]
 
 _TESTED_JAXLIB = ((0, 10), (0, 12))
-"""First and last version of jaxlib (major, minor) whose flags are known, see `accepted_flags`."""
+"""First and last version (major, minor) of jaxlib with tested flags, see `accepted_flags`."""
 
 _REMOVED_FLAGS = {"--xla_cpu_use_fusion_emitters": (0, 11)}
-"""Flags of `prepare_cpu` that jaxlib no longer has, each with the first version without it."""
+"""Flags of `prepare_cpu` that were removed from jaxlib, with the first version (major, minor) that lacks each."""
 
 try:
     from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
@@ -74,13 +74,13 @@ except ImportError:
     if TYPE_CHECKING:
         raise
     ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
-"""Traced programs. `jax.extend.core` may change at any time; without it equations are integrated on arrays."""
+"""Classes of traced programs. `jax.extend.core` may change at any time; without it equations are integrated on arrays."""
 
 
 def rewritten(
     program: ClosedJaxpr, equations: Sequence[tuple[JaxprEqn, list[Var | Literal]]], results: list[Var | Literal]
 ) -> ClosedJaxpr:
-    """Return a program of these equations, each with its inputs, and results; the same program if JAX does not allow it."""
+    """Return the program with these equations, inputs and results; return it unchanged if JAX does not allow that."""
     try:
         changed = [equation.replace(invars=inputs) for equation, inputs in equations]
         return program.replace(jaxpr=program.jaxpr.replace(eqns=changed, outvars=results))
@@ -92,13 +92,13 @@ Atoms: TypeAlias = "list[Var | Literal]"
 """The inputs of an operation."""
 
 Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
-"""Operations, each with its inputs, that replace another one, and the variable that replaces its result."""
+"""Operations with their inputs that replace another operation, and the variable that replaces its result."""
 
 
 def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
-    """Return the single operation of a function of such arguments, with variables of its own."""
+    """Return the single operation of a function of arguments like `like`, with new variables."""
     shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (x.aval for x in like)]
-    # For the same function JAX would return the same program again, with the same variables.
+    # A new lambda, since JAX returns the cached program with the same variables if the function is the same.
     (equation,) = jax.make_jaxpr(lambda *x: function(*x))(*shapes).jaxpr.eqns
     return equation
 
@@ -108,7 +108,7 @@ Rule = TypeVar("Rule", bound=Callable)
 
 
 class _PlainVmap(Generic[Out]):
-    """Substitute for `jax.custom_batching.custom_vmap`: JAX's own rule, which batches operation by operation."""
+    """Substitute for `jax.custom_batching.custom_vmap` that keeps JAX's own rule, which batches operation by operation."""
 
     def __init__(self, function: Callable[..., Out]):
         self.function = function
@@ -121,11 +121,11 @@ class _PlainVmap(Generic[Out]):
 
 
 custom_vmap: type[_PlainVmap] = getattr(getattr(jax, "custom_batching", None), "custom_vmap", _PlainVmap)
-"""Function with a rule of its own for `vmap`. Without it the results are the same, but slower."""
+"""Decorator of functions with a custom rule for `vmap`. Without it, the results are the same, but take longer to compute."""
 
 
 def traced(value: object) -> bool:
-    """Return True if JAX is transforming the computation of `value`, which then has no number.
+    """Return True if JAX is transforming the computation of `value`, which is then a tracer without a number.
 
     >>> traced(1.0)
     False
@@ -140,28 +140,34 @@ def traced(value: object) -> bool:
 
 
 def primal_of(tracer: object) -> object | None:
-    """Return the value whose derivative or batch `tracer` represents; None if it is unknown, as inside `jit`."""
+    """Return the value whose derivative or batch `tracer` represents, or None if it has no value, for example inside `jit`."""
     kind = type(tracer).__name__
     return getattr(tracer, {"JVPTracer": "primal", "LinearizeTracer": "primal", "BatchTracer": "val"}.get(kind, ""), None)
 
 
 def value_of(number: object) -> object:
-    """Return the value that derivatives are taken at; a number under `jit` or `vmap`, which has none, as it is."""
+    """Return the value at which derivatives are taken; return a number unchanged if it has none, as under `jit` or `vmap`."""
     while type(number).__name__ in ("JVPTracer", "LinearizeTracer") and hasattr(number, "primal"):
         number = number.primal  # pyright: ignore[reportAttributeAccessIssue]
     return number
 
 
 def evaluating() -> contextlib.AbstractContextManager[None]:
-    """Evaluate operations on known numbers at once inside a transformation; without JAX's context they are traced."""
+    """Evaluate operations on concrete numbers immediately, also inside a transformation.
+
+    Without JAX's private context manager these operations are traced.
+    """
     context = getattr(getattr(jax, "core", None), "eval_context", contextlib.nullcontext)
     return context()
 
 
 @contextlib.contextmanager
 def without_source_locations() -> Iterator[None]:
-    """Trace without source locations of operations, and remember which files are JAX's own instead of searching for each
-    run-time check. This saves a tenth of the time until a program is compiled. Without JAX's names nothing changes."""
+    """Trace without source locations of operations.
+
+    The list of JAX's own files is also cached, because JAX otherwise searches it again for each run-time check. Both save a
+    tenth of the time until a program is compiled. If a name is missing in JAX, its part has no effect.
+    """
     limit = getattr(sys.modules.get("jax._src.config"), "traceback_in_locations_limit", None)
     frames = sys.modules.get("jax._src.traceback_util")
     with contextlib.ExitStack() as stack:
@@ -178,17 +184,18 @@ def _includes_file(filename: str) -> bool:
 
 
 def backend_started() -> bool:
-    """Return True if JAX has started a backend, so that compiler flags have no effect; False if that is unknown.
+    """Return True if JAX has started a backend, after which compiler flags have no effect; False if that is unknown.
 
-    Public functions start a backend when asked.
+    A private attribute is necessary, since the public functions of JAX start a backend.
     """
     return bool(getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", None))
 
 
 def accepted_flags(flags: list[str]) -> list[str]:
-    """Return the `flags` that this jaxlib knows: an unknown flag in XLA_FLAGS ends the process.
+    """Return those of the `flags` that this jaxlib supports, because an unknown flag in XLA_FLAGS ends the process.
 
-    Untested versions of jaxlib are tried in a separate process (seconds); the answer is stored in a file.
+    For an untested version of jaxlib each flag is tried in a separate process, which takes seconds; the outcome is stored in a
+    file.
     """
     version, number = importlib.metadata.version("jaxlib"), _jaxlib()
     if _TESTED_JAXLIB[0] <= number <= _TESTED_JAXLIB[1]:
@@ -207,9 +214,9 @@ def accepted_flags(flags: list[str]) -> list[str]:
 
 
 def loops_need_a_flag() -> bool:
-    """Return True for jaxlib before 0.12, which runs the body of a time loop as a chain of small functions without a flag.
+    """Return True for jaxlib before 0.12, which without a flag runs the body of a time loop as a chain of small functions.
 
-    Measured time without the flag over time with it: 2.4 for a run with jaxlib 0.10.2, 0.9 to 1.1 with 0.12.0.
+    Measured ratio of the time of a run without the flag to that with it: 2.4 with jaxlib 0.10.2, 0.9 to 1.1 with 0.12.0.
     """
     return _jaxlib() < (0, 12)
 
@@ -217,7 +224,7 @@ def loops_need_a_flag() -> bool:
 def wide_vectors_are_right(flags: list[str]) -> bool:
     """Return True if programs with vectors of 512 bits are correct under these XLA_FLAGS.
 
-    With the newer code generator of jaxlib 0.10 the arctangent of arrays of 64 numbers or more is then 0.
+    The newer code generator of jaxlib 0.10 is not: with such vectors the arctangent of an array of 64 or more numbers is 0.
     """
     return "--xla_cpu_use_fusion_emitters=false" in flags or _jaxlib() >= (0, 12)
 
@@ -239,7 +246,7 @@ _patches: dict[tuple[str, str], tuple[list[int], Any]] = {}  # threads inside, a
 
 @contextlib.contextmanager
 def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> Iterator[None]:
-    """Replace a function of a module in this thread; several threads may do so at the same time."""
+    """Replace a function of a module in the current thread only; several threads may do so at the same time."""
     key, thread = (module.__name__, name), threading.get_ident()
     with _patching:
         if key not in _patches:
@@ -260,7 +267,7 @@ def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> I
 
 
 def _unpatched(module: ModuleType | None, name: str) -> Any:
-    """Return a function of a module as it was before `_patched`; None if there is none."""
+    """Return the original function of a module, also while `_patched` replaces it; None if the module has no such function."""
     with _patching:
         known = _patches.get((getattr(module, "__name__", ""), name))
     return getattr(module, name, None) if known is None else known[1]
@@ -270,9 +277,9 @@ def _unpatched(module: ModuleType | None, name: str) -> Any:
 def no_host_checks() -> Iterator[None]:
     """Trace Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
 
-    Errors need a callback into Python, and a program with a callback cannot be stored on disk. Equinox's own switch,
-    EQX_ON_ERROR in the environment, is read at its import and holds for the whole process; if it differs from the default it
-    stays. Without Equinox's two attributes the checks stay as they are.
+    Errors need a callback into Python, and a program with a callback cannot be stored on disk. Equinox's own setting, the
+    environment variable EQX_ON_ERROR, is not sufficient: it is read when Equinox is imported, and applies to the whole process.
+    If it differs from the default, or if Equinox lacks one of the two attributes, the checks are not changed.
     """
     errors = sys.modules.get("equinox._errors")
     plain = getattr(errors, "branched_error_if_impl", None)
@@ -282,7 +289,7 @@ def no_host_checks() -> Iterator[None]:
         return
 
     def to_nan(*args: object, on_error: str) -> object:
-        # The function itself, not its compiled form, whose trace JAX would use again outside.
+        # The function without `jit`: JAX would use the trace of the compiled function again outside of this context.
         return plain(*args, on_error="nan" if on_error == "default" else on_error)
 
     with _patched(errors, "branched_error_if_impl_jit", to_nan):
@@ -290,7 +297,7 @@ def no_host_checks() -> Iterator[None]:
 
 
 class _Instead:
-    """Module with some of its names replaced."""
+    """Module in which some names are replaced."""
 
     def __init__(self, module: ModuleType, **names: object):
         self._module = module
@@ -301,7 +308,7 @@ class _Instead:
 
 
 _ULPS = 100
-"""Distance from the end of a time loop of diffrax, in units in the last place, within which a step ends there."""
+"""Distance from the end of diffrax's time loop, in units in the last place, within which a step is extended to the end."""
 
 _REPLACING = threading.RLock()
 
@@ -310,10 +317,11 @@ _ULPS_ONE_BY_ONE = re.compile(rf"for _ in range\({_ULPS}\):\s+t1_clip_floor = eq
 
 @contextlib.contextmanager
 def fast_diffrax_loop_end() -> Iterator[None]:
-    """Trace diffrax's time loops with one operation for the time `_ULPS` units in the last place before their end.
+    """Trace diffrax's time loops with a single computation of the time `_ULPS` units in the last place before the end.
 
-    diffrax takes as many steps of one unit, unrolled: 300 operations, 2000 of the compiler's, 0.4 s for each loop. If its code
-    differs from `_ULPS_ONE_BY_ONE`, nothing changes.
+    diffrax computes this time by `_ULPS` unrolled steps of one unit each. They add 300 operations to the program, 2000
+    operations in the compiler and 0.4 s of compile time for each loop. If diffrax's code does not match `_ULPS_ONE_BY_ONE`,
+    nothing is changed.
     """
     integrate = sys.modules.get("diffrax._integrate")
     loop, internals = _unpatched(integrate, "loop"), getattr(integrate, "eqxi", None)
@@ -332,7 +340,7 @@ def fast_diffrax_loop_end() -> Iterator[None]:
             left -= 1
             return x if left else ulps_below(x, _ULPS)
 
-        with _REPLACING:  # another thread may trace a loop of its own
+        with _REPLACING:  # another thread may trace another loop at the same time
             internals = integrate.eqxi
             setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
             try:
@@ -348,7 +356,7 @@ def fast_diffrax_loop_end() -> Iterator[None]:
 def _source(function: FunctionType) -> str:
     try:
         return inspect.getsource(function)
-    except (OSError, TypeError):  # Python without sources
+    except (OSError, TypeError):  # the source files are not installed
         return ""
 
 
@@ -359,7 +367,10 @@ def ulps_below(x: Array, number: int) -> Array:
 
 
 def enumeration_of(item: object) -> type[eqx.Enumeration]:
-    """Return the `equinox.Enumeration` of a member or an array of members. Without its attribute, read it from the text."""
+    """Return the `equinox.Enumeration` of a member or an array of members.
+
+    If Equinox lacks the attribute, the name of the enumeration is read from the representation.
+    """
     found = getattr(item, "_enumeration", None)
     if found is None:
         module, _, name = repr(item).split("<")[0].rpartition(".")
@@ -368,7 +379,10 @@ def enumeration_of(item: object) -> type[eqx.Enumeration]:
 
 
 def enumeration_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
-    """Return the names of the members in the order of their numbers. Without Equinox's table, read them from the source."""
+    """Return the names of the members in the order of their numbers.
+
+    If Equinox lacks its table of names, they are read from the source of the enumeration.
+    """
     known = getattr(enumeration, "_name_to_item", None)
     if known is not None:
         return tuple(known)
@@ -379,5 +393,5 @@ def enumeration_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
 
 
 def user_folder() -> Path:
-    """`$XDG_CACHE_HOME/jaxvib`, or `~/.cache/jaxvib`."""
+    """Return jaxvib's folder for cached files: `$XDG_CACHE_HOME/jaxvib`, or `~/.cache/jaxvib` if the variable is not set."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxvib"

@@ -1,6 +1,6 @@
-"""Functions whose compiled programs, and those of their derivatives, are cached on disk.
+"""Functions whose programs are cached on disk, together with the programs of their derivatives and batches.
 
-`README.md` beside this file explains how a cached gradient works.
+The file `README.md` in this folder explains how a cached gradient is computed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _Types: TypeAlias = tuple[tuple[tuple[int, ...], str, bool], ...]
-"""Shape, dtype and weak type of arrays."""
+"""Shape, dtype and weak-type flag of each array."""
 
 
 @overload
@@ -46,14 +46,14 @@ def cached(*, outputs_from_solution: Callable[..., Any] | None) -> Callable[[Cal
 
 
 def cached(function: Callable[P, T] | None = None, *, outputs_from_solution: Callable[..., Any] | None = None) -> Any:
-    """Compile a function of trees, as `equinox.filter_jit` does, and cache its programs on disk.
+    """Compile a function of trees like `equinox.filter_jit`, and cache its programs on disk.
 
-    First derivatives by `jax.jvp`, `grad`, `jacfwd`, `jacrev` and batches by `vmap` are programs of their own, which are cached
-    too. For derivatives of derivatives, and inside `jit`, JAX transforms the compiled function itself.
+    First derivatives by `jax.jvp`, `grad`, `jacfwd` and `jacrev`, and batches by `vmap`, are separate programs, which are also
+    cached. For derivatives of derivatives, and inside `jit`, JAX transforms the compiled function itself.
 
-    **Arguments**: `outputs_from_solution`: a function of the outputs and the arguments that returns the outputs again with the
-    same derivatives, without the search that found them, or None in place of outputs that it does not provide. Reverse
-    derivatives are taken of it, or of the whole function if an output is needed that it does not provide.
+    **Arguments**: `outputs_from_solution`: a function of the outputs and the arguments. It computes the outputs again, with the
+    same derivatives, but without the search for the solution; it may return None in place of an output. Reverse derivatives
+    are those of this function, or of the whole function if a needed output is None.
     """
     return (
         CachedFunction(function) if function else functools.partial(CachedFunction, outputs_from_solution=outputs_from_solution)
@@ -78,18 +78,18 @@ class CachedFunction(Generic[P, T]):
         except TypeError as error:
             if "forward-mode" not in str(error):
                 raise
-            # JAX's message about forward derivatives of the replay of steps, the default adjoint of time integration.
+            # JAX raises this error for forward derivatives of a run with the default adjoint, the replay of its steps.
             raise InputError(
                 "adjoint", "allows reverse derivatives only; for jvp and jacfwd of a run write adjoint=diffrax.ForwardMode()"
             ) from error
 
     def is_ready(self, *args: P.args, **kwargs: P.kwargs) -> bool:
-        """Return True if a call has no program to wait for: it is in memory, cannot be stored, or JAX is transforming."""
+        """Return True if a call need not wait for a program: it is in memory or cannot be stored, or an argument is traced."""
         leaves, treedef = jax.tree.flatten((args, kwargs))
         return any(map(traced, leaves)) or self.stored.is_ready(leaves, treedef)
 
     def prepare(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Read the program of a call from disk, or trace and compile it, without running it."""
+        """Read the program of a call from disk, or else trace it, and compile it without running it."""
         start()
         self.stored.compiled(*jax.tree.flatten((args, kwargs)))
 
@@ -103,36 +103,36 @@ class CachedFunction(Generic[P, T]):
 
 
 def _is_simple(tracer: object) -> bool:
-    """True if one derivative or one batch of known numbers is taken."""
+    """Return True if `tracer` belongs to a single derivative or batch, at a value that is not traced."""
     value = primal_of(tracer)
     return value is not None and not traced(value)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class _CallSignature:
-    """A function and its arguments, with slots in place of arrays; `outputs` holds the structure of its last result."""
+    """Function with its arguments, arrays replaced by slots; `outputs` contains the structure of the last result."""
 
     function: CachedFunction
     arguments: Skeleton
     outputs: list[Skeleton] = dataclasses.field(default_factory=list, compare=False)
 
     def __call__(self, arrays: Sequence[Array]) -> Any:
-        """Trace the function itself."""
+        """Call the original function, which is traced."""
         args, kwargs = self.arguments.filled(arrays)
         return self.function.stored.function(*args, **kwargs)
 
     def split(self, result: Any) -> list[Array]:
-        """Return the arrays of a result, and keep its structure for `result`."""
+        """Return the arrays of a result, and store its structure for the method `result`."""
         leaves, treedef = jax.tree.flatten(result)
         self.outputs[:] = [Skeleton.of(leaves, treedef)]
         return [leaf for leaf in leaves if eqx.is_array(leaf)]
 
     def result(self, arrays: Sequence[Array]) -> Any:
-        """Return the result with these arrays."""
+        """Return the result that has these arrays."""
         return self.outputs[0].filled(arrays)
 
     def outputs_from_solution(self, solution: Sequence[Array], arrays: Sequence[Array]) -> list[Array | None]:
-        """Return the outputs by the function of this name; None for outputs that it does not provide."""
+        """Return the outputs of the user's function `outputs_from_solution`, with None for those that it does not provide."""
         assert self.function.outputs_from_solution is not None
         args, kwargs = self.arguments.filled(arrays)
         result = self.result(solution)
@@ -145,10 +145,10 @@ class _CallSignature:
         return [part for part, x in zip(parts, jax.tree.leaves(result), strict=True) if eqx.is_array(x)]
 
     def is_describable(self) -> bool:
-        """Return True if a key on disk can identify the call."""
+        """Return True if the call can be described in a key of a stored program."""
         try:
             return _is_describable(self)
-        except TypeError:  # an argument without a hash
+        except TypeError:  # an argument is not hashable
             return False
 
 
@@ -165,13 +165,16 @@ def _is_describable(call: _CallSignature) -> bool:
     return True
 
 
-# --- programs of derivatives; `active` is True for arrays with a derivative, `wanted` for outputs with a cotangent ---
+# --- programs of derivatives; `active` is True for arrays with a tangent, `wanted` for outputs with a nonzero cotangent ---
 
 
 def _differentiable(
     call: _CallSignature, active: Sequence[bool], arrays: Sequence[Array]
 ) -> tuple[Callable[..., tuple[list[Array], list[Array]]], list[Array]]:
-    """Return a function of the active arrays, and these; it returns the floating-point outputs, and all outputs beside them."""
+    """Return a function of the active arrays, and these arrays.
+
+    The function returns the floating-point outputs and, as auxiliary data, all outputs.
+    """
 
     def function(*active_arrays: Array) -> tuple[list[Array], list[Array]]:
         outputs = call.split(call(_replaced(active, arrays, active_arrays)))
@@ -185,7 +188,7 @@ def _selected(active: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:
 
 
 def _replaced(active: Sequence[bool], arrays: Sequence[Array], active_arrays: Sequence[Array]) -> list[Array]:
-    """Return the arrays with others in place of the active ones."""
+    """Return the arrays with the active ones replaced by `active_arrays`."""
     others = iter(active_arrays)
     return [next(others) if is_active else x for is_active, x in zip(active, arrays, strict=True)]
 
@@ -198,7 +201,7 @@ def _is_inexact(x: Any) -> bool:
 def _jvp_program(
     call: _CallSignature, active: tuple[bool, ...], arrays: list[Array], tangents: list[Array]
 ) -> tuple[Any, list[Array]]:
-    """Return the result and the tangents of its floating-point outputs."""
+    """Return the result of a call and the tangents of its floating-point outputs."""
     function, active_arrays = _differentiable(call, active, arrays)
     _, output_tangents, outputs = jax.jvp(function, active_arrays, tangents, has_aux=True)
     return call.result(outputs), output_tangents
@@ -206,7 +209,7 @@ def _jvp_program(
 
 @cached
 def _vjp_forward(call: _CallSignature, active: tuple[bool, ...], arrays: list[Array]) -> tuple[Any, list[Array]]:
-    """Return the result and the residuals of the reverse derivative."""
+    """Return the result of a call and the residuals of its reverse derivative."""
     outputs, pullback = _pullback(call, active, arrays)
     return call.result(outputs), [leaf for leaf in jax.tree.leaves(pullback) if eqx.is_array(leaf)]
 
@@ -220,7 +223,7 @@ def _vjp_backward(
     residuals: list[Array],
     cotangents: list[Array],
 ) -> list[Array]:
-    """Return the cotangents of the active arrays; `types` are those of all arrays."""
+    """Return the cotangents of the active arrays; `types` are the types of all arrays."""
     pullback, zeros = _traced_pullback(call, active, types)
     nonzero = iter(cotangents)
     return apply_pullback(
@@ -238,7 +241,7 @@ def _vjp_from_solution(
     solution: list[Array],
     cotangents: list[Array],
 ) -> list[Array]:
-    """Return what `_vjp_backward` returns, by `outputs_from_solution`; `solution` are all outputs for these arrays."""
+    """Return the cotangents of the active arrays from `outputs_from_solution`; `solution` contains all outputs of the call."""
     inexact = [k for k, x in enumerate(solution) if _is_inexact(x)]
     needed = [k for k, is_wanted in zip(inexact, wanted, strict=True) if is_wanted]
 
@@ -256,7 +259,7 @@ def _vjp_from_solution(
 
 
 def _pullback(call: _CallSignature, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:
-    """Return the outputs and the pullback, and keep its form for `_traced_pullback`."""
+    """Return the outputs and the pullback, and store the form of the pullback for `_traced_pullback`."""
     function, active_arrays = _differentiable(call, active, arrays)
     inexact, pullback, outputs = jax.vjp(function, *active_arrays, has_aux=True)
     form = Skeleton.of(*jax.tree.flatten(pullback)), tuple(map(zero_of, inexact))
@@ -268,17 +271,17 @@ def _pullback(call: _CallSignature, active: tuple[bool, ...], arrays: Sequence[A
 
 
 MAX_PULLBACK_FORMS = 64
-"""Largest number of forms of pullbacks in memory, some 1 MB each. A form is needed when the backward program is traced, soon
-after the forward one or never."""
+"""Largest number of forms of pullbacks in memory, about 1 MB each. A form is needed only while the backward program is traced,
+which follows soon after the trace of the forward program, if at all."""
 
 _pullbacks: collections.OrderedDict[Hashable, tuple[Skeleton, tuple[Any, ...]]] = collections.OrderedDict()
 _keeping = threading.Lock()
 
 
 def _traced_pullback(call: _CallSignature, active: tuple[bool, ...], types: _Types) -> tuple[Skeleton, tuple[Any, ...]]:
-    """Return the pullback without its arrays, and zero cotangents of the floating-point outputs."""
+    """Return the skeleton of the pullback, without its arrays, and zero cotangents of the floating-point outputs."""
     key = code_state(), call, active, types
-    if key not in _pullbacks:  # `_vjp_forward` was read from disk
+    if key not in _pullbacks:  # `_vjp_forward` was read from disk and not traced
         arrays = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in types]
         jax.eval_shape(lambda *values: _pullback(call, active, values)[0], *arrays)
     return _pullbacks[key]
@@ -290,7 +293,7 @@ def _types(arrays: Sequence[Array]) -> _Types:
 
 @cached
 def _batched_program(call: _CallSignature, batched: tuple[bool, ...], arrays: list[Array]) -> Any:
-    """Return the results of a batch along the first axis of the `batched` arrays."""
+    """Return the results of a batch; the first axis of each `batched` array is the axis of the batch."""
     shares = _shares_result(call, batched)
 
     def one(*arrays: Array) -> Any:
@@ -303,7 +306,7 @@ def _batched_program(call: _CallSignature, batched: tuple[bool, ...], arrays: li
 
 
 def _shares_result(call: _CallSignature, batched: Sequence[bool]) -> bool:
-    """Return True if a batch consists of several tangents at one point, which have one result."""
+    """Return True if a batch consists of several tangents at the same point, and therefore has a single primal result."""
     if call.function is not _jvp_program:
         return False
     _, _, arrays, _ = call.arguments.tree[0]
@@ -323,7 +326,7 @@ def _differentiate(arrays: Sequence[Array], tangents: Sequence[Any], *, call: _C
     nonzero = [tangent for is_active, tangent in zip(active, tangents, strict=True) if is_active]
     if all(not traced(tangent) or _is_simple(tangent) for tangent in nonzero):
         result, output_tangents = _jvp_program(call, active, list(arrays), nonzero)
-    else:  # the tangents are unknown: JAX will transpose
+    else:  # the tangents have no values, because JAX will transpose the linear map
         if call.function.outputs_from_solution is not None:
             args, kwargs = call.arguments.filled(arrays)
             result = call.function(*args, **kwargs)
@@ -347,11 +350,10 @@ def _batch(arrays: Sequence[Array], axes: Sequence[Any], *, call: _CallSignature
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class _LinearizationPoint:
-    """Point at which a derivative is taken: arguments, residuals (with `outputs_from_solution` all outputs) and the types of
-    the floating-point outputs.
+    """Point of a linearization: the arguments, the residuals and the types of the floating-point outputs.
 
-    JAX formats the parameters of primitives for error messages whenever it batches them; without `repr=False` that would
-    format all numbers.
+    The residuals are all outputs if the function has `outputs_from_solution`. JAX formats the parameters of primitives for
+    error messages whenever it batches them; `repr=False` avoids the formatting of all numbers.
     """
 
     call: _CallSignature
@@ -385,7 +387,7 @@ def _transpose(cotangents: Sequence[Any], *_: Any, at: _LinearizationPoint) -> l
 
 
 _stored = primitive("stored", evaluate=_evaluate, differentiate=_differentiate, batch=_batch)
-"""A function of known numbers under one derivative or one batch."""
+"""Primitive that calls a cached function under a single derivative or batch."""
 
 _linear_map = primitive(
     "stored_linear_map",
@@ -395,4 +397,4 @@ _linear_map = primitive(
     trace=_trace_linear_map,
     abstract=lambda *_, at: at.types,
 )
-"""Tangents of its outputs as a linear function of the tangents of its arguments."""
+"""Primitive that maps the tangents of the arguments of a cached function to the tangents of its outputs."""
