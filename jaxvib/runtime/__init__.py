@@ -1,1 +1,1 @@
-"""Compiler settings and compiled programs kept on disk."""
+"""Compiler settings, caches of compiled programs, devices and threads."""

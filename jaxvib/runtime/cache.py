@@ -71,18 +71,18 @@ def default_folder() -> Path:
 
 
 def keep_programs(folder: Path | None) -> None:
-    """Set the folder of traced programs; None: do not store them."""
+    """Set the folder of traced programs; None disables their storage."""
     _folder[:] = [] if folder is None else [folder]
 
 
 def program_folder() -> Path | None:
-    """Return the folder of traced programs; None if they are not stored."""
+    """Return the folder of traced programs, or None if programs are not stored."""
     return _folder[0] if _folder else None
 
 
 @contextlib.contextmanager
 def compiled_anew() -> Iterator[None]:
-    """Disable both caches, to measure the compile time of programs that this process has not compiled yet."""
+    """Disable both caches within the context, to measure compile times of programs that are new to this process."""
     folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
     keep_programs(None)
     jax.config.update("jax_enable_compilation_cache", False)
@@ -95,7 +95,7 @@ def compiled_anew() -> Iterator[None]:
 
 def require_own(folder: Path) -> None:
     """Raise `InputError` if another user may write to a folder or replace it."""
-    if not hasattr(os, "geteuid"):  # Windows: a home folder is its owner's
+    if not hasattr(os, "geteuid"):  # on Windows only the owner can write to a home folder
         return
     for place in (folder, *folder.resolve().parents):
         found = place.stat()

@@ -1,4 +1,4 @@
-"""XLA's options for time loops on the CPU, set before JAX starts."""
+"""XLA's options for time integration on the CPU, which must be set before JAX starts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["has_flags", "prepare_cpu", "processor"]
 _EXTRA = "--xla_backend_extra_options="
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 _COMPILING = "--xla_cpu_use_fusion_emitters=false"
-"""XLA's older code generator: programs of the same speed in two thirds of the time."""
+"""Flag that selects XLA's older code generator: equally fast programs in two thirds of the compile time."""
 
 _WIDTH = "--xla_cpu_prefer_vector_width"
 
@@ -29,8 +29,8 @@ def prepare_cpu(devices: int | None = 1) -> str:
 
     With jax before 0.12 the first use of a public name of jaxvib calls this function, unless JAXVIB_AUTOMATIC=off in the
     environment: without `xla_cpu_small_while_loop_byte_threshold` XLA's CPU backend runs the body of all but the smallest loops
-    as a chain of small functions, and time integration takes many times as long; steady answers hardly change. From 0.12 on XLA
-    needs no flag, and jaxvib sets none by itself. The flags, in `XLA_FLAGS`:
+    as a chain of small functions, and time integration takes many times as long; the time of steady answers hardly changes.
+    From 0.12 on XLA needs no flag, and jaxvib does not call this function. The flags, in `XLA_FLAGS`:
 
     - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
     - `--xla_cpu_use_fusion_emitters=false`, jax before 0.11: a code generator that needs two thirds of the compile time
@@ -90,7 +90,7 @@ def _has_wide_vectors() -> bool:
 
 @functools.cache
 def processor() -> str:
-    """The kind of processor this is, with its instruction sets where the system lists them."""
+    """Return the architecture and the name of the processor, with its instruction sets if the system lists them (Linux)."""
     features = ""
     with contextlib.suppress(OSError):  # Linux only
         lines = Path("/proc/cpuinfo").read_text().splitlines()

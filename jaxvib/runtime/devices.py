@@ -31,7 +31,7 @@ _TAKING = threading.Lock()
 def shared_devices() -> list[object]:
     """Return the accelerators that share this process's work; [None] for a single device, or if the caller chose one.
 
-    Processors count as one device, even if XLA divides them: threads share their cores.
+    The CPU counts as a single device, even if XLA divides it into several, because threads share its cores.
     """
     found = jax.local_devices()
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
@@ -39,17 +39,17 @@ def shared_devices() -> list[object]:
 
 
 def known(value: ArrayLike) -> Any:
-    """Convert a known value to NumPy, since arithmetic on JAX arrays compiles a program; return a tracer as it is."""
+    """Convert a value to NumPy, because arithmetic on JAX arrays would compile a program; return a tracer unchanged."""
     return value if traced(value) else np.asarray(value)
 
 
 def numpy_of(tree: PyTree) -> ModuleType:
-    """NumPy, or JAX's if JAX is transforming the computation that the tree is part of."""
+    """Return the module `numpy`, or `jax.numpy` if a leaf of the tree is traced."""
     return jnp if any(map(traced, jax.tree.leaves(tree))) else np
 
 
 def on_device(tree: PyTree) -> PyTree:
-    """Move NumPy's arrays and numbers in a tree to JAX's device; `jnp.asarray` would compile a program for each shape.
+    """Copy NumPy's arrays and numbers in a tree to JAX's device; `jnp.asarray` would compile a program for each shape.
 
     >>> on_device({"a": np.arange(2.0), "b": None})
     {'a': Array([0., 1.], dtype=float64), 'b': None}
@@ -60,13 +60,13 @@ def on_device(tree: PyTree) -> PyTree:
 
 
 def arrays_on_device(leaves: Sequence[Any]) -> list[Any]:
-    """Move NumPy's arrays among leaves of a tree to JAX's device; Python's numbers stay, since programs contain them."""
+    """Copy NumPy's arrays among the leaves of a tree to JAX's device; leave Python's numbers, which are part of programs."""
     return [on_device(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
 
 
 def take_a_device() -> None:
-    """Assign an accelerator of its own to this worker process, if the machine has several."""
-    # Before the first array: otherwise a worker reserves most of the memory of every accelerator.
+    """Assign a separate accelerator to this worker process if the machine has several."""
+    # Must be set before the first array: otherwise each worker reserves most of the memory of every accelerator.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     devices = jax.local_devices()
     if len(devices) > 1:
@@ -77,17 +77,17 @@ def take_a_device() -> None:
 
 @functools.cache
 def _place() -> int:
-    """Return this process's index among the workers on this machine that see the same accelerators.
+    """Return the index of this process among the workers on this machine that see the same accelerators.
 
-    The index is a locked file. The system unlocks it when the process ends in any way; the worker that replaces a dead one
-    gets its accelerator.
+    A process holds an index by the lock of a file. The system releases the lock when the process ends for any reason, and the
+    worker that replaces it gets its index and thereby its accelerator.
     """
-    import fcntl  # not on Windows, where JAX has no accelerators
+    import fcntl  # does not exist on Windows, where JAX has no accelerators
 
     seen = hashlib.sha256(repr([os.environ.get(name) for name in _VISIBLE]).encode()).hexdigest()[:16]
     for place in itertools.count():
         path = os.path.join(tempfile.gettempdir(), f"jaxvib-worker-{os.getuid()}-{seen}-{place}")
-        file = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)  # open as long as the process lives
+        file = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)  # stays open until the process ends
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return place

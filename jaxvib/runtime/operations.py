@@ -1,4 +1,4 @@
-"""Number of operations of a program, and removal of those that no result needs."""
+"""Number of operations of a program, and removal of unused operations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ def _programs(value: Any) -> Iterator[Any]:
 
 
 def pruned(function: Callable[..., Sequence[Array]], *like: Array) -> Callable[..., list[Array]]:
-    """Trace a function of such arrays and remove the operations that no result needs, before it is differentiated."""
+    """Return the traced function of arrays like `like`, without the operations on which no result depends.
+
+    It is called before a derivative, which would otherwise include these operations.
+    """
     if not HAS_JAXPRS:
         return lambda *arrays: list(function(*arrays))
     program = jax.make_jaxpr(function)(*like)

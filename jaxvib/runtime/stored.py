@@ -1,7 +1,7 @@
-"""Programs stored on disk, so that the next process that asks the same question need not trace them.
+"""Programs stored on disk, which other processes read instead of tracing them again.
 
-A program is stored in the format of `jax.export`, below a line of JSON that describes the structure of its result. XLA's
-compiled form is in JAX's own compilation cache. Files are data: nothing in them is run as Python.
+A file contains a line with a digest, a line of JSON that describes the structure of the result, and the program in the format
+of `jax.export`. The form compiled by XLA is in JAX's own compilation cache. Files are data: no Python code in them is executed.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ __all__ = ["StoredFunction", "is_debugging"]
 T = TypeVar("T")
 
 _PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")
-"""Packages whose versions a traced program depends on."""
+"""Packages on whose versions a traced program depends."""
 
 _OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
-"""JAX's options that a traced program depends on."""
+"""Options of JAX on which a traced program depends."""
 
 
 MAX_PROGRAMS_IN_MEMORY = 512
-"""Largest number of programs in memory. XLA maps each into 10 to 400 areas of memory: a process with some thousand programs has
-no areas left (65530 on Linux) and crashes inside the compiler without a message."""
+"""Largest number of programs in memory. XLA maps each program into 10 to 400 memory areas. A process with thousands of programs
+therefore exceeds the limit of Linux (65530 areas) and crashes inside the compiler without a message."""
 
 MAX_PROGRAM_MEMORY = 768 * 2**20
-"""Largest estimated memory, bytes, of all programs in memory: with the process itself less than 1.5 GB."""
+"""Largest estimated memory, bytes, of all programs in memory. The whole process then needs less than 1.5 GB."""
 
 MEMORY_PER_PROGRAM, MEMORY_PER_STORED_BYTE = 2**20, 300
-"""Estimated memory, bytes, of a program: this, and this much for each byte of its stored form. XLA does not report the memory
+"""Estimated memory of a program, bytes: a constant, and a factor of the size of its stored form. XLA does not report the memory
 of programs on the CPU. Measured growth of the resident memory: natural frequencies 2.0 MB (stored 4.3 kB), jam modes 13.6 MB
 (32 kB), branches 11 to 16 MB (40 kB), an exact jam 38 MB (146 kB), a run 29 to 46 MB (280 kB)."""
 
 UNKNOWN_STORED_SIZE = 100_000
-"""Assumed stored size, bytes, of programs that cannot be stored: those with host callbacks, mostly runs with a progress bar."""
+"""Assumed stored size, bytes, of programs that cannot be stored because of host callbacks, mostly runs with a progress bar."""
 
 _clock = itertools.count()
 _functions: weakref.WeakSet[StoredFunction] = weakref.WeakSet()
@@ -70,34 +70,40 @@ _listing = threading.Lock()  # of `_functions`
 class StoredFunction(Generic[T]):
     """Compiled function of trees of arrays and hashable values, whose programs are stored on disk.
 
-    The key of a program on disk holds all that it depends on: the shapes and types of arrays, the static parts of the
-    arguments, JAX's options, the versions, the sources, and the processor. The least recently used programs in memory, beyond
-    `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`, are freed and later read or traced again.
+    The key of a stored program contains everything on which the program depends: the shapes and types of arrays, the static
+    parts of the arguments, JAX's options, the versions of packages, the sources, and the processor. If the programs in memory
+    exceed `MAX_PROGRAMS_IN_MEMORY` or `MAX_PROGRAM_MEMORY`, the least recently used ones are freed and later read or traced
+    again.
 
-    Some programs are not stored, but traced in each process: those with arguments of other packages' classes (their sources
-    are not part of the key), with functions that have no name, with host callbacks, with arrays on several devices. In a
-    process whose code differs from the sources (see `jaxvib.imported`) no program is stored or read, and programs traced from
-    the former code are not used again.
+    A program is not stored, but traced in each process, if it has
+
+    - arguments of classes of other packages, whose sources are not part of the key
+    - functions without a name
+    - host callbacks
+    - arrays on several devices
+
+    In a process whose code differs from the source files (see `jaxvib.imported`), no program is stored or read, and programs
+    that were traced from the former code are not used again.
     """
 
     def __init__(self, function: Callable[..., T]):
         self.function = no_host_checks()(function)
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
-        self.lock = threading.RLock()  # threads that need the same program wait for the one that compiles it
+        self.lock = threading.RLock()  # threads that need the same program wait for the thread that compiles it
         with _listing:
             _functions.add(self)
 
     def __call__(self, leaves: Sequence[Any], treedef: Any) -> T:
-        """Evaluate the function; its arguments (args, kwargs) have these leaves, none of them a tracer."""
+        """Evaluate the function for arguments (args, kwargs) with these leaves, none of which may be a tracer."""
         if (program := self.compiled(leaves, treedef)) is None:
             return self._jitted(leaves, treedef)
         program.used = next(_clock)
-        with evaluating():  # inside a transformation JAX would dispatch a program of known numbers by its slow path
+        with evaluating():  # inside a transformation JAX would use its slow dispatch, even if no argument is traced
             return program(x for x in leaves if isinstance(x, _ARRAYS))
 
     def compiled(self, leaves: Sequence[Any], treedef: Any) -> _Program | None:
-        """Return the compiled program of these arguments; None for calls whose program cannot be stored."""
+        """Return the compiled program for these arguments, or None if it cannot be stored."""
         call, program = self._found(leaves, treedef)
         if program is _UNKNOWN:
             folder, *_, home, _ = call
@@ -115,18 +121,21 @@ class StoredFunction(Generic[T]):
         return program
 
     def is_ready(self, leaves: Sequence[Any], treedef: Any) -> bool:
-        """Return True if the program of these arguments is in memory, or cannot be stored."""
+        """Return True if the program for these arguments is in memory or cannot be stored."""
         return self._found(leaves, treedef)[1] is not _UNKNOWN
 
     def _found(self, leaves: Sequence[Any], treedef: Any) -> tuple[Any, _Program | None]:
-        """Return the key of a call, and its program in memory, `_UNKNOWN`, or None if it cannot be stored."""
+        """Return the key of a call and its program in memory.
+
+        The program is `_UNKNOWN` if it is not in memory, and None if it cannot be stored.
+        """
         folder = program_folder()
         if folder is None or is_debugging():
             return (), None
         call = (folder, treedef, tuple(map(leaf_key, leaves)), _home(leaves), _options())
         try:
             return call, self.ready.get((_current_code(), call), _UNKNOWN)
-        except TypeError:  # an argument without a hash
+        except TypeError:  # an argument is not hashable
             return (), None
 
     def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
@@ -134,7 +143,7 @@ class StoredFunction(Generic[T]):
         return self.jitted(*args, **kwargs)
 
     def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
-        """Read the program from disk, or trace it and write it there; None for calls whose program cannot be stored."""
+        """Read the program from disk, or trace it and write it to disk; return None if it cannot be stored."""
         if not code_state().is_on_disk:
             return None
         try:
@@ -156,14 +165,14 @@ class StoredFunction(Generic[T]):
 
     def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program:
         structure: list[Description] = []
-        # The skeleton, since the arrays of this call would live as long as the program.
+        # `flat` refers to a skeleton, because the arrays of this call would otherwise stay in memory with the program.
         arguments, state = Skeleton.of(leaves, treedef), code_state()
 
         def flat(*arrays: Array) -> list[Array]:
             args, kwargs = arguments.filled(arrays)
             result, outputs = self.function(*args, **kwargs), []
             structure[:] = [describe(result, outputs.append)]
-            return [jnp.asarray(x, x.dtype) for x in outputs]  # outputs of a stored program have no weak types
+            return [jnp.asarray(x, x.dtype) for x in outputs]  # not weakly typed, as the outputs of a stored program
 
         jitted = jax.jit(flat)
         try:
@@ -171,10 +180,10 @@ class StoredFunction(Generic[T]):
                 exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
                 stored = bytes(exported.serialize())
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
-            if not structure:  # the function's own error
+            if not structure:  # the function itself raised the error
                 raise
             return _Program.of(jitted, structure[0])
-        exported = export.deserialize(bytearray(stored))  # the first one holds its trace, 1 to 3 MB
+        exported = export.deserialize(bytearray(stored))  # frees the trace, 1 to 3 MB, to which the first one refers
         program = _Program.of(_compiled(path, exported, home), structure[0], size=len(stored))
         if code_state(look=True) != state:  # the code changed during the trace
             return program
@@ -188,7 +197,8 @@ class StoredFunction(Generic[T]):
 class _Program:
     """Function of all arrays of the arguments, compiled by `jax.jit`.
 
-    `result` is the structure of its result, `memory` its estimated memory in bytes, `used` the time of the last use.
+    `result` is the structure of its result and `memory` its estimated memory in bytes. `used` is a counter that orders programs
+    by their last use.
     """
 
     run: Callable[..., list[Array]]
@@ -208,18 +218,18 @@ class _Program:
         return self.result.filled(self.run(*arrays))
 
     def compile(self, arrays: Iterable[Array]) -> None:
-        """Compile the program, for arrays like these, without running it; JAX keeps the result."""
+        """Compile the program for arrays like these without running it; JAX stores the compiled form."""
         self.run.lower(*arrays).compile()  # pyright: ignore[reportFunctionMemberAccess]
 
 
 _pausing = threading.Lock()
 _traces: list[bool] = []
-"""An entry for each trace in progress: True if garbage collection was enabled before the first one."""
+"""Entries of all traces in progress, each True if garbage collection was enabled before the first of them."""
 
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Disable garbage collection, which takes a fifteenth of the time of a trace with its many objects."""
+    """Disable garbage collection during a trace, which creates many objects; collection takes a fifteenth of its time."""
     with _pausing:
         _traces.append(gc.isenabled() if not _traces else _traces[0])
         gc.disable()
@@ -231,12 +241,15 @@ def _no_garbage_collection() -> Iterator[None]:
                 gc.enable()
 
 
-_ARRAYS = (jax.Array, np.ndarray)  # a call moves NumPy's arrays to the device in a tenth of the time of `jax.device_put`
+_ARRAYS = (jax.Array, np.ndarray)  # a call copies NumPy's arrays to the device in a tenth of the time of `jax.device_put`
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
 
 
 def _evict_least_recently_used() -> None:
-    """Free the least recently used programs beyond `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`; keep the last one."""
+    """Free the least recently used programs beyond `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`.
+
+    The most recently used program is never freed, even if it exceeds the limit alone.
+    """
     with _listing:
         functions = list(_functions)
     programs = [
@@ -251,7 +264,7 @@ def _evict_least_recently_used() -> None:
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Write a file atomically: another process never reads half a program, and a failure leaves no file behind."""
+    """Write a file atomically: another process never reads an incomplete program, and an error leaves no file."""
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
         try:
             file.write(content)
@@ -263,7 +276,7 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def _read(path: Path, home: Sharding) -> _Program | None:
-    """Read a program; None if the file is missing, damaged or another user's, and is to be written anew."""
+    """Read a program; return None, and let the caller write it again, if the file is missing, damaged or of another user."""
     try:
         with path.open("rb") as file:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
@@ -282,15 +295,15 @@ def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable
     def run(*arrays: Array) -> list[Array]:
         return exported.call(*arrays)  # pyright: ignore[reportReturnType]
 
-    # The name is part of the key in JAX's compilation cache. It holds the processor, which JAX's key lacks, but no digest of
-    # the sources: a program that an edit leaves unchanged is not compiled again.
+    # The name is part of the key in JAX's compilation cache. It includes the processor, which JAX's key lacks. It includes no
+    # digest of the sources, because a program that is the same after an edit need not be compiled again.
     run.__name__ = f"{path.stem.rpartition('-')[0]}-{_digest(processor().encode())[:16]}"
-    # Without shardings JAX compiles twice: for arrays that it may move, and for outputs of another program.
+    # Without shardings JAX compiles twice: for uncommitted arrays, which it may move, and for outputs of other programs.
     return jax.jit(run, in_shardings=home)
 
 
 def _home(leaves: Sequence[object]) -> Sharding:
-    """Return the sharding of the first array that JAX must not move, otherwise that of the default device."""
+    """Return the sharding of the first committed array, which JAX must not move; otherwise that of the default device."""
     for leaf in leaves:
         if isinstance(leaf, jax.Array) and leaf.committed:
             return leaf.sharding
@@ -299,7 +312,7 @@ def _home(leaves: Sequence[object]) -> Sharding:
 
 
 def is_debugging() -> bool:
-    """Return True if JAX runs programs operation by operation, or may have to."""
+    """Return True if an option of JAX makes it run programs operation by operation, always or after a NaN or infinity."""
     return any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
 
 
@@ -313,7 +326,7 @@ def _digest(content: bytes) -> str:
 
 @functools.cache
 def _sources() -> str:
-    """Identify the code that programs are traced from: versions of packages and a digest of the sources."""
+    """Identify the code from which programs are traced: versions of packages, EQX_ON_ERROR and a digest of the sources."""
     versions = [importlib.metadata.version(name) for name in _PACKAGES]
     return f"{versions} {os.environ.get('EQX_ON_ERROR')} {digest_of_sources()}"
 
@@ -326,11 +339,11 @@ def _machine() -> str:
 
 _clearing = threading.RLock()
 _traced_code = [code_state()]
-"""State of the code that JAX's traced functions belong to."""
+"""State of the code from which the functions in JAX's caches were traced."""
 
 
 def _current_code(*, look: bool = False) -> CodeState:
-    """Return the state of the code, see `code_state`; after a change, clear what was traced or derived from the former code."""
+    """Return the state of the code, see `code_state`; after a change, clear all caches that depend on the former code."""
     state = code_state(look=look)
     if state != _traced_code[0]:
         with _clearing:
