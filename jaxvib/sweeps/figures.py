@@ -1,4 +1,4 @@
-"""Figures of a store, chosen by its axes and read with bounded memory."""
+"""Figures of a store, chosen by its axes and drawn with bounded memory."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 __all__ = ["figures", "plot_distribution", "plot_map", "plot_shares", "plot_sweep", "plot_tornado", "wilson"]
 
 _MAX_DOTS = 1500
-"""Largest number of cases along an axis of a figure; beyond it only every k-th case is drawn."""
+"""Maximum number of cases along an axis of a figure; of more cases only every k-th one is drawn."""
 
 _ROWS = 9
-"""Values of the other axis at which folds and torus points are computed."""
+"""Number of values of the other axis at which folds and torus points are computed."""
 
 _BINS = 60
 
@@ -36,14 +36,14 @@ _SPEED = "drive.speed"
 
 
 class _Table(NamedTuple):
-    """Labels of cases: `codes` (cases ...), -1 for none, of `names`."""
+    """Labels of cases: `codes` (cases ...) are indices into `names`, -1 for no label."""
 
     codes: np.ndarray
     names: list[str]
 
 
 def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
-    """Wilson's 95 % interval of a share with `hits` of `cases`; 0 to 1 without cases.
+    """Return Wilson's 95 % interval of a share with `hits` of `cases`; 0 to 1 if there are no cases.
 
     It is the set of shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
 
@@ -61,8 +61,12 @@ def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np
 
 
 def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
-    """Plot the figure that fits a study: over two axes a map, of regimes if they were measured; over samples alone the
-    distribution of the first measure; over one axis that measure as points."""
+    """Plot the figure that fits a study.
+
+    - two axes or more: a map, of regimes if they were measured
+    - samples alone: the distribution of the first measure
+    - one axis: the first measure as points; with samples, the shares of regimes if they were measured
+    """
     opened = Store(Path(store))
     dims = _dims(opened)
     if len([d for d in dims if d != SAMPLE]) >= 2:
@@ -84,7 +88,9 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
 def figures(
     store: str | Path, measure: str | None = None, *, x: str | None = None, y: str | None = None, theory: bool = True
 ) -> Iterator[tuple[str, Figure]]:
-    """Figures that fit a study, by name: "map", "shares", "distribution", "tornado"; for the arguments see `plot_map`.
+    """Yield the figures that fit a study, with their names: "map", "shares", "distribution", "tornado".
+
+    The arguments are those of `plot_map`.
 
     **Raises** `InputError` for names that the store does not have.
     """
@@ -112,9 +118,12 @@ def plot_map(
 ) -> Drawn:
     """Plot a map over two axes: of labels (regimes, jam modes) with the folds and torus points of exact jams, or of values.
 
-    **Arguments**: `measure`: its name in the store (default: the regime, if there is one); `x`, `y` names of axes;
-    along further axes the middle case is shown. `theory`: True to draw lines at which exact jams fold or lose their stability,
-    computed by `branches(scene, exact=True)` if one of the axes is the rotor speed.
+    **Arguments**
+
+    - `measure`: its name in the store (default: the regime, if there is one)
+    - `x`, `y`: names of axes; along further axes the middle case is shown
+    - `theory`: True to draw the lines on which exact jams fold or lose their stability, computed by
+      `branches(scene, exact=True)` if one of the axes is the rotor speed
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for names that the store does not have.
     """
@@ -150,8 +159,10 @@ def plot_map(
 
 
 def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot the share of each label (regimes with their jam modes) over one axis, over all cases of the other axes, with
-    Wilson's 95 % intervals. **Returns** a matplotlib figure, or the given `ax`."""
+    """Plot the share of each label (regimes with their jam modes) over one axis, with Wilson's 95 % intervals.
+
+    Each share counts all cases of the other axes. **Returns** a matplotlib figure, or the given `ax`.
+    """
     from jaxvib.draw.sweeps import shares_chart
 
     opened = Store(Path(store))
@@ -196,9 +207,9 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot the mean of a measure over the lowest and the highest fifth of the range of each number that changes.
+    """Plot the mean of a measure over the lowest and over the highest fifth of the values of each number that changes.
 
-    **Returns** a matplotlib figure, or the given `ax`, the number with the largest influence on top.
+    The number with the largest influence is on top. **Returns** a matplotlib figure, or the given `ax`.
     """
     from jaxvib.draw.sweeps import tornado_chart
 
@@ -228,7 +239,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
 
 
 def _fifths(store: Store, axis: str) -> tuple[float, float]:
-    """Upper end of the lowest fifth of the values of an axis, and lower end of the highest fifth."""
+    """Return the upper end of the lowest fifth of the values of an axis, and the lower end of the highest fifth."""
     values = store.read(axis, slice(0, 1 << 20))
     return float(np.nanquantile(values, 0.2)), float(np.nanquantile(values, 0.8))
 
@@ -238,7 +249,7 @@ def _dims(store: Store) -> list[str]:
 
 
 def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:
-    """Values of an axis, at most as many as can be drawn, and their stride."""
+    """Return the drawn values of an axis, at most `_MAX_DOTS`, and their stride."""
     values = store.read(axis)
     step = -(-values.size // _MAX_DOTS)
     return values[::step], step
@@ -256,7 +267,7 @@ def _axis_label(store: Store, axis: str) -> str:
 
 
 def _measure(store: Store, name: str | None) -> str:
-    """Name of a measure with numbers; default: the first one."""
+    """Return the name of a measure; default: the first one with numbers."""
     plain = [n for n in store.names if not _is_label(store, n)]
     found = name or next(iter(plain or store.names))
     if found not in store.names:
@@ -267,11 +278,11 @@ def _measure(store: Store, name: str | None) -> str:
 def _measure_label(store: Store, name: str) -> str:
     attributes = store.group[name].attrs
     words, unit = str(attributes.get("long_name", name)), attributes.get("units", "")
-    return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # no formula, whatever the names of users' quantities
+    return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # else matplotlib would typeset it as a formula
 
 
 def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:
-    """Numbers of a measure in a region, the largest along a further dimension; NaN for missing ones."""
+    """Return the numbers of a measure in a region, the largest along a further dimension; NaN for missing ones."""
     values = store.read(name, region).astype(float)
     return np.max(values, axis=-1) if values.ndim > len(store.shape) else values
 
@@ -285,7 +296,7 @@ def _is_label(store: Store, name: str) -> bool:
 
 
 def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Table:
-    """Labels of the cases of a region: the name of the regime, and the mode of jammed loads."""
+    """Return the labels of the cases of a region: the name of the regime, and the jam mode of jammed loads."""
     words: list[str] = str(store.group["regime"].attrs["flag_meanings"]).split() if "regime" in store.names else ["not jammed"]
     first = len(words)
     done = store.read("status", region) == 1
@@ -299,10 +310,10 @@ def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Table:
 def _theory(
     store: Store, across: str, up: str, xs: np.ndarray, ys: np.ndarray
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Lines in the plane on which exact jams of the stored scene fold or lose their stability, by kind.
+    """Return the lines in the plane on which exact jams of the stored scene fold or lose their stability, by kind.
 
-    Only over the rotor speed. If the other axis is a number of the start, which has no influence on steady motions, lines are
-    straight; if it is a number of the scene, they connect the points at some of its values.
+    Lines exist only if one axis is the rotor speed. If the other axis is a number of the start, which has no influence on
+    steady motions, the lines are straight. If it is a number of the scene, they connect the points at `_ROWS` of its values.
     """
     if _SPEED not in (across, up):
         return {}
@@ -318,7 +329,7 @@ def _theory(
     for value in rows[:1] if fixed else rows:
         try:
             special = exact_branches(put(scene, (spot,), jnp.asarray([float(value)]))).special
-        except InputError:  # a scene that has no exact jams of this kind has no lines
+        except InputError:  # the exact theory does not cover this scene
             return {}
         kinds: dict[str, list[float]] = {}
         for point in special:
@@ -328,7 +339,7 @@ def _theory(
     lines: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for kind in sorted({kind for kinds in found for kind in kinds}):
         counts = {len(kinds.get(kind, [])) for kinds in found}
-        if len(counts) == 1:  # the same points in every row: lines through them
+        if len(counts) == 1:  # the same number of points in every row can be connected by lines
             parts = [(np.asarray([kinds[kind][k] for kinds in found]), rows) for k in range(counts.pop())]
         else:
             parts = [

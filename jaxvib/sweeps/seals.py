@@ -1,7 +1,10 @@
 """Seals of a store: digests of its files, and the lock of the process that writes.
 
-The folder `.seals` holds for every finished chunk a file with a digest of all files of that chunk, the digests of those files
-that are written once, when the store is created, and the file that a process locks to write.
+The folder `.seals` contains
+
+- for every finished chunk, a file with a digest of all files of that chunk
+- the digests of the files that are written only once, when the store is created
+- the file that a process locks for writing
 """
 
 from __future__ import annotations
@@ -22,16 +25,16 @@ FOLDER = ".seals"
 _LAYOUT, _LOCK = "layout", "lock"
 
 _intact: dict[str, tuple[object, ...]] = {}
-"""Stamps of the files of chunks that this process has read and found intact, by the path of the seal."""
+"""Stamps of the files of chunks that this process has read and verified, by the path of the seal."""
 
 
 def seal_of(store: Path, chunk: int) -> Path:
-    """Path of a chunk's seal."""
+    """Return the path of a chunk's seal."""
     return store / FOLDER / str(chunk)
 
 
 def _digest(files: Mapping[str, Path]) -> str:
-    """Digest of names and contents, including the absence of a file."""
+    """Return a digest of names and contents; a missing file also changes it."""
     found = hashlib.sha256()
     for name, path in files.items():
         try:
@@ -46,7 +49,7 @@ def _digest(files: Mapping[str, Path]) -> str:
 
 
 def _stamps(files: Mapping[str, Path]) -> tuple[object, ...]:
-    """Stamps of files, which change if a file is written again or replaced."""
+    """Return stamps of files, which change if a file is rewritten or replaced."""
 
     def stamp(path: Path) -> object:
         try:
@@ -65,7 +68,7 @@ def seal(store: Path, chunk: int, files: Mapping[str, Path]) -> None:
 
 
 def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None:
-    """True if the seal of a chunk is that of its files, None if it has none."""
+    """True if the seal of a chunk agrees with its files; None if the chunk has no seal."""
     path = seal_of(store, chunk)
     stamps = _stamps({**files, "": path})
     if _intact.get(str(path)) == stamps:
@@ -84,7 +87,7 @@ def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None
 
 
 def seal_layout(store: Path) -> None:
-    """Record digests of all files of a store without chunks: metadata, values of axes."""
+    """Record the digests of all files of a store that has no chunks yet: metadata and values of axes."""
     files = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob("*")) if path.is_file()}
     digests = {name: _digest({name: path}) for name, path in files.items()}
     (store / FOLDER).mkdir()
@@ -94,7 +97,7 @@ def seal_layout(store: Path) -> None:
 
 
 def changed_layout(store: Path) -> str | None:
-    """Description of the first file that has changed since the creation of the store; None if there is none."""
+    """Describe the first file that has changed since the creation of the store; None if no file has changed."""
     try:
         layout = json.loads(read_text(store / FOLDER / _LAYOUT, "a store"))
         digests = layout["files"]
@@ -110,7 +113,7 @@ def changed_layout(store: Path) -> str | None:
 
 
 def _lock(file: int, *, exclusive: bool) -> bool:
-    """Try to lock an open file; False if another process has it. The system releases the lock at any end of the process."""
+    """Lock an open file; False if another process has the lock. The system releases it however the process ends."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -132,8 +135,10 @@ def _lock(file: int, *, exclusive: bool) -> bool:
 
 @contextlib.contextmanager
 def locked(store: Path) -> Iterator[bool]:
-    """Hold the lock of a store; yields False if another process or thread has it. **Raises** `OSError` if the lock file does
-    not exist and cannot be created."""
+    """Hold the lock of a store, and yield False if another process or thread has it.
+
+    **Raises** `OSError` if the lock file does not exist and cannot be created.
+    """
     path = store / FOLDER / _LOCK
     file = os.open(path, os.O_RDONLY if path.exists() and not os.access(path, os.W_OK) else os.O_RDWR | os.O_CREAT, 0o666)
     try:
@@ -143,7 +148,7 @@ def locked(store: Path) -> Iterator[bool]:
 
 
 def is_locked(store: Path) -> bool:
-    """True if a process writes into a store at this moment."""
+    """True if a process is writing into a store."""
     try:
         file = os.open(store / FOLDER / _LOCK, os.O_RDONLY)
     except OSError:

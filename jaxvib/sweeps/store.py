@@ -1,7 +1,8 @@
 """Store of a study on disk: labelled arrays in Zarr's format, written in chunks, each completely or not at all.
 
-Numbers of a chunk are written first, then its statuses, its seal last: a digest of all its files (`jaxvib.sweeps.seals`). A
-chunk is finished if, and only if, its seal agrees with its files. Files are written atomically. Nothing is unpickled.
+The numbers of a chunk are written first, then its statuses, and last its seal, which is a digest of all its files
+(`jaxvib.sweeps.seals`). A chunk is finished if and only if its seal agrees with its files. Files are written atomically. No
+file is unpickled.
 """
 
 from __future__ import annotations
@@ -61,8 +62,10 @@ def require_zarr() -> ModuleType:
 
 
 def versions() -> dict[str, str]:
-    """Versions of all packages that a result depends on, and a digest of the sources of jaxvib, which also shows parts that
-    this process has replaced."""
+    """Return the versions of all packages on which a result depends, and a digest of the sources of jaxvib.
+
+    The digest also shows if this process has replaced parts of jaxvib.
+    """
     changed = "" if code_state(look=True).is_on_disk else " with changes in this process"
     return {name: importlib.metadata.version(name) for name in _PACKAGES} | {"sources": digest_of_sources()[:16] + changed}
 
@@ -70,8 +73,8 @@ def versions() -> dict[str, str]:
 class Store:
     """Open store.
 
-    **Attributes**: `path`; `attributes` its record: the study, versions, seed; `arrays` by name; `shape` of the cases and
-    `tile` of a chunk; `names` of the measures.
+    **Attributes**: `path`; `attributes`, the record of the study, versions and seed; `arrays` by name; `shape`, the number of
+    cases along each dimension; `tile`, the number of cases of a chunk along each dimension; `names` of the measures.
     """
 
     def __init__(self, path: Path, writable: bool = False):
@@ -88,7 +91,7 @@ class Store:
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
                 raise InputError("store", f"is {quoted(str(path))}, which is no store of a sweep; name another one")
             self.record: Tables = self.attributes["study"]
-            # A chunk without values also gets a file, since a missing file counts as damage.
+            # A chunk without values needs a file too, because a missing file counts as damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self.arrays = {name: self.group[name] for name in self.group.array_keys()}
             self.shape = tuple(self.group["status"].shape)
@@ -101,19 +104,19 @@ class Store:
             raise self.damaged(f"{type(error).__name__}: {error}") from error
 
     def damaged(self, what: str) -> InputError:
-        """Error for a store that cannot be used."""
+        """Return the error for a store that cannot be used."""
         return InputError(
             "store", f"is {quoted(str(self.path))}, which is no store of a sweep, or a damaged one ({what}); name another"
         )
 
     @classmethod
     def create(cls, path: Path, study: Study) -> None:
-        """Create the empty store of a study atomically; a store that another process has just created stays."""
+        """Create the empty store of a study atomically. A store that another process has created meanwhile is kept."""
         zarr = require_zarr()
         part = path.with_name(f".{uuid.uuid4().hex}.partial")
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that metadata in one place are an extension of the format
+                warnings.simplefilter("ignore")  # zarr warns that consolidated metadata are an extension of the format
                 _fill(zarr, part, study)
                 zarr.consolidate_metadata(part)
             seals.seal_layout(part)
@@ -130,7 +133,10 @@ class Store:
         return int(self.attributes["coordinates_of_machine"])
 
     def require_same(self, study: Study) -> None:
-        """**Raises** `InputError` if the store is of another study or of other versions, or if this cannot be determined."""
+        """Require that the store belongs to this study and to the installed versions.
+
+        **Raises** `InputError` if it belongs to others, or if this cannot be determined.
+        """
         for name, mine in study.identities.items():
             if isinstance(mine, dict) and UNKNOWN in mine and self.record["measure"].get(name) != mine:
                 problem = f"{mine[UNKNOWN]}; the numbers in {str(self.path)!r} may be of other code"
@@ -148,7 +154,7 @@ class Store:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the store for writing. **Raises** `InputError` if another process, or thread, writes already."""
+        """Lock the store for writing. **Raises** `InputError` if another process or thread is writing."""
         with contextlib.ExitStack() as stack:
             try:
                 is_mine = stack.enter_context(seals.locked(self.path))
@@ -165,12 +171,12 @@ class Store:
         return tuple(-(-n // t) for n, t in zip(self.shape, self.tile, strict=True))
 
     def region(self, chunk: int) -> tuple[slice, ...]:
-        """Place of a chunk's cases along the dimensions."""
+        """Return the slices of a chunk's cases along the dimensions."""
         first = [int(k) * t for k, t in zip(np.unravel_index(chunk, self.tiles), self.tile, strict=True)]
         return tuple(slice(a, min(a + t, n)) for a, t, n in zip(first, self.tile, self.shape, strict=True))
 
     def _files(self, chunk: int) -> dict[str, Path]:
-        """Files of a chunk by the name of their array: of measures, errors, statuses, sampled numbers."""
+        """Return the files of a chunk by array name: sampled numbers, measures, errors, statuses."""
         place = tuple(int(k) for k in np.unravel_index(chunk, self.tiles))
         found: dict[str, Path] = {}
         for name in (*self.sampled, *self.names, "error", "status"):
@@ -185,7 +191,10 @@ class Store:
         return tuple(str(self.attributes.get("coordinates", "")).split())
 
     def states(self, *, writing: bool = False) -> np.ndarray:
-        """`ChunkState` of each chunk (chunks,), after reading every file once; `writing`: this process has the lock."""
+        """Read every file once and return the `ChunkState` of each chunk, (chunks,).
+
+        `writing`: True if this process has the lock.
+        """
         busy = not writing and seals.is_locked(self.path)
         return np.asarray([self._state(chunk, busy) for chunk in range(int(np.prod(self.tiles, dtype=np.int64)))], int)
 
@@ -199,19 +208,19 @@ class Store:
         return ChunkState.damaged
 
     def _is_readable(self, chunk: int, files: dict[str, Path]) -> bool:
-        """True if what a killed process left of a chunk can be read."""
+        """True if the files that a killed process left of a chunk can be read."""
         if not any(file.exists() for file in files.values()):
             return True
         region = self.region(chunk)
         try:
             for name in files:
                 self.group[name][region[-1:] if name in self.sampled else region]
-        except Exception:  # whatever zarr and its codecs say
+        except Exception:  # any error of zarr and its codecs
             return False
         return True
 
     def clear(self, chunk: int) -> None:
-        """Remove the files of a damaged chunk, its seal first: what stops now leaves a chunk that was not computed."""
+        """Remove the files of a damaged chunk, its seal first: an interruption then leaves a chunk that counts as missing."""
         try:
             for file in (seals.seal_of(self.path, chunk), *reversed(self._files(chunk).values())):
                 shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink(missing_ok=True)
@@ -219,7 +228,7 @@ class Store:
             raise cannot_write(self.path, error) from error
 
     def require_whole(self) -> None:
-        """**Raises** `InputError` if a chunk is damaged."""
+        """Require that no chunk is damaged. **Raises** `InputError` otherwise."""
         bad = np.flatnonzero(self.states() == ChunkState.damaged)
         if bad.size:
             problem = f"is {str(self.path)!r}, in which {bad.size} of {int(np.prod(self.tiles))} chunks are damaged"
@@ -227,7 +236,7 @@ class Store:
             raise InputError("store", f"{problem}, the first of them chunk {bad[0]}; {advice}")
 
     def write(self, study: Study, chunk: int, cases: Chunk) -> None:
-        """Write a chunk: its numbers, then its statuses, then its seal, which says that it is finished."""
+        """Write a chunk: its numbers, then its statuses, then its seal, which marks it as finished."""
         region = study.grid.region(chunk)
         shape = tuple(s.stop - s.start for s in region)
         try:
@@ -248,7 +257,10 @@ class Store:
             raise cannot_write(self.path, error) from error
 
     def counts(self, states: np.ndarray) -> np.ndarray:
-        """Cases with each status, in the order of `CASE_STATUSES`; those of chunks that are not finished are missing."""
+        """Return the number of cases with each status, in the order of `CASE_STATUSES`.
+
+        Cases of chunks that are not finished count as missing.
+        """
         total = np.zeros(len(CASE_STATUSES), np.int64)
         finished = (states == ChunkState.finished).reshape(self.tiles)
         for rows in self.pieces():
@@ -266,13 +278,13 @@ class Store:
         return np.bincount(self._values("status", region).ravel(), minlength=len(CASE_STATUSES))[: len(CASE_STATUSES)]
 
     def pieces(self) -> list[slice]:
-        """Slices of the first dimension, each of whole chunks and of about a million cases at most."""
+        """Return slices of the first dimension; each has whole chunks and at most about a million cases."""
         wide = max(int(np.prod(self.shape[1:], dtype=np.int64)), 1)
         rows = max(1, (1 << 20) // (wide * self.tile[0])) * self.tile[0]
         return [slice(k, min(k + rows, self.shape[0])) for k in range(0, self.shape[0], rows)]
 
     def read(self, name: str, region: slice | tuple[slice, ...] = slice(None)) -> np.ndarray:
-        """Numbers of an array. **Raises** `InputError` if a chunk of the store is damaged."""
+        """Return the numbers of an array. **Raises** `InputError` if a chunk of the store is damaged."""
         if not self.is_whole:
             self.require_whole()
             self.is_whole = True
@@ -293,7 +305,7 @@ def _short(value: Plain) -> str:
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:
-    """The error to raise where a store cannot be written: finished chunks are safe all the same."""
+    """Return the error for a store that cannot be written. Its finished chunks are not affected."""
     why = error.strerror or str(error)
     advice = "make room or name another store; finished chunks are kept, run the same command again to continue"
     return InputError("store", f"is {quoted(str(path))}, which cannot be written ({why}); {advice}")
