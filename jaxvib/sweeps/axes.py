@@ -44,15 +44,15 @@ _START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s
 _KEYS = ["from", "to", "count", "scale"]
 
 _MOST_CORNERS = 10
-"""Maximum number of axes for which all corners are checked; with more axes only the two opposite corners are."""
+"""Maximum number of axes for which all corners are checked; with more axes only two opposite corners are checked."""
 
 AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int | str]
 """A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the number is sampled."""
 
 
 class Spot(NamedTuple):
-    """Numbers that an axis changes: a `number` of the scene; or, if it is None, the entry `entry` (None: all) of the field
-    `field` of the start."""
+    """Numbers that an axis changes: a `number` of the scene or, if it is None, the entry `entry` (None: all entries) of the
+    field `field` of the start."""
 
     number: NamedNumber | None
     field: str
@@ -62,8 +62,8 @@ class Spot(NamedTuple):
 class Axis(NamedTuple):
     """Number, or several numbers with one name, that changes from case to case.
 
-    **Attributes**: `name`, `unit`; `values` (n,) SI, None for a number that is sampled between `low` and `high`, by ratio if
-    `log`; the `spot` of the number.
+    **Attributes**: `name`, `unit`; `values` (n,) SI, None for a number that is sampled between `low` and `high`, on a
+    logarithmic scale if `log`; the `spot` of the number.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Axis(NamedTuple):
     spot: Spot
 
     def at(self, share: np.ndarray) -> np.ndarray:
-        """Values at shares in [0, 1) of the range."""
+        """Return the values at shares in [0, 1) of the range."""
         if self.log:
             return self.low * (self.high / self.low) ** share
         return self.low + (self.high - self.low) * share
@@ -120,12 +120,12 @@ class Grid(NamedTuple):
         return int(np.prod(self.tiles, dtype=np.int64))
 
     def region(self, chunk: int) -> tuple[slice, ...]:
-        """Slices of the cases of a chunk along the dimensions."""
+        """Return the slices of the cases of a chunk along the dimensions."""
         first = [k * t for k, t in zip(np.unravel_index(chunk, self.tiles), self.tile, strict=True)]
         return tuple(slice(int(a), min(int(a) + t, n)) for a, t, n in zip(first, self.tile, self.shape, strict=True))
 
     def values(self, chunk: int) -> np.ndarray:
-        """The numbers of the cases of a chunk, in C order, (cases, axes), SI."""
+        """Return the numbers of the cases of a chunk, in C order, (cases, axes), SI."""
         region = self.region(chunk)
         index = np.indices([s.stop - s.start for s in region]).reshape(len(region), -1)
         drawn = self.drawn(region[-1]) if self.samples else np.zeros((0, 0))
@@ -140,16 +140,16 @@ class Grid(NamedTuple):
         return np.stack(columns, axis=1)
 
     def drawn(self, which: slice) -> np.ndarray:
-        """The sampled numbers of some samples, (samples, sampled axes), SI."""
+        """Return the sampled numbers of a slice of the samples, (samples, sampled axes), SI."""
         axes = [axis for axis in self.axes if axis.values is None]
         shares = samples(which.start, which.stop, len(axes), self.seed, self.sampling)
         return np.stack([axis.at(shares[:, k]) for k, axis in enumerate(axes)], axis=1)
 
 
 def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
-    """Axis of the number with that name, from a list of values or a table.
+    """Return the axis of the number with that name, from a list of values or a table.
 
-    **Raises** `InputError` for a name or values that the scene or a start cannot have.
+    **Raises** `InputError` for a name or for values that the scene or a start cannot have.
     """
     spot, unit = _where(scene, name)
 
@@ -190,7 +190,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
 
 
 def _where(scene: Scene, name: str) -> tuple[Spot, str]:
-    """Place of the numbers of that name, in the scene or in the start, and their unit."""
+    """Return the place of the numbers with that name, in the scene or in the start, and their unit."""
     if not str(name).startswith("start."):
         found = find_number(scene, name, "axes")
         return Spot(found, "", None), found.unit
@@ -205,7 +205,7 @@ def _where(scene: Scene, name: str) -> tuple[Spot, str]:
 
 
 def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
-    """**Raises** `InputError` if two axes change the same number."""
+    """Require that no two axes change the same number. **Raises** `InputError` otherwise."""
     taken: dict[object, str] = {}
     for axis in axes:
         found, field, entry = axis.spot
@@ -229,7 +229,7 @@ def put(scene: Scene, spots: Sequence[Spot], values: Array) -> Scene:
 
 
 def put_start(state: State, spots: Sequence[Spot], values: Array) -> State:
-    """Return the state with a case's numbers (axes,); one number for all angles moves the middle of the loads."""
+    """Return the state with the numbers (axes,) of a case. One number for all angles sets the mean angle of the loads."""
     for k, (found, field, entry) in enumerate(spots):
         if found is None:
             old = getattr(state, field)
@@ -245,7 +245,7 @@ def put_start(state: State, spots: Sequence[Spot], values: Array) -> State:
 
 
 def corners(axes: Sequence[Axis]) -> np.ndarray:
-    """The corners of the box that the axes span, (corners, axes), SI."""
+    """Return the corners of the box that the axes span, (corners, axes), SI."""
     ends = np.asarray([[axis.low, axis.high] for axis in axes])
     if len(axes) > _MOST_CORNERS:
         return ends.T
@@ -253,8 +253,10 @@ def corners(axes: Sequence[Axis]) -> np.ndarray:
 
 
 def tile_of(shape: Sequence[int], most: int) -> tuple[int, ...]:
-    """Number of cases along each dimension of a chunk with at most `most` cases, the last dimension first, with tiles of nearly
-    equal size."""
+    """Return the number of cases of a chunk along each dimension; a chunk has at most `most` cases.
+
+    The last dimension is filled first, and tiles have nearly equal sizes.
+    """
     tile, room = [], most
     for n in reversed(shape):
         parts = -(-n // max(min(n, room), 1))
@@ -264,15 +266,15 @@ def tile_of(shape: Sequence[int], most: int) -> tuple[int, ...]:
 
 
 SAMPLINGS = ("low_discrepancy", "random")
-"""Methods of sampling: a sequence of low discrepancy, or samples independent of each other."""
+"""Methods of sampling: a low-discrepancy sequence, or independent random samples."""
 
 
 def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.ndarray:
-    """The samples number `first` to `last` - 1 in the unit cube of `size` dimensions, (last - first, size), in [0, 1).
+    """Return the samples number `first` to `last` - 1 in the unit cube of `size` dimensions, (last - first, size), in [0, 1).
 
-    "low_discrepancy" is the additive sequence x_k = frac(x_0 + k a) with a_j = g^-j, where g > 1 solves g^(size+1) = g + 1, and
-    x_0 is random by `seed`; computed with whole numbers of 64 bits, so that the billionth sample has all its digits. "random"
-    are the numbers of a counter-based generator (Philox) with the key `seed`.
+    "low_discrepancy" is the additive sequence x_k = frac(x_0 + k a) with a_j = g^-j, where g > 1 solves g^(size+1) = g + 1 and
+    x_0 is random with the seed `seed`. It is computed with 64-bit integers; therefore the billionth sample has all its digits.
+    "random" samples are the numbers of a counter-based generator (Philox) with the key `seed`.
 
     >>> samples(0, 4, 1, 0, "low_discrepancy").round(3).ravel().tolist()
     [0.012, 0.63, 0.248, 0.866]
@@ -283,7 +285,7 @@ def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.nd
     as easy as 1, 2, 3, 2011.
     """
     if sampling == "random":
-        blocks = -(-size // 4)  # the generator makes four numbers at a time
+        blocks = -(-size // 4)  # the generator returns four numbers at a time
         raw = np.random.Philox(key=seed, counter=first * blocks).random_raw((last - first) * blocks * 4)
         numbers = raw.reshape(last - first, 4 * blocks)[:, :size]
     else:

@@ -31,7 +31,7 @@ _OPTIONS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_p
 
 
 def identify(value: object) -> Plain:
-    """Describe a value, see `identity`; a value that cannot be compared has a unique text."""
+    """Describe a value, see `identity`. The description of a value that cannot be compared is unique in every call."""
     try:
         return identity(value)
     except UnknownIdentity as error:
@@ -39,7 +39,7 @@ def identify(value: object) -> Plain:
 
 
 class CaseStatus(eqx.Enumeration):
-    """Outcomes of a case. Each member is the sentence shown to the user. Their order is part of the format of a store."""
+    """Outcomes of a case. Each member is the sentence shown to the user. Their order is part of the store's format."""
 
     missing = "the case was not computed yet"
     done = "the case was computed"
@@ -50,7 +50,7 @@ class CaseStatus(eqx.Enumeration):
 
 
 CASE_STATUSES = enumeration_names(CaseStatus)
-"""The names of the statuses in the order of their numbers in a store."""
+"""Names of the statuses in the order of their numbers in a store."""
 
 
 class SweepStatus(eqx.Enumeration):
@@ -62,11 +62,11 @@ class SweepStatus(eqx.Enumeration):
 
 @dataclass(frozen=True)
 class Study:
-    """A validated study, see `study`.
+    """Validated study, see `study`.
 
-    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures` and their `identities` when the study was made;
-    `plan` of the runs, None if there are none; their `start` and `mode`; `tier`; `specs` of the axes as they were given;
-    `forms`, shape and type of each measure in one case.
+    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures` and their `identities` when the study was built;
+    `plan` of the runs, None if there are no runs; their `start` and `mode`; `tier`; `specs`, the values of the axes as the
+    user wrote them; `forms`, shape and type of each measure in one case.
     """
 
     scene: Scene
@@ -90,20 +90,20 @@ class Study:
     def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None, str]:
         """Static arguments of the compiled program, beside the scene and the cases.
 
-        They include the digest of the identities of the measures: a function whose global numbers have changed equals itself,
-        and would get the previous program.
+        They include the digest of the measures' identities, because a function compares equal to itself after its global
+        numbers have changed, and would otherwise get the previous program.
         """
         return self.spots, self.measures, self.plan, self.start, self.mode, digest(self.identities)
 
     @property
     def size(self) -> int:
-        """Number of cases in one call of the program, a multiple of the batch, since a partial batch would be computed by other
-        instructions."""
+        """Number of cases in one call of the program. It is a multiple of the batch size, because a partial batch would be
+        computed by other instructions."""
         return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // BATCH_SIZE) * BATCH_SIZE
 
     @property
     def record(self) -> dict[str, Plain]:
-        """Identity of the study: every value that its results depend on, ready for JSON."""
+        """Identity of the study: every value on which its results depend, ready for JSON."""
         options: dict[str, Plain] = {name: str(getattr(jax.config, name)) for name in _OPTIONS}
         return {
             "scene": scene_to_toml(self.scene),
@@ -127,7 +127,7 @@ class Study:
         return digest(self.record)
 
     def changed(self) -> str | None:
-        """Name of a measure whose function, or a value that it refers to, has changed since the study was made; or None."""
+        """Return the name of a measure whose function, or a value in it, has changed since the study was built, or None."""
         for name, measure in zip(self.names, self.measures, strict=True):
             before, now = self.identities[name], identify(measure)
             if before != now and not (isinstance(before, dict) and UNKNOWN in before):
@@ -135,5 +135,5 @@ class Study:
         return None
 
     def nothing(self, cases: int) -> list[np.ndarray]:
-        """Placeholders of measures of cases without a value: NaN, for whole numbers -1."""
+        """Return placeholders for the measures of cases without a value: NaN, or -1 for integers."""
         return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]

@@ -1,9 +1,9 @@
 """Identity of a value: plain data that differ if two values can give different results.
 
-Numbers, containers and dataclasses are described by their entries, arrays by a digest of type, shape and bytes. A function of a
-user is described by its bytecode, its defaults and its closure, and by everything that it refers to, recursively: global
-numbers, helper functions, classes, entries of the user's modules. The text of the source is not read, since it may have been
-edited after the import. Objects of installed packages and of Python are described by name and version.
+Numbers, containers and dataclasses are described by their entries, large arrays by a digest of their bytes with type and shape.
+A user's function is described by its bytecode, defaults and closure, and recursively by everything to which it refers: global
+numbers, helper functions, classes, entries of the user's modules. The source text is not read, because it may have been edited
+after the import. Objects of installed packages and of Python are described by name and version.
 
 A value whose influence cannot be followed raises `UnknownIdentity`: open files, calls of `open` or `eval`, the clock, random
 numbers of the operating system.
@@ -38,7 +38,7 @@ _MAX_VALUES = 100_000
 """Maximum number of values in one description."""
 
 _MAX_ENTRIES = 64
-"""Maximum number of entries of an array that is written as such; a larger array is described by a digest."""
+"""Maximum number of entries of an array that is described by its entries; a larger array is described by a digest."""
 
 _UNKNOWN_BUILTINS = {"open", "input", "eval", "exec", "compile", "globals", "locals", "vars", "breakpoint", "__import__"}
 _UNKNOWN_MODULES = {
@@ -59,12 +59,12 @@ class UnknownIdentity(Exception):
 
 
 def digest(value: Plain) -> str:
-    """Digest of plain data, a text of fixed length."""
+    """Return a digest of plain data, a text of 32 hexadecimal digits."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def identity(value: object) -> Plain:
-    """Describe a value by everything that its results depend on. **Raises** `UnknownIdentity`.
+    """Describe a value by everything on which its results depend. **Raises** `UnknownIdentity`.
 
     >>> identity((1.0, "N"))
     {'tuple': [1.0, 'N']}
@@ -80,18 +80,18 @@ def identity(value: object) -> Plain:
 
 
 def difference(one: Plain, other: Plain, name: str = "") -> tuple[str, Plain, Plain] | None:
-    """Place of the first difference between two plain values, and both entries there; None if the values are equal."""
+    """Return the place of the first difference between two plain values, and both entries there; None for equal values."""
     if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
         pairs = [(f"{name}.{key}" if name else key, one[key], other[key]) for key in one]
     elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
         pairs = [(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(zip(one, other, strict=True))]
-    else:  # as text: 1 and 1.0 and True are equal to Python
+    else:  # compared as text, because Python takes 1, 1.0 and True for equal
         return None if json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True) else (name, one, other)
     return next((found for key, a, b in pairs if (found := difference(a, b, key))), None)
 
 
 class _Description:
-    """One description: the values in progress and their number."""
+    """State of one description: the values in progress, the finished ones, and their number."""
 
     def __init__(self) -> None:
         self.active: dict[int, int] = {}
@@ -110,7 +110,7 @@ class _Description:
             return value if np.isfinite(value) else {"float": repr(value)}
         if kind in (complex, bytes, type(Ellipsis), type(NotImplemented), range, slice, np.dtype):
             return {kind.__name__: repr(value)}
-        if id(value) in self.active:  # a function that calls itself, an object that holds itself
+        if id(value) in self.active:  # a function that calls itself, or an object that refers to itself
             return {"again": len(self.active) - self.active[id(value)]}
         if id(value) in self.described:
             return self.described[id(value)][1]
@@ -119,7 +119,7 @@ class _Description:
             found = self._composed(value)
         finally:
             del self.active[id(value)]
-        self.described[id(value)] = (value, found)  # with the value, so that no other one gets its id
+        self.described[id(value)] = (value, found)  # a reference to the value keeps Python from reusing its id
         return found
 
     def _composed(self, value: Any) -> Plain:
@@ -183,7 +183,7 @@ class _Description:
             return {"class": self.of(kind), "state": self.of(state)}
         try:
             reduced = value.__reduce_ex__(4)
-        except Exception as error:  # locks, files, generators, and what else has no state that could be written down
+        except Exception as error:  # locks, files, generators and other objects that cannot be pickled
             raise UnknownIdentity(f"refers to a value of the class {_name(kind)}, which cannot be compared") from error
         if isinstance(reduced, str):
             return {"class": _name(kind), "name": reduced}
@@ -202,9 +202,9 @@ class _Description:
         return {"class": _name(kind), "bases": self.of(list(kind.__bases__)), "digest": digest(entries)}
 
     def _function(self, function: types.FunctionType) -> Plain:
-        home = str(function.__globals__.get("__name__"))  # `functools.wraps` puts another name into `__module__`
+        home = str(function.__globals__.get("__name__"))  # `functools.wraps` overwrites `__module__`
         if _is_library(home) and function.__globals__ is getattr(sys.modules.get(home), "__dict__", None):
-            code: Plain = _version(home)  # a wrapper or a closure of a package, which its version identifies
+            code: Plain = _version(home)  # the version of the package identifies its wrappers and closures
         else:
             code = self._code(function.__code__, function.__globals__)
         names = function.__code__.co_freevars
@@ -216,7 +216,7 @@ class _Description:
     def _cell(self, cell: types.CellType) -> Plain:
         try:
             return self.of(cell.cell_contents)
-        except ValueError:  # a name that has no value yet
+        except ValueError:  # the name has no value yet
             return {"missing": True}
 
     def _code(self, code: types.CodeType, scope: dict[str, Any]) -> Plain:
@@ -243,7 +243,7 @@ class _Description:
                 raise UnknownIdentity(f"calls {name}")
             return name if hasattr(builtins, name) else {"missing": name}
         value = scope[name]
-        for step in rest:  # only the used entry of a module, since others may change
+        for step in rest:  # only the used entry of a module counts; other entries may change
             if not isinstance(value, types.ModuleType) or _is_library(value.__name__):
                 break
             if step.opname not in ("LOAD_ATTR", "LOAD_METHOD") or not hasattr(value, step.argval):
@@ -252,7 +252,7 @@ class _Description:
         return self.of(value)
 
     def _imported(self, level: Any, name: str, entries: Any, scope: dict[str, Any]) -> Plain:
-        """A module that a function imports, or the `entries` that it imports from it."""
+        """Describe a module that a function imports, or the `entries` that the function imports from it."""
         try:
             module = importlib.import_module("." * int(level or 0) + name, scope.get("__package__"))
         except ImportError:
@@ -285,7 +285,7 @@ def _is_users(kind: type) -> bool:
 
 
 def _library_name(value: Any) -> str | None:
-    """Name and version of an object that a package or Python defines under its name; None for other objects."""
+    """Return name and version of an object that a package or Python defines under that name; None for other objects."""
     module, inner = getattr(value, "__module__", None), getattr(value, "__qualname__", None) or getattr(value, "__name__", None)
     if not isinstance(inner, str) or isinstance(value, types.MethodType):
         return None
@@ -306,7 +306,7 @@ def _library_name(value: Any) -> str | None:
 
 @functools.cache
 def _is_library(module: str) -> bool:
-    """True if a module belongs to Python or to an installed package, jaxvib's own included."""
+    """True if a module belongs to Python or to an installed package, including jaxvib."""
     root = module.partition(".")[0]
     if root in ("jaxvib", "optimize"):
         return True

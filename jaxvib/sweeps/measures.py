@@ -19,15 +19,15 @@ from optimize.quantities.quantity import Quantity
 __all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "measure_of"]
 
 _SETTLED_SPEED_SHARE = 0.01
-"""Largest difference of a mean load speed from the last one, relative to the rotor speed, of settled loads."""
+"""Largest difference between a mean load speed and the final one, relative to the rotor speed, at which loads are settled."""
 
 
 @dataclass(frozen=True)
 class RunMeasure:
     """Number that is computed from a run, see `BatchRun`.
 
-    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that gives a scalar, or an array over `axis`, the
-    name of a further dimension ("coordinate", "load"); `meanings`, the words for the values 0, 1, ... of one that is a label.
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that returns a scalar, or an array over `axis`, the
+    name of a further dimension ("coordinate", "load"); `meanings`, the names of the values 0, 1, ... if the measure is a label.
     """
 
     name: str
@@ -43,7 +43,7 @@ class RunMeasure:
 
 
 Measure: TypeAlias = Quantity | RunMeasure
-"""Measure of a study."""
+"""Type of a measure of a study."""
 
 
 def _regime(run: BatchRun) -> Array:
@@ -52,7 +52,7 @@ def _regime(run: BatchRun) -> Array:
 
 
 def _settling(run: BatchRun) -> Array:
-    """End of the last part in which the speed of a load differs from its final speed."""
+    """Return the end of the last part of the run in which the speed of a load differs from its final speed."""
     last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
     away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * jnp.abs(rotor), axis=1)
     late = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
@@ -102,12 +102,12 @@ RUN_MEASURES = {
     )
 }
 """Measures of a run by name: its regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
-foundation force zero to peak, ripple, drift as in `AbstractMeasured`, and the time, to a 64th of the run, after which the
-loads' speeds stay within 1 % of the rotor's of their last ones."""
+foundation force zero to peak, ripple and drift as in `AbstractMeasured`, and the settling time: the time, resolved to 1/64 of
+the run, after which each load speed differs from its final value by less than 1 % of the rotor speed."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:
-    """Measure, looked up by name if it is a text. **Raises** `InputError` for other values."""
+    """Return a measure, looked up by name if it is a text. **Raises** `InputError` for other values."""
     if isinstance(given, (Quantity, RunMeasure)):
         return given
     if isinstance(given, str) and given in RUN_MEASURES:

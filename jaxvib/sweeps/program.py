@@ -27,20 +27,23 @@ _SAMPLES = 1024
 """Number of states in the measuring window of a run."""
 
 _PER_TURN = 8
-"""Minimum number of them in a turn of the rotor; jammed loads turn more slowly."""
+"""Minimum number of states of the window in a turn of the rotor; jammed loads turn more slowly."""
 
 _SLOW_PERIODS = 20
 """Length of the window in periods of the lowest natural frequency, as in `simulate`."""
 
 _MAX_STEPS = 1e9
-"""Maximum number of steps of a run, about an hour of computing."""
+"""Maximum number of steps of a run, about an hour of computation."""
 
 _CODE = {name: k for k, name in enumerate(CASE_STATUSES)}
 
 
 class Chunk(NamedTuple):
-    """Cases of a chunk: values by name of the measure, (cases, ...); `status` (cases,): numbers of `CaseStatus`; `errors`: the
-    sentence of each failed case, by its index."""
+    """Results of the cases of a chunk.
+
+    **Attributes**: `found`, values (cases, ...) by name of the measure; `status` (cases,), numbers of `CaseStatus`; `errors`,
+    the message of each failed case by its index.
+    """
 
     found: dict[str, np.ndarray]
     status: np.ndarray
@@ -57,8 +60,10 @@ def _each(
     mode: int | None,
     identities: str,
 ) -> tuple[tuple[Array, ...], Array]:
-    """The measures of each of the cases (cases, axes), and True for each whose motion stayed finite; `identities` is the digest
-    of those of the measures, see `Study.program`."""
+    """Compute the measures of each case (cases, axes), and True for each case whose motion stayed finite.
+
+    `identities` is the digest of the identities of the measures, see `Study.program`.
+    """
 
     def one(value: Array) -> tuple[tuple[Array, ...], Array]:
         this = put(scene, spots, value)
@@ -66,7 +71,7 @@ def _each(
         if plan is not None:
             separation = (
                 START_SEPARATION if start == "jam" else None
-            )  # with loads at one angle, no run would show that a jam is unstable
+            )  # loads that start at one angle stay together, even in an unstable jam
             state = put_start(initial_state(this, start, mode=mode, separation=separation, throw=False), spots, value)
             run = run_in_batch(this, state, plan)
 
@@ -94,9 +99,9 @@ def _speeds(scene: Scene, values: Array, spots: tuple[Spot, ...]) -> tuple[Array
 
 
 def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: float, steps: int | None) -> BatchPlan:
-    """Plan of steps and window for all cases, by the fastest and the slowest of the `corners` (n, axes) of the study.
+    """Return the plan of steps and window for all cases, from the fastest and the slowest of the study's `corners` (n, axes).
 
-    Frequencies increase with each stiffness and decrease with each mass; therefore the corners have the extreme ones.
+    Frequencies increase with each stiffness and decrease with each mass; therefore the corners have the extreme frequencies.
     """
     fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), spots))
     most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
@@ -107,22 +112,22 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
         name = "until" if steps is None else "steps"
         raise InputError(name, f"needs {until / step:.3g} steps for every run; give a shorter run or fewer steps")
     each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
-    # a number that is whole within rounding is not rounded up
+    # 1e-9: a number that is whole up to rounding errors is not rounded up
     counts = (int(np.ceil(x - 1e-9)) or 1 for x in (each, between))
     return BatchPlan(until, window, _SAMPLES, *counts, implicit=implicit)
 
 
 def shapes(study: Study) -> list[jax.ShapeDtypeStruct]:
-    """Shape and type of each measure of one case, without computing any. Raises what tracing the program raises."""
+    """Return shape and type of each measure of one case by tracing the program. Errors of tracing are passed on."""
     values = jnp.zeros((1, len(study.spots)))
     found, _ = jax.eval_shape(lambda v: _each(study.scene, v, *study.program), values)
     return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in found]
 
 
 def compute(study: Study, chunk: int) -> Chunk:
-    """Compute the cases of a chunk. A case that raises an error is located by bisection and recorded with its sentence.
+    """Compute the cases of a chunk. A case that raises an error is located by bisection and recorded with its message.
 
-    The program always has the same shape: a chunk with fewer cases is padded with copies of its first one.
+    The program always has the same shapes: a chunk with fewer cases is padded with copies of its first one.
     """
     values = study.grid.values(chunk)
     errors: dict[int, str] = {}
@@ -137,13 +142,13 @@ def compute(study: Study, chunk: int) -> Chunk:
 def _computed(
     study: Study, values: np.ndarray, which: np.ndarray, errors: dict[int, str]
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Results of the cases `which` of a chunk; NaN (labels: -1) in the others and in those that raise an error."""
+    """Return the results of the cases `which` of a chunk; NaN (labels: -1) for other cases and cases that raise an error."""
     filled = np.repeat(values[which[:1]], study.size, axis=0)
     filled[which] = values[which]
     try:
         found, finite = _cases(study.scene, jnp.asarray(filled), *study.program)
         return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
-    except RuntimeError as error:  # errors of a running program only; an error of its compilation concerns all cases
+    except RuntimeError as error:  # raised by a running program; an error of its compilation would concern all cases
         if "RESOURCE_EXHAUSTED" in str(error):
             raise
         if len(which) == 1:
@@ -156,7 +161,7 @@ def _computed(
 
 
 def _sentence(error: Exception) -> str:
-    """Line of an error that describes it."""
+    """Return the line of an error message that describes the error."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     messages = [line for line in lines if line.split(":")[0].endswith(("Error", "Exception")) and ": " in line]
     return (messages or lines or [type(error).__name__])[-1]

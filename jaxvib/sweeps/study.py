@@ -1,4 +1,4 @@
-"""A study: a scene, what changes in it, what is measured, and how; from Python or from a file."""
+"""Study of a scene, built from arguments or read from a file: the numbers that change, the measures, the runs."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
 """Measures, or a mapping from names to measures."""
 
 _CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
-"""Cases of a chunk: about a second's work, less than that is taken up by keeping books."""
+"""Default number of cases of a chunk by tier: about a second of computation, which outweighs the cost of writing it."""
 
 _RESERVED = ("status", "error")
 
 _MAX_CASES = 10**9
-"""Cases of a study: their numbers are kept, and a list of their chunks is held in memory."""
+"""Maximum number of cases of a study: their numbers are stored, and the list of their chunks is in memory."""
 
 
 def study(
@@ -52,7 +52,7 @@ def study(
     seed: int = 0,
     chunk: int | None = None,
 ) -> Study:
-    """A study, checked; for the arguments see `sweep`. **Raises** `InputError` for values that are not allowed."""
+    """Return a validated study; for the arguments see `sweep`. **Raises** `InputError` for values that are not allowed."""
     scene = validate_scene(scene)
     if not isinstance(axes, Mapping) or not axes:
         raise InputError("axes", "is empty; name at least one number that changes, such as drive.speed")
@@ -103,7 +103,7 @@ def study(
         forms = shapes(made)
     except (InputError, ComputationError):
         raise
-    except Exception as error:  # of a function of the user
+    except Exception as error:  # any error of a user's function
         problem = f"cannot be computed ({type(error).__name__}: {error}); it gets a Scene and gives a number of JAX"
         raise InputError("measure", problem) from error
     for name, m, form in zip(names, measures, forms, strict=True):
@@ -116,7 +116,7 @@ def study(
 
 
 def _is_name(name: str) -> bool:
-    """True for a name that a folder of the store may have on any file system, and that no figure takes for a formula."""
+    """True if a folder of the store may have this name on any file system, and no figure typesets it as a formula."""
     fits = name.isprintable() and 0 < len(name.encode()) <= 200 and name == name.strip()
     return fits and not set(name) & set("/\\$") and not name.startswith((".", "__")) and name != "zarr.json"
 
@@ -128,7 +128,7 @@ def _plain(spec: AxisSpec) -> Plain:
 
 
 def _named(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
-    """Names of what is measured, each its own: with the mode behind it where quantities of several modes have one name."""
+    """Return the measures and a unique name for each: the mode is appended if a quantity of several modes is measured."""
     if isinstance(measure, Mapping):
         found = {str(name): measure_of(m, f"measure.{name}") for name, m in measure.items()}
         if found:
@@ -153,10 +153,10 @@ _FIELDS = ["scene", "tier", "samples", "sampling", "seed", "chunk", "axes", "run
 
 
 def load_study(path: str | Path) -> Study:
-    """Reads a study file: TOML with the path of a `scene` from there, `[axes]`, `[[measure]]` and, for runs, `[run]`.
+    """Read a study file: TOML with the path of a `scene` relative to the file, `[axes]`, `[[measure]]` and, for runs, `[run]`.
 
-    **Returns** `Study`. **Raises** `InputError` for a file that cannot be read and for everything that is wrong in it, field
-    named.
+    **Returns** `Study`. **Raises** `InputError` for a file that cannot be read and for every error in it, with the name of the
+    field.
 
     >>> import pathlib, tempfile
     >>> from jaxvib.machine.files import TEMPLATES
@@ -217,14 +217,14 @@ def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]
 
 
 def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
-    """A quantity of the user's own: a function of a scene, in a module that Python finds."""
+    """Return a user's quantity: a function of a scene, in a module that Python can import."""
     for key in table:
         if key not in ("function", "unit"):
             raise InputError(f"{field}.{key}", f"is no field here; {suggest_name(key, ['function', 'unit', 'name'])}")
     module, _, function = str(table["function"]).partition(":")
     try:
         found = getattr(importlib.import_module(module), function)
-    except Exception as error:  # whatever the module of the user raises
+    except Exception as error:  # any error of the user's module
         reason = f"{error}" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: {error}"
         problem = f"is {quoted(table['function'])}, which cannot be imported ({reason}); write 'module:function'"
         raise InputError(f"{field}.function", problem) from error
@@ -270,4 +270,4 @@ quantity = "run.load_speed"       # and run.amplitude, run.foundation_force, run
 # function = "mine:stiffness_ratio"
 # unit = ""
 """
-"""A commented study file."""
+"""Commented study file."""
