@@ -1,1 +1,1 @@
-"""Studies of many cases of a scene: labelled, kept on disk, resumed where they stopped, on one machine or several."""
+"""Studies of many cases of a scene: labelled results on disk, resumable, on one machine or several."""

@@ -1,4 +1,4 @@
-"""Chunks computed by workers of Dask: processes on this machine, or a cluster behind a scheduler's address."""
+"""Chunks computed by Dask workers: processes on this machine, or a cluster at a scheduler's address."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def on_a_cluster(
 ) -> Generator[tuple[int, Chunk], None, None]:
     """Compute the chunks by workers; yield each finished chunk with its number. Only this process writes.
 
-    The chunks of a worker that dies are computed by others. If several workers died with a chunk, its cases are "lost".
+    The chunks of a worker that dies are computed by others. If several workers have died with a chunk, its cases are "lost".
 
     **Raises** `InputError` if Dask is not installed, the scheduler does not answer, no worker connects, or a worker has other
     versions.
@@ -47,7 +47,7 @@ def on_a_cluster(
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))
     with contextlib.ExitStack() as stack:
         if scheduler is None:
-            # Dask's profiling of its workers, which is not used here, takes half of their overhead.
+            # Dask profiles its workers by default. This is half of their overhead, and its results are not used here.
             stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
             options = {"dashboard_address": None, "silence_logs": 50}
             address = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **options))
@@ -88,13 +88,13 @@ def on_a_cluster(
 
 
 def _remote(study: Study, chunk: int, key: str, expected_versions: dict[str, str], precise: bool) -> Chunk | str:
-    """Cases of a chunk, computed on a worker, or the reason for a refusal: versions that differ from those of the store."""
+    """Compute the cases of a chunk on a worker, or return the reason for a refusal: versions that differ from the store's."""
     for name, version in versions().items():
         if expected_versions[name] != version:
             return f"has {name} {version}, and the store was begun with {expected_versions[name]}: digits would differ"
     jax.config.update("jax_enable_x64", precise)
     take_a_device()
-    if key not in _STUDIES:  # the first received copy is kept, since the program was compiled for its functions
+    if key not in _STUDIES:  # keep the first received copy, because the program was compiled for its functions
         _STUDIES[key] = dataclasses.replace(study, scene=jax.tree.map(jnp.asarray, study.scene))
     return compute(_STUDIES[key], chunk)
 

@@ -18,7 +18,7 @@ class Progress(NamedTuple):
 
     **Attributes**
 
-    - `done` cases of `cases`, those of former calls included
+    - `done`: number of finished cases of `cases`, including those of earlier calls
     - `rate`: cases per second in this call
     - `left`: estimated seconds until the end
     """
@@ -30,7 +30,7 @@ class Progress(NamedTuple):
 
 
 Report = Callable[[Progress], None]
-"""Function that is called after every chunk."""
+"""Type of a function that is called after every chunk."""
 
 
 def in_this_process(study: Study, todo: Iterable[int]) -> Generator[tuple[int, Chunk], None, None]:
@@ -39,7 +39,7 @@ def in_this_process(study: Study, todo: Iterable[int]) -> Generator[tuple[int, C
 
 
 def timed(cases: int, done: int, report: Report | None) -> Callable[[int], None]:
-    """Function that is called with the number of cases of each finished chunk and reports the progress."""
+    """Return a function that takes the number of cases of each finished chunk and reports the progress."""
     begun, before, now = time.perf_counter(), done, done
 
     def add(more: int) -> None:

@@ -1,4 +1,4 @@
-"""Studies of many cases: run, resumed, read."""
+"""Functions that run, resume and read studies of many cases."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ __all__ = ["CaseCount", "Sweep", "open_sweep", "run_study", "sweep"]
 
 
 _MAX_WORKERS = 16
-"""Maximum number of processes on any machine; on a machine with many cores, four for each core."""
+"""Maximum number of worker processes on a machine with few cores; with more than four cores, four for each core."""
 
 
 class CaseCount(NamedTuple):
@@ -50,7 +50,7 @@ class CaseCount(NamedTuple):
 
 
 class Sweep(Result):
-    """Store of a study and its progress; the numbers themselves stay on disk.
+    """Progress of a study and the path of its store; the numbers stay on disk.
 
     Returned by `sweep` and `open_sweep`.
 
@@ -61,8 +61,8 @@ class Sweep(Result):
     - `cases`: their number
     - `counts`: number of cases with each status
     - `computed`: cases computed in this call, in `seconds`, compilation included
-    - `damaged`: cases whose files were damaged, or cut off while they were written: `sweep` has computed them again,
-      `open_sweep` counts them as missing
+    - `damaged`: cases whose files were damaged or incompletely written; `sweep` has computed them again, `open_sweep` counts
+      them as missing
     """
 
     status: SweepStatus
@@ -136,9 +136,8 @@ def sweep(
     """Compute every case of a study and keep it in a store on disk; an existing store of the same study is continued.
 
     - Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask
-    - A finished chunk is written at once and kept, whatever ends the process; one whose files are damaged is computed again
-    - A case's numbers depend on the case alone: not on the cases beside it, on the order, on the number of workers, or on
-      restarts
+    - A finished chunk is written at once and survives any end of the process; a chunk with damaged files is computed again
+    - The numbers of a case depend on that case alone, not on other cases, their order, the number of workers or restarts
 
     **Arguments**
 
@@ -146,35 +145,37 @@ def sweep(
     - `axes`: a mapping from names to values, see below; typical: 1 to 3 axes of 10 to 100 values
     - `measure`: a list of quantities of `optimize`, functions of your own as `optimize.Quantity`, and names of measures of a
       run (`jaxvib.sweeps.measures.RUN_MEASURES`): "run.regime", "run.mode", "run.load_speed", "run.amplitude",
-      "run.foundation_force", "run.settling_time", ... ; or a mapping from the names that they shall have
+      "run.foundation_force", "run.settling_time", ...; or a mapping from names in the store to these
     - `store`: a folder, usually with the ending ".zarr"
     - `tier` of quantities of a jam: "leading", "exact" or "time"; default: that of each quantity
-    - `until`, s, `start`, `mode`, `steps`: runs go from the start ("rest", or "jam" near a `mode`), with the axes' numbers in
-      it, to `until`, by this number of equal steps, the same in all cases; default: one for each radian of the fastest motion
+    - `start`, `mode`: the start of runs, "rest" (the default), or "jam" for a start near a jam `mode`; the axes may change its
+      numbers
+    - `until`: the end of runs, s
+    - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion
     - `samples`, `seed`, `sampling`: number and kind of samples, "low_discrepancy" or "random"; typical: 1000 to 100,000
-    - `chunk`: cases that are computed and written together; it is part of the store's record; typical: the default, about a
-      second's work. Smaller chunks lose less at an interrupt and cost more file operations
+    - `chunk`: number of cases that are computed and written together; it is part of the store's record; typical: the default,
+      about a second of computation. Smaller chunks lose less at an interruption and cost more file operations
     - `workers`: number of processes on this machine; or `scheduler`, the address of a Dask scheduler ("tcp://10.0.0.1:8786"),
-      which has `timeout`, s, to answer. They need the extra `cluster`
+      which must answer within `timeout`, s. Both need the extra `cluster`
     - `report`: a function that is called with a `Progress` after each chunk
 
     Names of `axes`:
 
-    - a number of the scene by the name that designs have for it ("machine.stiffness[0]", "loads.drag", "drive.speed")
+    - a number of the scene by its name in a design ("machine.stiffness[0]", "loads.drag", "drive.speed")
     - a number of the start ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]" m/s; without
-      an entry, all alike)
+      an index, all entries change together)
 
     Values of an axis are a list, or a table of `from`, `to`, `count` and `scale` ("even" or "log"). Cases are all combinations.
     Numbers whose table has no `count` are sampled together, `samples` times for each combination of the others.
 
-    **Returns** `Sweep`. A case that fails raises nothing: its status and its sentence are in the store.
+    **Returns** `Sweep`. A case that fails raises no error; its status and its message are in the store.
 
     **Raises** `InputError` for
 
     - values that are not allowed
-    - a store of another study (any value that its results depend on makes another study, including those in functions of your
-      own)
-    - a store into which another sweep writes, and one that cannot be written
+    - a store of another study; studies differ if any value differs on which results depend, including values in your own
+      functions
+    - a store into which another sweep is writing, and a store that cannot be written
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import pathlib, tempfile, jaxvib as jv
@@ -215,7 +216,7 @@ def run_study(
     timeout: Number = "30 s",
     report: Report | None = None,
 ) -> Sweep:
-    """Computes what is missing in the store of a study; for the arguments see `sweep`."""
+    """Compute the missing cases in the store of a study; for the arguments see `sweep`."""
     begun = time.perf_counter()
     path = Path(store)
     if workers is not None:
@@ -238,7 +239,7 @@ def _computed(
     timeout: Number,
     report: Report | None,
 ) -> Sweep:
-    """Compute what is missing in a store that this process has locked, and again what is damaged."""
+    """Compute the missing chunks of a store that this process has locked, and recompute the damaged ones."""
     if (changed := new_study.changed()) is not None:
         problem = "is a function of which a part, or a value that it refers to, has changed since the study was made"
         raise InputError(f"measure.{changed}", f"{problem}; make the study again")
@@ -255,7 +256,7 @@ def _computed(
         if workers is None and scheduler is None:
             source = in_this_process(new_study, todo)
         else:
-            from jaxvib.sweeps.cluster import on_a_cluster  # asks for Dask
+            from jaxvib.sweeps.cluster import on_a_cluster  # needs Dask
 
             source = on_a_cluster(new_study, todo, workers=workers, scheduler=scheduler, timeout=timeout)
         with contextlib.closing(source):
@@ -272,11 +273,11 @@ def _cases(new_study: Study, chunk: int) -> int:
 
 @validated
 def open_sweep(store: str | Path) -> Sweep:
-    """Read the store of a finished or running study: every file once, so that damaged chunks are known and counted.
+    """Read the store of a finished or running study. Every file is read once, to count the damaged chunks.
 
     **Arguments**: `store`: the folder of the study.
 
-    **Returns** `Sweep`. **Raises** `InputError` for a folder that is no store, or a store whose metadata are damaged.
+    **Returns** `Sweep`. **Raises** `InputError` for a folder that is not a store, or a store whose metadata are damaged.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> from optimize import jam_frequency
