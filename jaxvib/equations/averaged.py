@@ -1,40 +1,40 @@
 """Averaged equations of motion: complex amplitudes of the carrier and load speeds in place of vibrations.
 
-**Exactly modulated carrier.** Let theta be the loads' mean angle and Omega = theta' their mean rate, phi_j = theta + psi_j,
-w_j = phi_j'. With q = Re(Y e^{i theta}), q' = Re(V e^{i theta}) and a load's position Re(R e e^{i phi}), e = (1, -i) for the
-directions (across, up), the carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'' (M with the loads' masses)
-become, without any approximation,
+**Carrier.** Let theta be the loads' mean angle and Omega = theta' their mean rate, phi_j = theta + psi_j, w_j = phi_j'. The
+motion is q = Re(Y e^{i theta}), q' = Re(V e^{i theta}), and the position of a load is Re(R e e^{i phi}) with e = (1, -i) for
+the directions (across, up). The carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'', where M includes the
+loads' masses, become without any approximation
 
     Y' = V - i Omega Y
     V' = A - i Omega V,     M A = - (C + n G) V - K Y + B^T e sum_j S_j e^{i psi_j} (w_j^2 - i w_j'),     S_j = m_j R_j
 
-A is the complex amplitude of the acceleration. No derivative of Y is dropped, so beats, the ringing after a resonance was
-passed, and carriers that are coupled by the rotor's speed are followed as they are.
+A is the complex amplitude of the acceleration. No derivative of Y is dropped. Beats, the ringing after the passage of a
+resonance, and the coupling of coordinates by the rotor speed are therefore included exactly.
 
-**Averaged loads.** The load's equation, with I_j = kappa_j m_j R_j^2 and D_j = b_Wj R_j^2, holds the product of two quantities
-that turn with theta. Its slow part is kept, the part at twice the speed is dropped:
+**Averaged loads.** Let I_j = kappa_j m_j R_j^2 and D_j = b_Wj R_j^2. The load's equation contains the product of two quantities
+that turn with theta. The averaged equation keeps the slow part of this product and drops the part at twice the speed:
 
     I_j w_j' = D_j (n - w_j) - (S_j/2) Im(e^{-i psi_j} a_j),     psi_j' = w_j - Omega,     a_j = e^H B_j A
 
-Only a_j, the forward circular part of the acceleration where the load runs, drives it; the backward part averages to zero.
-Loads at one port feel one number a; where they run at stations s_j of their own, B_j = B + s_j T, it is a_j = a_1 + s_j a_2.
-As A contains w_j', the loads' own reaction, these numbers are implicit: with the levers g_j = 1 or (1, s_j),
-P = e^H B M^-1 B^T e of those one or two rows, h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j
+Only a_j, the forward circular part of the acceleration at the load, drives the load; the backward part averages to zero. All
+loads at one port have the same a. For loads at different stations s_j, B_j = B + s_j T and a_j = a_1 + s_j a_2. A contains w_j'
+(the reaction of the loads); therefore a, or (a_1, a_2), is the solution of a linear system. With the levers g_j = 1 or
+(1, s_j), P = e^H B M^-1 B^T e of those one or two rows, h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j, the system is
 
     (1 - P sum_j h_j g_j g_j^T) a + P sum_j h_j e^{2 i psi_j} g_j g_j^T conj(a)
         = - e^H B M^-1 ((C + n G) V + K Y) + P sum_j g_j S_j e^{i psi_j} (w_j^2 - i f_j)
 
-**What is lost.** The dropped torque shakes the loads' angles at twice their speed by
-r_j = S_j |e^T B_j A| / (2 I_j (2 w_j)^2) rad, and r_j is what the relative error is made of: it is of first order in
-eps = S/(M R), the loads' share of the mass, times the dynamic magnification. Where the carrier answers circularly to a circling
-force (two equal directions), e^T B A = 0 and the averaged equations are exact.
+**Error.** The dropped torque makes the loads' angles vibrate at twice their speed with the amplitude
+r_j = S_j |e^T B_j A| / (2 I_j (2 w_j)^2) rad. The relative error is of the order of r_j, that is of first order in
+eps = S/(M R), the loads' share of the mass, times the dynamic magnification. If a rotating force makes the carrier move on a
+circle (two equal directions), e^T B A = 0 and the averaged equations are exact.
 
-The equilibria are the leading-order jams exactly: V = i Omega Y, A = -Omega^2 Y turn them into `steady_displacement` and
-`jam_rotor_speed`. Gravity and every other potential of the load's angle have mean torque 0.
+The equilibria are exactly the leading-order jams: V = i Omega Y and A = -Omega^2 Y turn the equations into those of
+`steady_displacement` and `jam_rotor_speed`. Gravity and every other potential of the load's angle have mean torque 0.
 
 Source: the method of averaging, N. N. Bogoliubov, Yu. A. Mitropolsky, Asymptotic Methods in the Theory of Non-linear
-Oscillations, 1961; I. I. Blekhman, Synchronization in Science and Technology, 1988. The equations averaged are the antiphase
-paper's (1), (2) in general form.
+Oscillations, 1961; I. I. Blekhman, Synchronization in Science and Technology, 1988. The averaged equations are (1), (2) of the
+antiphase paper in general form.
 """
 
 from __future__ import annotations
@@ -71,16 +71,19 @@ _CIRCLE = (1.0, -1.0j)
 
 
 def mean_torque(unbalance: Array, felt: Array) -> Array:
-    """-(S/2) Im(e^{-i psi} a), N m: the mean torque of a vibration on a load.
+    """Return -(S/2) Im(e^{-i psi} a), N m: the mean torque of a vibration on a load.
 
-    **Arguments**: `unbalance` S = m R, kg m; `felt` e^{-i psi} a, m/s^2: with a = e^H B A, the forward circular part of the
-    acceleration of the point that carries the load, as the load at its phase psi feels it. Arrays of one shape.
+    **Arguments**, arrays of one shape
+
+    - `unbalance` S = m R, kg m
+    - `felt` e^{-i psi} a, m/s^2: the forward circular part a = e^H B A of the acceleration of the point that carries the load,
+      relative to the phase psi of the load
     """
     return -unbalance * felt.imag / 2.0
 
 
 class Amplitudes(eqx.Module):
-    """A slowly changing motion; also the time derivative of one.
+    """Slowly changing motion, or the time derivative of one.
 
         q = Re(displacement e^{i theta}),  q' = Re(velocity e^{i theta}),  phi_j = theta + phase_j,  theta' = mean of rate_j
 
@@ -95,11 +98,11 @@ class Amplitudes(eqx.Module):
 
 
 class Averaged(eqx.Module):
-    """The averaged equations of a scene, ready for time integration; a pure function of time (s) and `Amplitudes`.
+    """Averaged equations of a scene for time integration; a pure function of time (s) and `Amplitudes`.
 
-    - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), M with the loads' masses
-    - `port` (levers, np, nd): B and, where loads have stations, T; `input_matrix` M^-1 of their transposes, (levers, np, nd)
-    - `levers` g (levers, count): 1 and, where loads have stations, s_j m
+    - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), where M includes the loads' masses
+    - `port` (levers, np, nd): B and, if loads have stations, T; `input_matrix`: M^-1 times their transposes, (levers, np, nd)
+    - `levers` g (levers, count): 1 and, if loads have stations, s_j in m
     - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s, all (count,)
     """
 
@@ -116,7 +119,7 @@ class Averaged(eqx.Module):
     axes: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
-        """The time derivative of `state` at time `t`."""
+        """Return the time derivative of `state` at time `t`."""
         n = self.drive.rotor_speed(t, None)
         at = jnp.cos(state.phase) + 1j * jnp.sin(state.phase)
         free = self.drag * (n - state.rate) / self.inertia
@@ -148,8 +151,10 @@ class Averaged(eqx.Module):
         )
 
     def ripple(self, state: Amplitudes) -> Array:
-        """Amplitude of the angle of each load under the dropped torque, (count,) rad: S |e^T B i Omega V| / (2 I (2
-        Omega)^2)."""
+        """Return the amplitude of each load's angle under the dropped torque, (count,) rad.
+
+        S |e^T B i Omega V| / (2 I (2 Omega)^2)
+        """
         backward = times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
         backward = jnp.sum(self.levers * backward[:, None], axis=0)
         size = magnitude(backward)
@@ -158,7 +163,7 @@ class Averaged(eqx.Module):
         return jnp.where(turning, self.unbalance * size / (8.0 * self.inertia * jnp.where(turning, omega, 1.0)), 0.0)
 
     def _circle(self) -> Array:
-        """e, a row for each direction of the port."""
+        """Return e, a row for each direction of the port."""
         return jnp.asarray([_CIRCLE[axis] for axis in self.axes])[None, :, None]
 
 
@@ -168,10 +173,10 @@ def averaged_loads(scene: Scene) -> CircularLoads:
 
 
 def averaged_field(scene: Scene) -> Averaged:
-    """The averaged equations of `scene`, see the module's page for what they are and what they leave out.
+    """Return the averaged equations of `scene`; the module docstring derives them and states their error.
 
-    **Returns** `Averaged`; `jit`, `vmap` and `grad` go through it and through the scene. **Raises** `InputError` for loads
-    that do not move on a circle, motors that loads slow down, and effects other than gravity, whose mean torque is 0.
+    **Returns** `Averaged`; `jit`, `vmap` and `grad` apply to it and to the scene. **Raises** `InputError` for loads that do not
+    move on a circle, for motors, and for effects other than potentials such as gravity, whose mean torque is 0.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jax.numpy as jnp, jaxvib as jv
@@ -187,7 +192,7 @@ def averaged_field(scene: Scene) -> Averaged:
 
 
 def averaged_model(model: LinearModel) -> Averaged:
-    """`averaged_field` of a scene that is assembled and checked already."""
+    """Return `averaged_field` of a scene that is already assembled and validated."""
     carrier, mount, loads, drive = model.carrier, model.mount, turning_loads(model.scene), model.scene.drive
     one = jnp.ones((1, loads.count), dtype=model.mass.dtype)
     levers = jnp.concatenate([one if lever is None else lever[None] for lever in mount.levers])
@@ -217,12 +222,13 @@ def averaged_model(model: LinearModel) -> Averaged:
 
 
 def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: Array) -> Array:
-    """Growth of small disturbances of a jam, 1/s: the largest real part of an eigenvalue of the averaged equations about it.
+    """Return the growth rate of small disturbances of a jam, 1/s.
 
-    The common turn of all phases, which nothing restores, is left out. NaN where the jam is not finite.
+    It is the largest real part of the eigenvalues of the averaged equations, linearized about the jam. The eigenvalue 0 of a
+    common shift of all phases is left out. The result is NaN if the jam is not finite.
 
-    **Arguments**: `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The drive is one of
-    constant speed.
+    **Arguments**: `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The speed of the
+    drive is constant.
     """
     nd, count = displacement.shape[0], phase.shape[0]
 
@@ -234,7 +240,7 @@ def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: A
 
     y = jnp.concatenate([displacement, 1j * omega * displacement])
     matrix = jax.jacfwd(flow)(jnp.concatenate([y.real, y.imag, jnp.full_like(phase, omega), phase]))
-    # Eigenvalues of a matrix that is not finite keep a library busy for ever.
+    # The library routine for eigenvalues does not return for a matrix that is not finite.
     finite = jnp.all(jnp.isfinite(matrix))
     values = eigenvalues_in_turn(jnp.where(finite, matrix, 0.0))
     common = jnp.argmin(jnp.abs(values))
@@ -243,11 +249,11 @@ def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: A
 
 
 def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
-    """The slow motion that a state of the full equations belongs to: Re Y e^{i theta} = q, Re V e^{i theta} = q'.
+    """Return amplitudes of a state of the full equations: Re Y e^{i theta} = q, Re V e^{i theta} = q'.
 
-    What is not seen, the quarter of a period later, is that of a vibration at the loads' mean speed; where they turn at
-    less than half the lowest natural frequency, and so cannot have caused it, that of ringing at the natural frequencies.
-    A load's rate is taken for its mean.
+    The state determines only these real parts. The imaginary parts follow from the assumption that the carrier vibrates at the
+    loads' mean speed. If the loads turn at less than half the lowest natural frequency, they cannot have caused the vibration,
+    and the carrier is assumed to ring at its natural frequencies. Each load's rate is used as its mean rate.
     """
     (angle,), (rate,) = state.angle, state.rate
     model = linear_model(scene)
@@ -269,7 +275,7 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _with_conjugate(a: Array, b: Array, right: Array) -> Array:
-    """x of a x + b conj(x) = right: written out for one number, otherwise as real equations of twice the number."""
+    """Return x of a x + b conj(x) = right: in closed form for one number, otherwise from twice as many real equations."""
     if right.shape[0] == 1:
         a, b = a[0], b[0]
         return (jnp.conj(a) * right - b * jnp.conj(right)) / (a.real**2 + a.imag**2 - b.real**2 - b.imag**2)

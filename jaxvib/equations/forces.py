@@ -72,8 +72,8 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     **Arguments**
 
     - `scene` and a `state` of it
-    - `t`, s: the time, which determines the angle of an ideal drive's rotor. It matters to an imbalance alone; typical: 0 (the
-      default) without an imbalance
+    - `t`, s: the time, which determines the angle of an ideal drive's rotor. It matters only for a rotor with an imbalance;
+      typical: 0 (the default) without an imbalance
 
     **Returns** a scalar, J. `jit`, `vmap` and `grad` go through it.
 
@@ -90,7 +90,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 
 
 def _at_time(t: Array | float, state: State) -> Any:
-    """A time as a number of a program: another one needs no other program."""
+    """Return a time as an array, so that one program serves all times."""
     return t if isinstance(t, Array) else np.asarray(t, state.displacement.dtype)
 
 
@@ -120,7 +120,7 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
 def _load_energies(
     loads: Loads | None, mount: Mount, effects: tuple[Effect, ...], velocity: Array, state: ExciterState, speed: Array
 ) -> list[Array]:
-    """Kinetic and potential energy of the loads of an exciter, and of their spin, J."""
+    """Return the kinetic and potential energies of an exciter's loads, and the energy of their spin, J."""
     if loads is None:
         return []
     p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
@@ -149,8 +149,8 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
         P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of supports and contacts
         M_j = b_W R^2 (speed - phi_j') + friction
 
-    The torque T turns an ideal drive's rotor against loads, their spin and the imbalance d. Loads that slide dissipate - F_t.c
-    besides. The rate of the energy is the difference, dE/dt = P_in - P_diss.
+    The torque T turns an ideal drive's rotor against loads, their spin and the imbalance d. Loads that slide also dissipate
+    - F_t.c. The rate of the energy is the difference, dE/dt = P_in - P_diss.
 
     **Arguments**
 
@@ -204,7 +204,7 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
 def _load_power(
     exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[Array, Array, list[Array]]:
-    """Torque of the rotor on the loads, N m; power of the rotor that spins and slides them; powers that they lose, W."""
+    """Return the torque of the rotor on the loads, N m, its power to spinning and sliding loads, W, and the lost powers, W."""
     loads, g = exciter.loads, total_gravity(exciter.effects)
     taken = loads.resistance(state.angle, state.rate, speed)
     sliding, (supplied, lost_in_contact) = _spin_power(exciter, state, change, at_load, speed)
@@ -225,8 +225,11 @@ def _load_power(
 def _spin_power(
     exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-    """The rates of the coordinates that a load's slip makes up for; what the rotor puts into loads that spin and slide, and
-    what sliding takes, W, but for the friction of rolling."""
+    """Return rates and powers of loads that spin and slide.
+
+    **Returns** the rates of the coordinates that are equivalent to the slip of each load; the power of the rotor to loads that
+    spin and slide, W; the power that sliding dissipates, W, without rolling friction.
+    """
     loads, spin, zero = exciter.loads, state.spin, jnp.zeros(())
     if spin is None:
         return (), (zero, zero)
@@ -253,8 +256,8 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
         N = m (centrifugal force of u' - n . (acceleration of the load's carrier + gravity upward)),    see `Loads.normal_force`
 
-    The equations then keep a load on its track. Friction of the normal force is then 0. n is the direction in
-    which the load presses.
+    n is the direction in which the load presses. If N is negative, the equations keep the load on its track, and friction
+    that is proportional to N is 0.
 
     **Arguments**
 
@@ -295,7 +298,7 @@ def _normal_force(scene: Scene, t: Array, state: State) -> Array:
 
 
 def _imbalance_rate(exciter: Exciter, mount: Mount, turn: Array) -> Array:
-    """d'(theta).P (nd,) of the rotor's imbalance: the carrier's share of its momentum per speed of the rotor."""
+    """Return d'(theta).P (nd,) of the rotor's imbalance: its momentum in the carrier's coordinates per rotor speed."""
     static, moment = mount.rotor_rows(), mount.tilt
     row = jnp.zeros_like(static[0])
     for term in terms_of(exciter.effects, RotorImbalance):
