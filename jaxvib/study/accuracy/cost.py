@@ -127,7 +127,7 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
 
 
 def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
-    """Result of a call, the time of the fastest call, and the additional time of the first one, s."""
+    """Return the result of a call, the time of the fastest call, and the additional time of the first one, s."""
     begun = time.perf_counter()
     value = jax.block_until_ready(call())
     first, best, spent = time.perf_counter() - begun, np.inf, 0.0
@@ -142,7 +142,7 @@ def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
 
 
 def relative(value: ArrayLike, reference: np.ndarray) -> float:
-    """Largest difference, relative to the largest entry; infinite for values that are not finite."""
+    """Return the largest difference, relative to the largest entry; infinite for values that are not finite."""
     difference = float(np.max(np.abs(np.ravel(np.asarray(value, float)) - reference)) / np.max(np.abs(reference)))
     return difference if np.isfinite(difference) else np.inf
 
@@ -156,6 +156,6 @@ def row_of(
     repeats: int,
     dtype: str = "float64",
 ) -> CostRow:
-    """Row of the timed `call`, whose `error` is computed afterwards."""
+    """Time a `call` and return its row; the `error` is computed after the timing."""
     value, seconds, compiling = timed(call, repeats)
     return CostRow(tier, method, dtype, setting, error(value), seconds, compiling)

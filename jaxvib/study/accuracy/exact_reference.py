@@ -23,22 +23,22 @@ SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
 
 
 class ExactJam(NamedTuple):
-    """Exact jam with many points and with fewer."""
+    """Exact jam with many collocation points, and with fewer for the estimate of its error."""
 
     mode: int
     fine: Orbit
     coarse: Orbit
 
     def length(self, scene: Scene, tolerance: float) -> float:
-        """Duration, s, after which a run has forgotten its start to the tolerance, with the measuring window; for a stable
-        jam."""
+        """Return the duration, s, of a run to a stable jam: the time in which the influence of its start decays to the
+        tolerance, and the measuring window."""
         rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
         window = slow_period(scene) * SLOW_PERIODS
         return min(window + np.log(1.0 / tolerance) / rate, slow_period(scene) * MOST_PERIODS)
 
 
 def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
-    """Exact jam of a mode (default: the last but one that is stable by its slope).
+    """Return the exact jam of a mode (default: the last but one that is stable by its slope).
 
     **Raises** `InputError` for a drive whose speed is not constant, and if no mode is stable.
     """
@@ -49,7 +49,7 @@ def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
 
 
 def usual_mode(scene: Scene) -> int:
-    """Default jam mode: the last but one that is stable by its slope.
+    """Return the default jam mode: the last but one that is stable by its slope.
 
     **Raises** `InputError` if no mode is stable, and for the same scenes as `jam_modes`.
     """
@@ -61,17 +61,17 @@ def usual_mode(scene: Scene) -> int:
 
 
 def collocation_points(scene: Scene, points: int) -> int:
-    """Number of points on half a period, or with the same spacing on a whole one if that is needed."""
+    """Return the number of points on half a period, or with the same spacing on a whole one if the motion needs it."""
     return points if has_half_turn(scene.all_effects) else 2 * points + 1
 
 
 def slow_period(scene: Scene) -> float:
-    """The longest period of the carrier's natural motions, s."""
+    """Return the longest period of the carrier's natural motions, s."""
     frequencies = natural_frequencies(scene)
     return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
 
 
 def unstable(tiers: str, jam: ExactJam) -> str:
-    """Sentence with the reason why time integration cannot compute an unstable jam."""
+    """Return a sentence with the reason why time integration cannot compute an unstable jam."""
     largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
     return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"

@@ -40,7 +40,8 @@ _SAFETY = 3.0
 """Factor on the error of finite differences within which a difference counts as noise."""
 
 _LARGE, _TINY = 1e-2, 1e4 * float(np.finfo(float).eps)
-"""Changes are as large as the largest one above this share of it; below this share of the quantity itself they are rounding."""
+"""Share of the largest change above which a change counts as equally large, and share of the quantity below which a change
+counts as rounding."""
 
 
 class GradientStatus(eqx.Enumeration):
@@ -222,7 +223,7 @@ def check_gradients(
         return put_numbers(scene, numbers, at + shares * scales)
 
     def by(shares: Array) -> Array:
-        """Values of the quantity with each number changed by that share of its size."""
+        """Return the values of the quantity with each number changed by that share of its size."""
         given = call_user(quantity, "quantity", put(shares))
         if not is_real(given):
             raise InputError("quantity", f"gives {quoted(given)}; it must give one real number")
@@ -262,7 +263,7 @@ _MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]
 
 
 def _movable(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber], np.ndarray, tuple[str, ...]]:
-    """Checked numbers, the sizes to which their steps are relative, and the names of numbers at a bound."""
+    """Return the checked numbers, the sizes to which their steps are relative, and the names of numbers at a bound."""
     found, scales, left_out = [], [], []
     for name in numbers_of(scene) if free is None else free:
         for each in find_number(scene, name, "free").single(scene):
@@ -285,7 +286,7 @@ def _central(by: Callable[[Array], Array], n: int, i: int, step: float) -> float
 
 
 def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, float]:
-    """Derivative from central differences (k,) with decreasing steps, its error, and the best step."""
+    """Return the derivative from central differences (k,) with decreasing steps, its error, and the best step."""
     better = central[1:] + (central[1:] - central[:-1]) / (_RATIO**2 - 1.0)
     apart = np.abs(np.diff(better))
     rounding = np.finfo(float).eps * abs(value) / np.asarray(_DIFFERENCE_STEPS[2:-1])
@@ -303,7 +304,7 @@ def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, floa
 
 
 def _parts(central: np.ndarray, slopes: np.ndarray, value: float) -> bool:
-    """True if the quantity changes as much at small steps as at large ones, consistent with its derivatives (r,).
+    """Return True if the quantity changes as much at small steps as at large ones, consistent with its derivatives (r,).
 
     Noise also causes changes at small steps, but leaves the derivatives unchanged; a wrong derivative leaves the quantity
     unchanged.

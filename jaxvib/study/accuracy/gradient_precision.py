@@ -35,11 +35,11 @@ _supports = operator.attrgetter("machine.stiffness")
 """Stiffnesses of the supports of a scene."""
 
 _Way: TypeAlias = tuple[str, str, str, Callable[[Array], Array | np.ndarray]]
-"""Tier, method and setting in words, and the gradient at stiffnesses."""
+"""Names of tier, method and setting, and the function from stiffnesses to the gradient."""
 
 
 def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: int) -> Cost:
-    """Gradient of the largest amplitude of a jam by the stiffnesses of the supports, by all methods; see `work_precision`."""
+    """Return the cost of the gradient of a jam's largest amplitude by the supports' stiffnesses; see `work_precision`."""
     mode, supports = jam.mode, _supports(scene)
     stiffness = jnp.ravel(supports)
     few, more, most = (collocation_points(scene, points) for points in (16, 24, 32))
@@ -76,7 +76,7 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
 
 
 def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
-    """Gradient by runs of the scene `at` some stiffnesses, which start near a stable jam."""
+    """Return gradients by runs of the scene `at` some stiffnesses, which start near a stable jam."""
     until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
     max_steps = min(enough_steps(frequency_bounds(scene)[0], jnp.asarray(until)), _MOST_NOTED)
 
@@ -104,7 +104,7 @@ def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: flo
 
 
 def _differences(value: Callable[[Array], Array], at: Array) -> np.ndarray:
-    """Central differences with relative steps of 1e-5; 0 for numbers that are 0."""
+    """Return central differences with relative steps of 1e-5; 0 for numbers that are 0."""
     steps = 1e-5 * np.asarray(at)
     whole = np.zeros(len(steps))
     for k in np.flatnonzero(steps):

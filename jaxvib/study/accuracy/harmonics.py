@@ -40,10 +40,10 @@ class HarmonicConvergence(Result):
 
     **Attributes**
 
-    - `harmonics` (n,): the highest one of the carrier
+    - `harmonics` (n,): the highest harmonic of the carrier
     - `omega` (w,), rad/s, of the jams
-    - `error` (n, w), relative, of the rotor speed, by comparison with twice as many points as the last
-    - `known` (n, w): the estimate of the error by each jam
+    - `error` (n, w): relative error of the rotor speed, by comparison with twice the largest number of points
+    - `known` (n, w): the estimate of the error by each jam itself
     """
 
     status = Computed.done

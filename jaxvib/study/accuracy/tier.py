@@ -30,21 +30,21 @@ class JamValues(Protocol):
 
     @property
     def amplitude(self) -> Array:
-        """(nd,) m, of tilts rad, zero to peak."""
+        """Amplitudes (nd,) m, of tilts rad, zero to peak."""
         ...
 
     @property
     def foundation_force(self) -> Array:
-        """N, zero to peak."""
+        """Amplitude of the foundation force, N, zero to peak."""
         ...
 
 
 class Tier(NamedTuple):
-    """A way to compute a jam.
+    """Method to compute a jam.
 
-    **Attributes**: `name`; `answers`: which questions, in words; `require(scene)` raises `InputError`, which names the property
-    that a part of the scene lacks, where the tier cannot answer; `jam(scene, mode, until)` the jam mode's result, until a time
-    (s) where the tier integrates in time.
+    **Attributes**: `name`; `answers`: text on its purpose; `require(scene)` raises `InputError` if the tier cannot include the
+    scene, and names the property that a part of the scene lacks; `jam(scene, mode, until)` returns the result for a jam mode,
+    integrated until a time (s) if the tier integrates in time.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Tier(NamedTuple):
     jam: Callable[[Scene, int, float], JamValues]
 
     def refusal(self, scene: Scene) -> str | None:
-        """Sentence by which the tier refuses the scene, otherwise None.
+        """Return the sentence with which the tier refuses the scene, or None if it includes the scene.
 
         >>> import jaxvib as jv
         >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),

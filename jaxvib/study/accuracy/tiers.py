@@ -29,8 +29,8 @@ __all__ = ["TierValues", "Tiers", "compare_tiers"]
 
 
 class TierValues(eqx.Module):
-    """One tier's answers, NaN where it has none: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,
-    `stable` (n,); `message` (n sentences) says of each whether it is there, or why not."""
+    """Results of one tier, NaN for missing ones: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,
+    `stable` (n,); `message` (n sentences): the outcome of each, with the reason for a missing one."""
 
     omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "mass"))
     amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "mass", "coordinate"))

@@ -186,7 +186,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
 
 
 def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cost:
-    """Quantity of a motion without a jam, measured at the end of a run from rest."""
+    """Return the cost of a quantity of a motion without a jam, measured at the end of a run from rest."""
     end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
 
     def read(found: Result) -> Array:
@@ -196,7 +196,7 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
 
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
-        """Value computed at the first use, so that the row of the same program includes the time of compiling."""
+        """Return the reference value, computed at the first use: rows of the same program then include its compilation."""
         run = simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
         return np.ravel(np.asarray(read(run), float))
 
@@ -207,7 +207,7 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
 def _integrated(
     ask: _Ask, read: Callable[[Result], Array], error: Callable[[Array], float], start: State, length: Callable[[float], float]
 ) -> tuple[list[CostRow], list[str]]:
-    """The quantity at the end of averaged and full runs, of a `length` for each tolerance."""
+    """Return rows of the quantity at the end of averaged and full runs, with a `length` for each tolerance."""
     full, rows, left_out = _full(ask, start, length, lambda run: error(read(run))), [], []
     for tolerance in _AVERAGED:
         end = length(tolerance)
@@ -225,10 +225,10 @@ def _integrated(
 
 
 def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
-    """Full runs by every solver to every tolerance, in double and (the default method) in single precision."""
+    """Return rows of full runs by every solver to every tolerance, in double and (default method) in single precision."""
     ends = {tolerance: length(tolerance) for tolerance in ask.tolerances}
     fastest, _ = frequency_bounds(ask.scene)
-    steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # the same for all, since it is a part of the program
+    steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # one number for all runs, since it is part of the program
 
     def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:
         solver = SOLVERS[name]()
@@ -274,7 +274,7 @@ def _final_state(ask: _Ask, end: float | None) -> Cost:
 
     def error(run: Run) -> float:
         last, exact = _last(run), _last(best())
-        single = run.error.dtype.itemsize < 8  # of its angles whole turns are not known
+        single = run.error.dtype.itemsize < 8  # the number of whole turns of its angles is unknown
         value = float(scaled_error(turned(last, exact) if single else last, exact, scale()))
         return value if np.isfinite(value) else np.inf
 

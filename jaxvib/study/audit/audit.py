@@ -197,7 +197,7 @@ def audit(
 
 
 def _with_computed_advice(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
-    """Row of a number with the advice of its effect, if that was computed."""
+    """Return the row of a number with the advice on its effect, if that was computed."""
     for effect in effects:
         if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
             return row._replace(advice=effect.advice, says=f"{row.says}; the advice is that of the computed effect")

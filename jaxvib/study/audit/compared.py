@@ -46,8 +46,8 @@ class EffectRow(NamedTuple):
       `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN if unknown
     - `uncertainty` of these changes
     - cost of the effect, with it less without: `operations` of the equations of motion; `seconds` of a run of 100 turns;
-      `compile`, seconds of processor to trace and compile that run. NaN if no time was taken. Small differences of times are
-      the clock's noise
+      `compile`, seconds of processor time to trace and compile that run; NaN without timings. Small differences of times are
+      timing noise
     - `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `says`: the reason, with its numbers
     """
 
@@ -84,18 +84,18 @@ class RepeatedComparison:
         self._times: dict[int, tuple[Scene, tuple[float, float]]] = {}
 
     def tier(self, *scenes: Scene) -> str:
-        """Name of the tier that computes the motion of all these scenes."""
+        """Return the name of the tier that computes the motion of all these scenes."""
         return "exact orbit" if all(self.comparison.has_exact_orbit(scene) for scene in scenes) else "full"
 
     def values(self, scene: Scene, tier: str) -> MotionValues:
-        """Values of the motion of a scene by a tier."""
+        """Return the values of the motion of a scene by a tier."""
         exact = tier == "exact orbit"
         if (id(scene), exact) not in self._known:  # stored with its scene, whose id stays unique this way
             self._known[id(scene), exact] = scene, (self.comparison.exact if exact else self.comparison.full)(scene)
         return self._known[id(scene), exact][1]
 
     def times(self, scene: Scene) -> tuple[float, float]:
-        """Time of a run of 100 turns of the rotor, and of tracing and compiling it, s; NaN without timings."""
+        """Return the times, s, of a run of 100 turns of the rotor, and of tracing and compiling it; NaN without timings."""
         if not self.repeats:
             return math.nan, math.nan
         if id(scene) not in self._times:
@@ -124,7 +124,7 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
 
 
 def field_operations(scene: Scene) -> int:
-    """Operations of the traced equations of motion of a scene, `vector_field(scene)(t, state)`.
+    """Return the number of operations of the traced equations of motion of a scene, `vector_field(scene)(t, state)`.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
@@ -138,7 +138,7 @@ def field_operations(scene: Scene) -> int:
 
 
 def relative_changes(new: MotionValues, old: MotionValues, own: MotionValues, units: tuple[str, ...]) -> dict[str, float]:
-    """Changes from `old` to `new`, relative to the values `own`, by the names in `CHANGES`; see `EffectRow`."""
+    """Return the changes from `old` to `new`, relative to the values `own`, by the names in `CHANGES`; see `EffectRow`."""
     moved, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
     largest = {unit: max(x for x, u in zip(size, units, strict=True) if u == unit) for unit in units}
     shares = [float(d) / largest[u] if largest[u] > 0.0 else math.nan for d, u in zip(moved, units, strict=True)]
@@ -157,7 +157,7 @@ def _size(values: MotionValues) -> float:
 
 
 def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, accuracy: float) -> EffectRow:
-    """Row on the effect by which `variant` differs from `scene`, judged at the relative `accuracy`."""
+    """Return the row on the effect by which `variant` differs from `scene`, judged at the relative `accuracy`."""
     tier = repeated.tier(scene, variant.scene)
     own, other = repeated.values(scene, tier), repeated.values(variant.scene, tier)
     new, old = (own, other) if variant.present else (other, own)
@@ -189,7 +189,7 @@ def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, acc
 
 
 def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, str]:
-    """`advice` and `says` of a row, for a motion that is `new` with the effect and `old` without it."""
+    """Return `advice` and `says` of a row, for a motion that is `new` with the effect and `old` without it."""
     advice_if_needed = "needed" if row.present or row.says == "as given" else "perhaps needed"
     sentences = [row.says]
     if new != old:

@@ -85,7 +85,7 @@ class JamComparison(NamedTuple):
     mode: int
 
     def has_exact_orbit(self, scene: Scene) -> bool:
-        """True if the theory of exact orbits includes the scene."""
+        """Return True if the theory of exact orbits includes the scene."""
         try:
             require_coincident(scene)
         except InputError:
@@ -93,11 +93,11 @@ class JamComparison(NamedTuple):
         return True
 
     def exact(self, scene: Scene) -> MotionValues:
-        """Values of the exact orbit; NaN and a kind "no jam mode" if the jam does not exist."""
+        """Return the values of the exact orbit; NaN and a kind "no jam mode" if the jam does not exist."""
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
         there = bool(np.isfinite(orbit.omega))
         kind = f"jam mode {self.mode}, {orbit.judgement}" if there else f"no jam mode {self.mode}"
-        # Loads that would separate have another motion; the other statuses concern the computation only.
+        # The motion of loads that would separate is a different one; other statuses concern the computation only.
         if there and bool(orbit.status == OrbitStatus.would_separate):
             kind = f"{kind}, but the loads part"
         computed = not there or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)
@@ -112,7 +112,7 @@ class JamComparison(NamedTuple):
         )
 
     def state(self, scene: Scene) -> State:
-        """State on the exact jam without the parts that theories of jams leave out, with separated loads; NaN without a jam."""
+        """Return a state on the exact jam, without effects that theories of jams exclude, with separated loads; else NaN."""
         n = scene.loads.count
         orbit = jam_orbit(without_excluded_effects(scene), mode=self.mode, throw=False)
         displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
@@ -120,7 +120,7 @@ class JamComparison(NamedTuple):
         return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
     def full(self, scene: Scene) -> MotionValues:
-        """Values of the full equations, from near the exact jam until they are settled."""
+        """Return the values of the full equations, integrated from near the exact jam until they have settled."""
         run = settle(scene, start=self.state(scene), throw=False)
         return _read(scene, run, fold_speed(without_excluded_effects(scene), float(run.omega)))
 
@@ -133,7 +133,7 @@ class RunComparison(NamedTuple):
     start: Literal["rest", "turning"] | State
 
     def state(self, scene: Scene) -> State:
-        """Initial state of `scene`, with the loads' own rotation if its effects make it free."""
+        """Return the initial state of `scene`, with the rotation of each load about itself if an effect makes it free."""
         if isinstance(self.start, State):
             with contextlib.suppress(InputError):  # the state is of a scene with another effect
                 return with_spin(scene, self.start)
@@ -144,22 +144,22 @@ class RunComparison(NamedTuple):
         return initial_state(scene, "rest")
 
     def has_exact_orbit(self, scene: Scene) -> bool:
-        """False: a run has no exact orbit."""
+        """Return False, since a run has no exact orbit."""
         return False
 
     def exact(self, scene: Scene) -> MotionValues:
-        """Never called."""
+        """Raise an error; it is never called."""
         raise NotImplementedError
 
     def full(self, scene: Scene) -> MotionValues:
-        """Values of the full equations."""
+        """Return the values of the full equations."""
         start = self.state(scene)
         run = simulate(scene, self.until, start=start, save="window", turns=_WINDOW_PERIODS, estimate=False, throw=False)
         return _read(scene, run, math.nan)
 
     @classmethod
     def of_arguments(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunComparison:
-        """Comparison by a run; default of its end: `SLOW_PERIODS` slow periods after the last jump of the drive."""
+        """Return a comparison by a run; by default it ends `SLOW_PERIODS` slow periods after the last jump of the drive."""
         if start is None:
             start = "turning" if scene.drive.constant else "rest"
         elif isinstance(start, State):
@@ -171,13 +171,13 @@ class RunComparison(NamedTuple):
 
 
 def without_excluded_effects(scene: Scene) -> Scene:
-    """Copy of the scene without the effects that theories of jams exclude, such as imbalance, which acts at another speed."""
+    """Return the scene without effects that theories of jams exclude, such as imbalance, which acts at another speed."""
     kept = tuple(e for e in scene.all_effects if all(isinstance(term, COINCIDENT_TERMS) for term in e.terms()))
     return scene if len(kept) == len(scene.all_effects) else scene.replace(effects=kept)
 
 
 def turning_state(scene: Scene) -> State:
-    """State with the carrier at rest and evenly spread loads at the rotor speed."""
+    """Return the state with the carrier at rest and evenly spread loads at the rotor speed."""
     first, *others = scene.loads.rest()
     n, still = scene.loads.count, jnp.zeros(scene.machine.structure().mass.shape[:1])
     zero = jnp.zeros((n,))
@@ -188,7 +188,7 @@ def turning_state(scene: Scene) -> State:
 
 
 def mean_torque(scene: Scene, omega: float) -> float:
-    """Mean torque of the rotor on loads with the mean speed `omega`, N m, by drag alone."""
+    """Return the mean torque of the rotor on loads with the mean speed `omega`, N m, by drag alone."""
     n = scene.loads.count
     u = scene.loads.rest()
     rate = (jnp.full((n,), omega), *(jnp.zeros((n,)) for _ in u[1:]))
@@ -197,8 +197,11 @@ def mean_torque(scene: Scene, omega: float) -> float:
 
 
 def fold_speed(scene: Scene, omega: float) -> float:
-    """Rotor speed, rad/s, of the fold at which the exact jam with load speed `omega` ends: the next fold above it on the
-    branch, otherwise the next below. NaN if there is none, or if theories of jams refuse the scene."""
+    """Return the rotor speed, rad/s, of the fold at which the exact jam with load speed `omega` ends.
+
+    This is the next fold above the jam on the branch, otherwise the next one below. It is NaN if there is none, or if theories
+    of jams exclude the scene.
+    """
     try:
         folds = jam_modes(scene).folds
     except InputError:

@@ -39,14 +39,14 @@ class NumberRow(NamedTuple):
 def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -> list[NumberRow]:
     """Compute the numbers on effects that `scene` lacks, for the motion `values` and a relative `accuracy`.
 
-    - gravity on the loads: g/(R Omega^2), its share in the force with which a load presses on its track
-    - crowding: the share of the track that the loads' diameters fill, N arcsin(r/R)/pi, and what of the unbalance is lost
-      where they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R; r that of steel balls where none is given
+    - gravity on the loads: g/(R Omega^2), its share in the normal force of a load on its track
+    - crowding: the share of the track that the loads' diameters fill, N arcsin(r/R)/pi, and the share of the unbalance that is
+      lost if they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R; without a `ball_radius`, r is that of steel balls
     - distance: smallest distance of two loads, in diameters, without contact
-    - dry against viscous friction: that of a ball bearing, or of steel on steel, over the drag b_W R^2 (n - Omega)
-    - gyroscopic: the loads' inertia about the axis over that of the machine about a tilt, with R as its radius of gyration,
-      where the machine cannot tilt
-    - lift: the foundation force over the weight, above which supports that a machine stands on would have to pull
+    - dry friction over viscous friction: that of a ball bearing, or of steel on steel, over the drag b_W R^2 (n - Omega)
+    - gyroscopic: the loads' inertia about the axis over that of the machine about a tilt, with R as its radius of gyration, if
+      the machine cannot tilt
+    - lift: the foundation force over the weight; above 1, supports on which the machine stands would have to pull
 
     Effects that are in the scene have no row. **Returns** a list of `NumberRow`.
 
@@ -78,7 +78,7 @@ def _arm(scene: Scene) -> float:
 
 
 def _ball_radius(scene: Scene) -> tuple[float, str] | None:
-    """Radius of the loads, or of steel balls of their mass, and its origin; None for loads on bearings."""
+    """Return the radius of the loads, or of steel balls of their mass, with its origin; None for loads on bearings."""
     own = getattr(scene.loads, "ball_radius", None)
     if own is not None:
         return float(own), ""

@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class OperationCount(NamedTuple):
-    """Operations of the equations of motion with a part.
+    """Number of operations of the equations of motion with a part.
 
     **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations` with it; `added`: difference to
     the scene `beside` without it.

@@ -25,11 +25,11 @@ class TierRow(NamedTuple):
 
     **Attributes**
 
-    - `name` of the tier, `answers`: True if it can compute the audit's quantities for the scene
-    - error relative to the best tier that answers, in `amplitude` (of the coordinate with the largest error, in units of the
-      largest), `foundation_force` and `omega`, NaN if it does not answer
-    - `seconds` of an answer, and additional seconds of the first one, `compile`, NaN if no time was taken
-    - `says`: its purpose, or the reason why it does not answer
+    - `tier`: its name; `answers`: True if it can compute the audit's quantities for the scene
+    - error relative to the best tier, in `amplitude` (of the coordinate with the largest error, in units of the largest
+      amplitude), `foundation_force` and `omega`, NaN if `answers` is False
+    - `seconds` of a computation, and additional seconds of the first one, `compile`; NaN without timings
+    - `says`: its purpose, or the reason why it cannot compute the quantities
     """
 
     tier: str
@@ -51,7 +51,7 @@ class TierRow(NamedTuple):
 
 
 def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues, repeats: int) -> list[TierRow]:
-    """A row for each of `TIERS`, against the values `own` of the best tier that answers; without times for 0 `repeats`."""
+    """Return a row for each of `TIERS`, compared with the values `own` of the best tier; without times if `repeats` is 0."""
     return [_row(tier, scene, comparison, own, repeats) for tier in TIERS]
 
 
@@ -90,7 +90,7 @@ def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, ow
 def _call(
     tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues
 ) -> Callable[[], JamValues | MotionValues] | str:
-    """Function that evaluates the tier, or the reason why it cannot be evaluated."""
+    """Return a function that evaluates the tier, or the reason why the tier cannot be evaluated."""
     timeless = tier.name in ("leading order", "exact orbit")
     if isinstance(comparison, JamComparison):
         if not timeless and "unstable" in own.kind:

@@ -21,7 +21,7 @@ from jaxvib.machine.scene import Scene
 __all__ = ["Variant", "possible_variants", "present_variants"]
 
 _DROOP = 0.015
-"""Share of its speed that an induction motor twice as strong as needed loses: half of a usual rated slip of 3 %."""
+"""Relative decrease of the speed of an induction motor twice as strong as needed: half of a usual rated slip of 3 %."""
 
 
 class Variant(NamedTuple):
@@ -44,21 +44,21 @@ class WithoutGyroscopic(Machine):
         self.machine, self.kind = machine, str(machine.kind)
 
     def carrier(self) -> Carrier:
-        """The carrier of the machine."""
+        """Return the carrier of the machine."""
         return self.machine.carrier()
 
     def mount(self, at: Place = None) -> Mount:
-        """The mount of the machine without its gyroscopic matrix."""
+        """Return the mount of the machine without its gyroscopic matrix."""
         return eqx.tree_at(lambda mount: mount.gyroscopic, self.machine.mount(at), None)
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """The rows of the machine."""
+        """Return the rows of the machine."""
         return self.machine.rows_at(place, name)
 
 
 def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
-    """The scene without each effect that it has, without gyroscopic coupling, without the limit of its motor's power (the rotor
-    then rises to the motor's speed over half the time `until`, s)."""
+    """Yield the scene without each effect that it has, without gyroscopic coupling, and without the limit of its motor's power
+    (the rotor's speed then rises to that of the motor over half the time `until`, s)."""
     kinds = [effect.kind for effect in scene.all_effects]
     for k, effect in enumerate(scene.all_effects):
         number = f" {kinds[: k + 1].count(effect.kind)}" if kinds.count(effect.kind) > 1 else ""
@@ -73,8 +73,10 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
 
 
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
-    """The scene with each effect that it has not and could have: the `given` ones, else those that the package knows, with
-    usual numbers (`Effect.typical`); and with a drive that gives way, where its speed is given."""
+    """Yield the scene with each effect that it lacks and could have, and with a motor if its speed is prescribed.
+
+    The effects are the `given` ones; by default those of the package with typical numbers (`Effect.typical`).
+    """
     there = {effect.kind for effect in scene.all_effects if not effect.repeatable}
     for effect in given or ():
         if effect.kind not in there:

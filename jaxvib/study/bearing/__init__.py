@@ -1,1 +1,1 @@
-"""Friction of a pendulum bearing from its swings."""
+"""Friction of a pendulum bearing from recorded swings."""

@@ -25,7 +25,7 @@ __all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_poi
 
 
 _LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
-"""Amplitude, rad, and relative error of the averaged formula and the fitted arcs beyond it."""
+"""Amplitude, rad, above which the averaged formula and the fitted arcs have a relative error, and that error."""
 
 _MAX_AMPLITUDE = np.pi / 2.0
 """Amplitude, rad, beyond which the error of the arcs fitted to the turning points is unknown. With 25 samples a second and weak
@@ -33,10 +33,10 @@ friction it changed mu1 by 0.4 to 0.9 percent, up to three times the interval of
 
 
 class Estimate(NamedTuple):
-    """Number from measurements.
+    """Measured number with its uncertainty.
 
-    **Attributes**: its `value`; its standard `error` from the record's noise; `low` and `high`, the interval that contains it
-    with a probability of 95 %, the instruments' share included.
+    **Attributes**: its `value`; its standard `error` from the record's noise; `low` and `high`: its confidence interval of
+    95 %, which includes the error of the instruments.
     """
 
     value: float
@@ -55,7 +55,7 @@ class TurningPoints(NamedTuple):
 
     @property
     def amplitude(self) -> np.ndarray:
-        """(K - 1,) rad: half the way from each turning point to the next, which any zero of the angle leaves as it is."""
+        """Half the distance from each turning point to the next, (K - 1,) rad; it does not depend on the zero of the angle."""
         return np.abs(np.diff(self.angle)) / 2.0
 
 
@@ -93,11 +93,11 @@ class Decrement(Result):
 
     @property
     def is_drifting(self) -> bool:
-        """True if the first and the last pair differ by more than noise: the interval then holds no mu1."""
+        """True if the first and the last pair differ by more than noise; the interval is then not valid for mu1."""
         return abs(self.drift) > 4.0
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """mu1 of each pair of swings, first to last.
+        """Plot mu1 of each pair of swings, first to last.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -126,7 +126,7 @@ def turning_points(record: Record) -> TurningPoints:
     """
     t, f = record.time, record.angle
     rough = np.diff(f, 4)
-    noise = float(np.median(np.abs(rough))) / 0.6745 / np.sqrt(70.0)  # a smooth signal has hardly a fourth difference
+    noise = float(np.median(np.abs(rough))) / 0.6745 / np.sqrt(70.0)  # fourth differences of a smooth signal are negligible
     peaks = _regular(t, _alternating(f, max(8.0 * noise, 1e-3 * float(np.ptp(f)))))
     if len(peaks) < 3:
         raise InputError(
@@ -142,10 +142,10 @@ def turning_points(record: Record) -> TurningPoints:
             continue
         size = min(abs(f[k] - middle), np.pi)
         away = np.abs(frequency * (t - t[k]))
-        # For a large swing only the nearer part is such an arc; a coarse record needs the whole part.
+        # A large swing has the form of the arc only close to the turning point; a coarse record needs the whole sixth.
         near = away <= np.pi / 3.0 / (1.0 + size**2 / 3.0)
         near = near if np.count_nonzero(near) >= 9 else away <= np.pi / 3.0
-        # In units of 1/w; below 0 beyond 90 deg, where the arc is a hyperbolic cosine.
+        # In units of 1/w; negative beyond 90 deg, where the arc is a hyperbolic cosine.
         square = float(np.cos(size))
         x = small * (t[near] - t[k])
         basis = _arcs(x, square)
@@ -185,7 +185,7 @@ def period_stretch(amplitude: np.ndarray) -> np.ndarray:
 
 
 def _alternating(f: np.ndarray, least: float) -> list[int]:
-    """Indices of alternating maxima and minima, each confirmed by a return of at least `least`; without the two ends."""
+    """Return indices of alternating maxima and minima, each followed by a return of at least `least`, without both ends."""
     found: list[int] = []
     high = low = 0
     rising: bool | None = None
@@ -202,7 +202,7 @@ def _alternating(f: np.ndarray, least: float) -> list[int]:
 
 
 def _regular(t: np.ndarray, peaks: list[int]) -> list[int]:
-    """Longest stretch of regular turning points, without noise about a pendulum at rest and the release by hand."""
+    """Return the longest stretch of regular turning points, which excludes noise at rest and the release by hand."""
     steps = np.diff(t[peaks])
     even = [True, *((steps[1:] < 1.6 * steps[:-1]) & (steps[1:] > 0.6 * steps[:-1])), False]
     cuts = [0, *(k for k, is_even in enumerate(even) if not is_even)]
@@ -260,8 +260,7 @@ def ten_periods(
     factor = 2.0 * float(pendulum.total_inertia) / span
     estimates = factor * _shrinkage(a[:pairs], a[n:])
 
-    # Errors of the angles go into every pair they are part of; the derivative of G(a)/2 by the two angles is
-    # +-G'(a)/4.
+    # The error of an angle enters every pair that contains it; the derivative of G(a)/2 by the two angles is +-G'(a)/4.
     slopes = np.zeros((pairs, turns.angle.size))
     signs = np.sign(np.diff(turns.angle))
     for k in range(pairs):
@@ -304,6 +303,6 @@ def _slope(amplitude: np.ndarray) -> np.ndarray:
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
-    """Estimate with its interval, from the sum of squares of noise and instrument errors."""
+    """Return an estimate with its interval; errors of noise and instruments are added in squares."""
     half = float(np.hypot(quantile * error, instrument * value))
     return Estimate(value, error, value - half, value + half)

@@ -40,8 +40,9 @@ class Unknowns(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A fit: the `unknowns`; `covariance` (p, p) of them in their order, from the Fisher information with the noise found;
-    `residual` (n,) rad, fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
+    """Result of a fit: the `unknowns`; their `covariance` (p, p), in their order, from the Fisher information with the
+    estimated noise; `residual` (n,) rad, fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s;
+    `converged`."""
 
     unknowns: Unknowns
     covariance: Array
@@ -52,7 +53,7 @@ class Fit(NamedTuple):
 
 
 def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool) -> tuple[Unknowns, Array]:
-    """Initial parameters of a fit, from the turning points, and the width that dry friction is smoothed with.
+    """Return the initial parameters of a fit, from the turning points, and the smoothing width of dry friction.
 
     A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction and 2 T_f/(m g l) to dry friction.
     """
@@ -82,7 +83,7 @@ def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints,
 
 
 def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
-    """Upper bound of the integration steps, a power of 2, so that records of many lengths share few programs."""
+    """Return an upper bound of the integration steps, a power of 2, with which records of many lengths share few programs."""
     return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
 
 
@@ -90,8 +91,10 @@ def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
 def fit_swing(
     pendulum: BearingPendulum, time: Array, angle: Array, weight: Array, start: Unknowns, width: Array, max_steps: int
 ) -> Fit:
-    """The least-squares fit behind `identify`, for `vmap` over records: `time` (n,) s from 0, `angle` (n,) rad, and which of
-    them count, `weight` (n,) 1 or 0."""
+    """Return the least-squares fit behind `identify`, for `vmap` over records.
+
+    **Arguments**: `time` (n,) s from 0; `angle` (n,) rad; `weight` (n,), 1 for samples that count and 0 for the others.
+    """
     size = jnp.std(angle) * jnp.sqrt(2.0)
     duration = time[-1] - time[0]
     inertia, length = pendulum.total_inertia, pendulum.length
@@ -169,7 +172,7 @@ def _least_squares(
         normal = triangle.T @ triangle
         damped = normal + damping * jnp.diag(jnp.diagonal(normal))
         trial = x - jnp.linalg.solve(damped, triangle.T @ reached)
-        # The full next step in standard errors: of the best point so far, for at a kink the sum may not fall any more.
+        # The full next step in standard errors, from the best point so far, since the sum may not decrease further at a kink.
         left_to_go = jnp.sum(reached**2) / (cost / (n - p) + floor)
         return count + 1, trial, damping, *best, left_to_go
 

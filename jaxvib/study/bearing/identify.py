@@ -124,7 +124,7 @@ class Identified(Result):
 
 
 def shown(estimate: Estimate) -> str:
-    """An estimate as text: value and the half-width of its 95 % interval."""
+    """Return an estimate as text: value and half-width of its 95 % interval."""
     return f"{estimate.value:.5g} ± {(estimate.high - estimate.low) / 2.0:.2g}"
 
 
@@ -187,8 +187,8 @@ def identify(
         raise InputError(record.name, f"swings for {until - swing.time[0]:.3g} s before it rests; record more of the swing")
     large = np.where(swing.time <= min(_still_large(turns), until), 1.0, 0.0)
     if dry and np.sum(large) < np.sum(swinging):
-        # Where the pendulum comes to rest, between the ends of the dead zone, hangs on the last digits of the friction: a fit
-        # to the rest from far off ends in the wrong half swing.
+        # The place in the dead zone at which the pendulum comes to rest depends on the last digits of the friction: a fit to
+        # the samples at rest from distant initial values converges to the wrong half swing.
         start = fit_swing(*given, jnp.asarray(large), start, width, steps).unknowns
     fit = fit_swing(*given, jnp.asarray(swinging), start, width, steps)
     found = _judged(pendulum, swing, turns, fit, float(width), instrument, until)
@@ -198,7 +198,7 @@ def identify(
 
 
 def _still_large(turns: TurningPoints) -> float:
-    """The time of the last turning point before the swing is a tenth of what it was; infinite where it stays larger."""
+    """Return the time of the last turning point before the swing has decayed to a tenth; infinite if it stays larger."""
     small = np.flatnonzero(turns.amplitude < 0.1 * turns.amplitude[0])
     return float(turns.time[max(small[0], 4)]) if small.size else math.inf
 
@@ -206,7 +206,7 @@ def _still_large(turns: TurningPoints) -> float:
 def _judged(
     pendulum: BearingPendulum, record: Record, turns: TurningPoints, fit: Fit, width: float, instrument: float, until: float
 ) -> Identified:
-    """Return the fit with intervals, a status, and what a reader should know besides."""
+    """Return the fit with intervals, a status and notes."""
     values = [float(v) for v in jax.tree.leaves(fit.unknowns)]
     covariance = np.asarray(fit.covariance)
     errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
@@ -268,7 +268,7 @@ def _status(found: Identified, *, has_converged: bool, is_patterned: bool, instr
 
 
 def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
-    """Yield sentences about a fit that a reader should know."""
+    """Yield the notes about a fit, a sentence each."""
     decrement, frequency, small = found.decrement, found.frequency.value, float(found.pendulum.frequency)
     if decrement is not None and found.dry is None and decrement.drift > 4.0:
         yield "the swing decays faster the smaller it is, as by dry friction: identify mu2 as well"
@@ -296,10 +296,10 @@ def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
 
 
 def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:
-    """Return the F statistic of residuals, n of them after a fit of `found` numbers, and its chance if they are noise.
+    """Return the F statistic of n residuals after a fit of `found` numbers, and its probability if they are noise.
 
-    They are compared with slow changes of the zero, and with slowly changing vibrations of the swing's frequency and twice and
-    three times that: what another law of friction, a torque or another restoring force leaves.
+    The residuals are compared with slow changes of the zero, and with slowly changing vibrations at one, two and three times
+    the frequency of the swing. Another law of friction, a torque or another restoring force leaves such residuals.
     """
     from scipy.special import fdtrc  # slow to import
 
@@ -320,7 +320,7 @@ def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: 
 
 
 def student_quantile(freedom: int) -> float:
-    """The 97.5 % point of Student's t, by its series in 1/freedom: to 1e-4 from 10 on.
+    """Return the 97.5 % quantile of Student's t by its series in 1/freedom; the error is below 1e-4 from 10 degrees of freedom.
 
     >>> round(student_quantile(10), 3), round(student_quantile(1000), 3)
     (2.228, 1.962)

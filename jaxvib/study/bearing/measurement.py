@@ -1,4 +1,4 @@
-"""Measurement files: a record of a swing, the pendulum that swung, and what is asked about its bearing."""
+"""Measurement files: the record of a swing, the pendulum, and the arguments of `identify`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["TEMPLATE", "Measurement", "measurement_from_tables"]
 
 
 _FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "from": "from_", "until": "until"}
-"""Names of a record's fields in a file, where `from` is no word of Python's, and here."""
+"""Names of a record's fields in a file, and in Python, in which `from` is a keyword."""
 
 
 class Measurement(NamedTuple):
-    """The arguments of `identify`: `pendulum`, `record`, `dry`, `instrument`."""
+    """Arguments of `identify`: `pendulum`, `record`, `dry`, `instrument`."""
 
     pendulum: BearingPendulum
     record: Record
@@ -30,9 +30,9 @@ class Measurement(NamedTuple):
 
 
 def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
-    """A measurement from the tables [record], [pendulum], [identify] of a file in `folder`, see `TEMPLATE`.
+    """Return a measurement from the tables [record], [pendulum], [identify] of a file in `folder`, see `TEMPLATE`.
 
-    **Arguments**: `tables` as TOML reads them; `folder` in which the record's file is looked for.
+    **Arguments**: `tables` as parsed from TOML; `folder` that contains the record's file.
 
     **Returns** `Measurement`. **Raises** `InputError` for a table or field that is missing or unknown, and for values that are
     not allowed.
@@ -109,4 +109,4 @@ bearing = "20 mm"           # diameter, where dry friction acts
 dry = true                  # find mu2 as well as mu1
 instrument = 0.03           # relative uncertainty of the moment of inertia, from ruler and scales
 """
-"""A commented measurement file."""
+"""Commented example of a measurement file."""

@@ -1,4 +1,4 @@
-"""Records of a swing: time and angle as a camera or a sensor wrote them down."""
+"""Records of a swing: time and angle from a camera or a sensor."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from jaxvib.results.fields import in_unit
 __all__ = ["Record", "read_record"]
 
 _MAX_BYTES, _MAX_LINE = 2**26, 10_000
-"""Bytes of a record, some million samples, and characters of a line."""
+"""Largest number of bytes of a record (some million samples), and of characters of a line."""
 
 _MIN_SAMPLES = 16
-"""Samples a record needs: fewer hold no swing."""
+"""Smallest number of samples of a record; fewer do not contain a swing."""
 
 _NAMES = {"time": ("time", "t", "zeit", "время"), "angle": ("angle", "phi", "theta", "f", "winkel", "угол")}
 
@@ -40,7 +40,7 @@ _UNITS = {
         **dict.fromkeys(("turn", "turns", "rev", "revs", "revolution", "revolutions"), 2.0 * np.pi),
     },
 }
-"""Units of columns in SI, in small letters: a header's letters may have any size."""
+"""Units of columns in SI, in lower case; headers may be in upper or lower case."""
 
 _HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[{]\s*(?P<unit>[^)\]}]*?)\s*[)\]}]|/\s*(?P<per>\S+))$")
 _TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")

@@ -1,4 +1,4 @@
-"""A pendulum that swings down on a bearing that stands still: how bearing friction shows without a machine around it."""
+"""Decaying swing of a pendulum on a fixed bearing, from which bearing friction is measured without the machine."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class Swing(Result):
     steps: Array = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
-        """Text of the end of the swing."""
+        """Return the outcome of the swing as text."""
         when = f" at {float(self.stopped_at):.6g} s" if np.isfinite(self.stopped_at) else ""
         first, last = (f"{float(np.rad2deg(self.angle[k])):.4g} deg at {float(self.time[k]):.6g} s" for k in (0, -1))
         return f"{self.message}{when}; from {first} to {last}, {int(self.steps)} steps"
@@ -229,7 +229,7 @@ def _diameter(pendulum: BearingPendulum) -> Array:
 
 
 def controller_to(tolerance: float) -> diffrax.AbstractStepSizeController:
-    """A proportional and integral controller of steps to a relative and absolute error."""
+    """Return a proportional-integral controller of steps to a relative and absolute tolerance."""
     return diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4)
 
 
@@ -248,10 +248,10 @@ def swing_states(
     adjoint: diffrax.AbstractAdjoint,
     max_steps: int,
 ) -> Swing:
-    """`swing` without a look at its arguments; `dry` may be negative here, as a fit to noise may want it."""
+    """Compute a `swing` without validation of its arguments; `dry` may be negative, which happens in a fit to noise."""
     given = (pendulum.frequency, angle, rate, viscous) if dry is None else (pendulum.frequency, angle, rate, viscous, dry)
     exists = jnp.all(jnp.isfinite(jnp.stack(jnp.broadcast_arrays(*given))))
-    # A swing that does not exist (a fit's step into nothing in one lane of a batch) must not fail the others' search for stops.
+    # A swing that does not exist (after a step of a fit out of range, in a batch) must not fail the others' search for stops.
     angle, rate, viscous = (jnp.where(exists, value, 0.0) for value in (angle, rate, viscous))
     dry = None if dry is None else jnp.where(exists, dry, 0.0)
     pendulum = eqx.tree_at(lambda p: p.g, pendulum, jnp.where(exists, pendulum.g, 1.0))
@@ -261,13 +261,16 @@ def swing_states(
         width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
 
     def moving(t: RealScalarLike, y: tuple[Array, Array], args: None, **_: object) -> Array:
-        """Changes its sign to minus where the pendulum is slow within the dead zone: there the smooth sign lets it creep."""
+        """Return a number that becomes negative when the pendulum is slow within the dead zone.
+
+        The smoothed sign of dry friction would let it creep there.
+        """
         assert dry is not None and width is not None
         f, slip = y
         slow = jnp.abs(slip) - 3.0 * width
         return jnp.maximum(slow, frequency * (jnp.abs(jnp.tan(f)) - jnp.tan(pendulum.dead_zone(dry))))
 
-    # A start that is held already changes no sign.
+    # There is no change of sign if friction already holds the pendulum at the start.
     free = None if dry is None else moving(times[0], (angle, rate), None) > 0.0
 
     def term(t: RealScalarLike, y: tuple[Array, Array], args: None) -> tuple[Array, Array]:
@@ -292,8 +295,8 @@ def swing_states(
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
-        # `moving` falls through 0. That is said, for where the last step ends a rounding short of it the search would not find
-        # two signs at its ends.
+        # `flip=True` states that `moving` falls through 0. Without it the search would fail if the last step ends just before
+        # the root and both of its ends have the same sign by rounding.
         event=None if dry is None else diffrax.Event(moving, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
     )
     assert solution.ts is not None and solution.ys is not None
@@ -324,8 +327,11 @@ def swing_states(
 def _last_part(
     pendulum: BearingPendulum, dry: Array, times: Array, last: Array, y: tuple[Array, Array]
 ) -> tuple[Array, tuple[Array, Array]]:
-    """Return the time at which a slow pendulum comes to rest, and its angles and rates until then, from the time `last` and the
-    state `y` there: by the sharp sign of dry friction, harmonic about the end of the dead zone that it moves away from."""
+    """Return the time at which a slow pendulum comes to rest, and its angles and rates until then.
+
+    It starts from the state `y` at the time `last`. With the exact sign of dry friction the motion is harmonic about the end of
+    the dead zone that the pendulum moves away from.
+    """
     (end, end_slip), frequency = y, pendulum.frequency
     way = jnp.where(end_slip < 0.0, -1.0, 1.0)
     middle = -way * pendulum.dead_zone(dry)

@@ -1,1 +1,1 @@
-"""Capture: which starts bring the balls of a torus to the rotor's speed."""
+"""Capture: initial speeds from which the balls of a torus reach the speed of the rotor."""

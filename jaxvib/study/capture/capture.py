@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 __all__ = ["CAUGHT", "Capture", "CaptureStatus", "capture", "capture_time", "thrown_state"]
 
 CAUGHT = 3e-3
-"""A load whose mean speed differs from the rotor's by less turns with it, as in `regime`."""
+"""Relative difference of speeds below which a load turns with the rotor, as in `regime`."""
 
 _SCAN = 32
-"""Initial speeds that are tried side by side where a threshold is looked for."""
+"""Number of initial speeds of a scan for the threshold."""
 
 
 class CaptureStatus(eqx.Enumeration):
@@ -131,12 +131,12 @@ class Capture(Result):
 
 
 def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
-    """The carrier at rest, the loads side by side at the bottom of the tube, all at the same speed relative to the rotor.
+    """Return the state with the carrier at rest and the loads side by side at the bottom of the tube, with one relative speed.
 
-    **Arguments**: `speed` psi'/w, -1 for loads at rest in space; `shift` rad, one number or (count,), by which the loads lie
-    further along the ring. They lie 2 atan(r/R) apart, as the paper has it.
+    **Arguments**: `speed` psi'/w relative to the rotor, -1 for loads at rest in space; `shift` rad of the loads along the ring,
+    one number or (count,). Neighbouring loads are 2 atan(r/R) apart, as in the paper.
 
-    **Returns** `State`. **Raises** `InputError` for loads that are none of a torus.
+    **Returns** `State`. **Raises** `InputError` for loads that do not run in a torus.
 
     >>> from jaxvib.machine.files import TEMPLATES, scene_from_toml
     >>> state = thrown_state(scene_from_toml(TEMPLATES["torus"]), -0.5)
@@ -231,7 +231,8 @@ def capture(
     first = given.number if given is not None else max(16, math.ceil(end * steps_per_second(scene, equations)))
 
     def outcomes(which: np.ndarray, steps: int) -> list[np.ndarray]:
-        """Return True for runs that are captured, that stay finite, and that leave their wall, (speeds, starts) each."""
+        """Return three Boolean arrays (speeds, starts): True for runs that are captured, stay finite, or lose contact with the
+        wall."""
         lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
         shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
         values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
@@ -256,7 +257,7 @@ def capture(
         captured, finite, detached = parts
         return [_judged(speed, captured, finite, detached, turns, steps)]
 
-    # A threshold beside one of the speeds may fall into either of the neighbouring stretches.
+    # A threshold close to one of the speeds may fall into the interval on either side of it.
     tolerance = 1.001 * max(np.max(np.diff(tried), initial=0.0) if resolution is None else resolution, 1e-12)
     found = refine(scan, lambda answer: np.array([answer.border]), 1, tolerance, most if given is None else 0)
     (answer,), moved = found.answers, float(found.moved[0, 0])
@@ -276,7 +277,7 @@ def _thrown_still(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
 
 
 def _least(captured: np.ndarray) -> int:
-    """The index of the least speed from which on all starts are captured; the number of speeds where there is none."""
+    """Return the index of the least speed from which on all starts are captured, or the number of speeds if there is none."""
     failing = np.flatnonzero(~np.all(captured, axis=1))
     return 0 if failing.size == 0 else int(failing[-1]) + 1
 
@@ -312,12 +313,13 @@ def _judged(
 def capture_time(run: Run, within: float = 0.05) -> Array:
     """Time at which the last load comes to within a share of the rotor speed and stays there, s.
 
-    The last time in the run's trajectory at which a load's speed differs from the rotor's by more than `within` times the
-    rotor's, linear between the states that were kept. Derivatives go through it, forward and reverse; they hold as long as the
-    same passage of the same load is the last one: where another takes its place the time jumps, and no derivative says so.
+    It is the last time in the run's trajectory at which a load's speed differs from the rotor's by more than `within` times the
+    rotor's speed, interpolated linearly between the stored states. It has forward and reverse derivatives. They are valid as
+    long as the same passage of the same load is the last one: if another passage becomes the last one, the time jumps, and the
+    derivatives do not show the jump.
 
-    **Returns** a scalar; 0 where all loads were there from the beginning, infinite where one is not there at the end.
-    **Raises** `InputError` for a run that kept its window only.
+    **Returns** a scalar: 0 if all loads are within the share from the beginning, infinite if one is not at the end.
+    **Raises** `InputError` for a run without a trajectory.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

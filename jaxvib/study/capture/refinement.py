@@ -1,8 +1,8 @@
-"""Steps of runs whose outcomes are compared: rates that they resolve, and doubling until the answer no longer moves.
+"""Steps of runs whose outcomes are compared: resolved rates, and doubling until the result no longer changes.
 
-Two scans that agree prove nothing while both leave a rate unresolved: with a third of the steps that a friction needs no ball
-is captured, with two thirds neither. The first scan therefore resolves every rate of the equations of motion at the state in
-which balls turn with the rotor, and only from there on steps are doubled.
+Agreement of two scans proves nothing if both leave a rate unresolved: with a third of the steps that a friction needs, no ball
+is captured, and with two thirds none is captured either. Therefore the first scan already resolves every rate of the equations
+of motion at the state in which the balls turn with the rotor; the steps are doubled from there.
 """
 
 from __future__ import annotations
@@ -30,13 +30,15 @@ DOUBLINGS = 2
 """Default number of times that steps are doubled at most."""
 
 _STEPS_PER_RADIAN = 1.0
-"""Steps per radian of the fastest oscillation, balls up and down their tube: errors far below those of chance."""
+"""Steps per radian of the fastest oscillation, that of balls across their tube. The errors are far below the statistical error
+of captured fractions."""
 
 _STEPS_PER_ADDED_RADIAN = 2.0
 """Steps per radian of contacts between balls and of slips (`Effect.fastest_rate`): six for a collision."""
 
 _DECAY_PER_STEP = 3.0
-"""Decay rate times the step. The method of order 8 is stable up to 5.2; normal forces rise above the one on the equator."""
+"""Largest product of decay rate and step. The method of order 8 is stable up to 5.2; the margin is needed because normal forces
+rise above the force on the equator."""
 
 Answer = TypeVar("Answer")
 
@@ -44,8 +46,9 @@ Answer = TypeVar("Answer")
 class Refined(NamedTuple, Generic[Answer]):
     """Answers of the finest scans.
 
-    **Attributes**: `answers` of P points; `multiple` (P,) of the first scan's steps that each took; `moved` (P, K), by how much
-    its K borders moved at the last doubling: infinite if a border exists by one scan only, NaN without a doubling.
+    **Attributes**: `answers` of P points; `multiple` (P,): the number of steps of each answer, in units of the first scan's;
+    `moved` (P, K): the change of its K borders by the last doubling, infinite if only one of the two scans has the border, NaN
+    without a doubling.
     """
 
     answers: list[Answer]
@@ -60,10 +63,11 @@ def refine(
     tolerance: float,
     doublings: int = DOUBLINGS,
 ) -> Refined[Answer]:
-    """Scans points with ever more steps, each until its borders stay.
+    """Double the steps of each point until its borders change by less than the tolerance.
 
-    **Arguments**: `scan(indices, multiple)` gives the answers of points by `multiple` times the steps; `borders` of an answer,
-    NaN for one that does not exist; `points` P; `tolerance` of borders that stay; `doublings` of the steps at most.
+    **Arguments**: `scan(indices, multiple)` returns the answers of points with `multiple` times the steps; `borders` returns
+    the borders of an answer, NaN for one that does not exist; `points`: their number P; `tolerance`: the largest allowed change
+    of a border; `doublings`: the largest number of doublings.
 
     >>> found = refine(lambda i, n: [1.0 / n] * i.size, lambda x: np.array([x]), 1, tolerance=0.3)
     >>> found.answers, found.multiple.tolist(), found.moved.tolist()
@@ -84,18 +88,18 @@ def refine(
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Differences; 0 between two NaN, infinite between NaN and a number."""
+    """Return the absolute differences: 0 between two NaN, infinite between NaN and a number."""
     apart = np.abs(one - other)
     missing = np.isnan(one) != np.isnan(other)
     return np.where(missing, np.inf, np.where(np.isnan(apart), 0.0, apart))
 
 
 def steps_per_second(scene: Scene, equations: Equations = vector_field) -> float:
-    """Number of equal steps a second that resolve the motion of balls in a torus under a constant rotor speed.
+    """Return the number of equal steps per second that resolve the motion of balls in a torus at a constant rotor speed.
 
     Oscillations and decays are the eigenvalues of the linearized `equations` with the balls on the equator, turning with the
-    rotor. Friction overdamps the balls there and saturates elsewhere, so that their own frequency counts besides; contacts and
-    slips, which do not act there, are those that effects tell.
+    rotor. Friction overdamps the balls there but saturates elsewhere; therefore their natural frequency without friction counts
+    too. Contacts and slips do not act there; their rates are the `Effect.fastest_rate` of the effects.
     """
     values = np.linalg.eigvals(np.asarray(_jacobian(scene, equations)))
     own = scene.loads.natural_frequency(scene.drive.speed)

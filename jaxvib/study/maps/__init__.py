@@ -1,1 +1,1 @@
-"""Maps over a scene's parameters."""
+"""Maps over the parameters of a scene."""

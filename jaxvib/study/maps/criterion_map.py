@@ -53,7 +53,7 @@ class CriterionMap(Result):
     shift: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor", "end"))
 
     def summary(self) -> str:
-        """A table a person can read: share of speeds judged right, mean size of the boundaries' shift."""
+        """Return a table in text: the share of speeds at which both agree, and the mean modulus of the boundaries' shift."""
         lines = ["share of rotor speeds judged right (mean shift of the boundaries it has)"]
         lines.append("drag x \\ mass x " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
         for d, factor in enumerate(self.drag_factor):
@@ -65,8 +65,8 @@ class CriterionMap(Result):
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
-        """One panel a drag: rotor speed in `unit` against load mass, where the criterion is right and where not; onto as many
-        axes `ax` where they are given.
+        """Plot agreement and disagreement of the criterion over rotor speed in `unit` and load mass, one panel for each drag,
+        onto as many axes `ax` if given.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
@@ -138,9 +138,10 @@ def criterion_map(
 
 
 def _shifts(exact: np.ndarray, grid: np.ndarray, boundary: np.ndarray) -> np.ndarray:
-    """Distances of the ends of each interval of the criterion from those of the exact interval with the largest overlap.
+    """Return the distances of the ends of each interval of the criterion from those of the exact interval that overlaps most.
 
-    The longest, because a sliver of stability can stay at a resonance when the interval itself has moved away from it.
+    The largest overlap decides, because a short interval of stability can remain at a resonance when the interval itself has
+    moved away from it.
     """
     shifts = np.full(boundary.shape, np.nan)
     low, high = np.nan_to_num(exact[:, 0], nan=grid[0]), np.nan_to_num(exact[:, 1], nan=grid[-1])

@@ -1,4 +1,4 @@
-"""Many run-ups of one scene: where its loads end, over their drag and over the angles they start from."""
+"""Run-ups of one scene: final motions of its loads over their drag and their initial angles."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 __all__ = ["RunUps", "run_ups"]
 
 _FAILED = "failed"
-"""The word for a run that did not reach its end: it has no kind of motion."""
+"""Name of the outcome of a run that did not reach its end and has no regime."""
 
 _TOLERANCE = Tolerance(1e-7)
-"""Error of a step in double precision: enough to name a motion."""
+"""Tolerance of a step in double precision, which is small enough to determine the regime."""
 
 _MIN_ALLOWED_STEPS = 2**20
-"""Steps that a run may take at least, so that run-ups of any usual length share one program."""
+"""Smallest limit of the number of steps; with it run-ups of any usual length share one program."""
 
 
 class RunUps(Result):
@@ -70,15 +70,15 @@ class RunUps(Result):
     finished: np.ndarray = eqx.field(metadata=in_unit("", "drag", "start"))
 
     def fraction(self, kind: str) -> np.ndarray:
-        """Share of the starts (nd,) that came to a `kind` of motion, or whose runs "failed".
+        """Return the share of the starts (nd,) that end in a `kind` of motion, or whose runs "failed".
 
-        **Raises** `InputError` for another word.
+        **Raises** `InputError` for an unknown kind.
         """
         require_one_of(kind, (*REGIMES, _FAILED), "kind")
         return np.mean(self.kind == kind, axis=1)
 
     def summary(self) -> str:
-        """A line for each drag: shares of the kinds of motion that its starts came to, where they jammed, and what failed."""
+        """Return a line of text for each drag: shares of the regimes at the end, speeds of jams, and failed runs."""
         lines = [f"of {len(self.angle)} starts at each drag"]
         for k, drag in enumerate(self.drag):
             portions = []
@@ -90,7 +90,7 @@ class RunUps(Result):
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
-        """Shares of the kinds of motion, and speeds of the loads in `unit`, over drag; onto two axes `ax` where they are given.
+        """Plot the shares of the kinds of motion, and the load speeds in `unit`, over drag, onto two axes `ax` if given.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
@@ -102,7 +102,7 @@ class RunUps(Result):
 
 
 def _span(values: np.ndarray) -> str:
-    """One number where all are the same to a thousandth, else the smallest and the largest."""
+    """Return text with one number if all are equal to a thousandth, otherwise with the smallest and the largest."""
     low, high = float(np.min(values)), float(np.max(values))
     return f"{low:.4g}" if high - low < 1e-3 * high else f"{low:.4g} .. {high:.4g}"
 
@@ -184,7 +184,7 @@ def run_ups(
     elif starts is not None:
         sets = random_numbers(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
         if has_term(scene.all_effects, LoadInteraction):
-            sets = np.sort(sets, axis=1)  # on one track in the order of their numbers
+            sets = np.sort(sets, axis=1)  # loads on one track keep the order of their numbers
     else:
         sets = np.asarray(initial_state(scene, separation=separation).azimuth)[None]
     count(batch, "batch")
@@ -223,7 +223,7 @@ def run_ups(
 def _together(
     scene: Scene, until: Array, drags: Array, angles: Array, chosen: StepChoice | None, max_steps: int
 ) -> tuple[Regime, Array, Array]:
-    """Run-ups side by side: the regime of each, the loads' mean speed, whether it reached its end."""
+    """Return the regime of each run-up of a batch, the mean speed of its loads, and True if it reached its end."""
 
     def one(drag: Array, angle: Array) -> tuple[Regime, Array, Array]:
         this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)

@@ -1,4 +1,4 @@
-"""Stability over a design number: where jams are stable, and from which value on a bifurcation is there."""
+"""Stability over a design number: ranges of stable jams, and the value at which a bifurcation appears."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class StabilityMap(Result):
 
     - `value` (n,) of x
     - `omega` (n, P): load speeds, rad/s
-    - `stable` (n, P): True if every load keeps to the jam there
+    - `stable` (n, P): True if the jam is stable for every load
     - `special` (n,): the special points of each diagram
     """
 
@@ -47,7 +47,7 @@ class StabilityMap(Result):
     special: tuple[tuple[SpecialPoint, ...], ...]
 
     def summary(self) -> str:
-        """A line for each value: how much of the range is stable, and the special points, for a person to read."""
+        """Return a line of text for each value: the stable share of the range, and the special points."""
         lines = []
         for x, stable, points in zip(self.value, self.stable, self.special, strict=True):
             kinds = ", ".join(f"{point.kind.replace('_', ' ')} at {point.omega:.6g} rad/s" for point in points)
@@ -55,7 +55,7 @@ class StabilityMap(Result):
         return "\n".join(lines)
 
     def plot(self, *, label: str = "x", unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """Stable jams shaded over the load speed in `unit` and x, special points as marks by kind; `label` names x on its axis.
+        """Plot stable jams as shaded areas over the load speed in `unit` and x, special points as marks; `label` is x's name.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
