@@ -1,4 +1,4 @@
-"""Optional packages and files of exports."""
+"""Import of optional packages, and checks of the paths of exports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["optional_module", "require_writable"]
 
 
 def optional_module(name: str, extra: str) -> Any:
-    """Return a module of an optional package. **Raises** `InputError` with the command that installs it."""
+    """Import a module of an optional package. **Raises** `InputError` with the command that installs it, if it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -21,7 +21,10 @@ def optional_module(name: str, extra: str) -> Any:
 
 
 def require_writable(path: Path) -> None:
-    """**Raises** `InputError` for a missing folder and for a file that is read-only, before anything is computed."""
+    """Require, before anything is computed, that a path can be written to.
+
+    **Raises** `InputError` for a missing folder and for a read-only file.
+    """
     if not path.parent.is_dir():
         raise InputError("path", f"is {quoted(str(path))}, and its folder does not exist; create it or name another one")
     if path.is_dir() or (path.exists() and not path.stat().st_mode & 0o222):

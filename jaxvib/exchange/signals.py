@@ -1,4 +1,4 @@
-"""Names and units of what a machine feels and shows, the same in every format."""
+"""Names and units of the inputs and outputs of a machine, common to all formats."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ class Signal(NamedTuple):
 
 
 def coordinate_signals(carrier: Carrier, name: str, order: int) -> tuple[Signal, ...]:
-    """Signals of a derivative of the coordinates: of the order 0, displacements, 1, velocities, or 2, accelerations."""
+    """Return the signals of a derivative of the coordinates: order 0 displacements, 1 velocities, 2 accelerations."""
     named = zip(carrier.coordinates, carrier.units, strict=True)
     return tuple(Signal(f"{name}.{coordinate}", unit + _RATES[order]) for coordinate, unit in named)
 
 
 def force_inputs(carrier: Carrier) -> tuple[Signal, ...]:
-    """Signals of the forces on the coordinates: N, of an angle N m."""
+    """Return the signals of the forces on the coordinates: N, for an angle N m."""
     named = zip(carrier.coordinates, carrier.units, strict=True)
     return tuple(Signal(f"force.{coordinate}", "N" if unit == "m" else "N m") for coordinate, unit in named)
 
 
 def foundation_forces(carrier: Carrier) -> tuple[Signal, ...]:
-    """Signals of the force on the foundation."""
+    """Return the signals of the force on the foundation."""
     return tuple(Signal(f"foundation_force.{direction}", "N") for direction in carrier.foundation_directions)
 
 
 def signals_of(names: Sequence[str], unit: str) -> tuple[Signal, ...]:
-    """Signals of one unit."""
+    """Return signals that have the same unit."""
     return tuple(Signal(name, unit) for name in names)

@@ -1,6 +1,7 @@
 """Universal files (UFF, UNV) of modal analysis, written and read through pyuff.
 
-A machine is a row of nodes: its platforms, or points of a rotor's axis. Across is the direction +Y, up is +Z, the axis is +X.
+A machine is represented by a row of nodes: its platforms, or points on a rotor's axis. The direction +X is along the axis, +Y
+across, +Z up.
 """
 
 from __future__ import annotations
@@ -28,27 +29,27 @@ __all__ = ["UffFile", "UffFunction", "export_uff", "read_uff"]
 Quantity = Literal["displacement", "velocity", "acceleration"]
 
 _ORDERS: dict[str, tuple[int, str]] = {"displacement": (8, "m"), "velocity": (11, "m/s"), "acceleration": (12, "m/s^2")}
-"""Specific data types and units of motions."""
+"""Specific data types of the format, and units, of displacements, velocities and accelerations."""
 
 _FORCE, _REACTION, _TIME, _FREQUENCY = 13, 9, 17, 18
 _HISTORY, _RESPONSE, _GENERAL = 1, 4, 0
 _KINDS = {_HISTORY: "history", _RESPONSE: "response"}
 _EXPONENTS = {8: (1, 0), 11: (1, 0), 12: (1, 0), 9: (0, 1), 13: (0, 1), 15: (-2, 1), 16: (-1, 1)}
-"""Exponents of length and force in quantities by their specific data type."""
+"""Exponents of length and force in the unit of a quantity, by its specific data type."""
 
 _LINES = 2048
 _HIGHEST = 1.5
-"""Default frequencies reach so many times the highest natural frequency."""
+"""Highest default frequency, relative to the highest natural frequency."""
 
 _DIGITS = 5
-"""Digits of the abscissa in a file; a default spacing has no more."""
+"""Significant digits of the default spacing, not more than those of the abscissa in a file."""
 
 _MAX_UNEVEN = 1e-6
 _MAX_BYTES = 2**28
 
 
 class _Node(NamedTuple):
-    """Node of a machine: `number`, `position` (x, y, z) m, `rows` (np, nd) by which it moves."""
+    """Node of a machine: `number`, `position` (x, y, z) in m, `rows` (np, nd) from coordinates to its displacements."""
 
     number: int
     position: tuple[float, float, float]
@@ -65,9 +66,9 @@ class UffFunction(NamedTuple):
     - `kind`: "history", "response" (frequency response function) or "other"
     - `x` (n,), s or Hz, and `values` (n,), real or complex, in SI
     - `quantity` such as "acceleration", "" if the file does not state it
-    - `response` and `reference`: the node and the direction (1 to 6 for +X to a turn about +Z, negative for the opposite) of
-      answer and force
-    - `about`: the first line of the file's description
+    - `response` and `reference`: node and direction of the response and of the force; 1 to 3 are +X to +Z, 4 to 6 rotations
+      about +X to +Z, negative numbers the opposite directions
+    - `about`: the first line of the function's description in the file
     """
 
     kind: Literal["history", "response", "other"]
@@ -100,13 +101,15 @@ def export_uff(
 ) -> Path:
     """Write a universal file (58, 55, 15, 82, 151, 164) of a scene or of a run.
 
-    - Of a `Scene`: frequency response functions of every node to a force at the exciter in each of its directions, one function
-      for each node and direction, at even frequencies; natural motions, undamped (normal modes) for machines that move up and
-      down, with damping at the rotor speed (complex modes, the whirl) for machines that move across and up
-    - Of a `Run`: histories of every node and of the force on the foundation (node 0), and the amplitude spectra of its end
+    - Frequency responses of a `Scene`: one function for each node and direction, to a force at the exciter in each of its
+      directions, at evenly spaced frequencies
+    - Natural modes of a `Scene`: undamped (normal modes) for machines that move up and down; damped, at the rotor speed
+      (complex modes, the whirl), for machines that move across and up
+    - Histories of a `Run`: those of every node and of the force on the foundation (node 0), and the amplitude spectra of its
+      end
 
-    Header, units (SI), nodes and lines come first; programs for modal analysis refuse functions without them. Numbers have 12
-    digits, those of the abscissa and of shapes 6, as the format prescribes.
+    Header, units (SI), nodes and lines come first, because programs for modal analysis reject functions without them. Numbers
+    have 12 digits, but those of the abscissa and of mode shapes have 6, as the format prescribes.
 
     **Arguments**
 
@@ -117,8 +120,8 @@ def export_uff(
       natural frequency
     - `rotor_speed`, rad/s, as in `state_space`; typical: 0 to 500
 
-    **Returns** the path. **Raises** `InputError` for frequencies that are not even or are not positive, for accelerations of a
-    run, which keeps none, and for a path that cannot be written to.
+    **Returns** the path. **Raises** `InputError` for frequencies that are not evenly spaced or not positive, for accelerations
+    of a run, which are not stored, and for a path that cannot be written to.
 
     >>> import pathlib, tempfile, numpy as np, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -143,7 +146,7 @@ def export_uff(
         scene, content = source.scene, _histories(source, quantity)
     pyuff = optional_module("pyuff", "uff")
     with written(path) as part:
-        part.touch()  # raises what pyuff would hide
+        part.touch()  # raises an error that pyuff would hide
         pyuff.UFF(str(part)).write_sets([*_head(scene, path), *content], mode="overwrite")
     return path
 
@@ -163,7 +166,7 @@ def _nodes(scene: Scene) -> list[_Node]:
 
 
 def _directions(scene: Scene) -> list[int]:
-    """Return the directions of the rows of a node: +Y across, +Z up."""
+    """Return the numbers of the directions of a node's rows: 2 (+Y) across, 3 (+Z) up."""
     return [2 + axis for axis in scene.mounting().axes]
 
 
@@ -182,7 +185,7 @@ def _head(scene: Scene, path: Path) -> list[dict[str, Any]]:
 
 
 def _modes(scene: Scene, rotor_speed: Number | None) -> list[dict[str, Any]]:
-    """Return the natural motions at the nodes."""
+    """Return the natural modes at the nodes (datasets 55)."""
     nodes, directions = _nodes(scene), _directions(scene)
     numbers_ = [node.number for node in nodes]
 
@@ -233,7 +236,7 @@ def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_s
 
 
 def _even_frequencies(scene: Scene, frequencies: Numbers | None) -> np.ndarray:
-    """Return frequencies in Hz. **Raises** `InputError` if their spacing is not even."""
+    """Return frequencies in Hz. **Raises** `InputError` if they are not evenly spaced."""
     if frequencies is None:
         step = _HIGHEST * float(np.max(np.asarray(estimated_frequencies(scene)))) / (2.0 * np.pi * _LINES)
         return float(f"{step:.{_DIGITS - 1}e}") * np.arange(1, _LINES + 1)
@@ -286,7 +289,7 @@ def _function(
     reference: tuple[int, int],
     abscissa: int,
 ) -> dict[str, Any]:
-    """Return dataset 58."""
+    """Return a function as dataset 58."""
     ordinate, unit = _ORDERS.get(quantity, (_REACTION, "N"))
     per_force = kind == _RESPONSE
     about = f"{quantity} of node {response[0]}{f' per force on node {reference[0]}' * per_force}"
@@ -318,8 +321,8 @@ def _function(
 def read_uff(path: str | Path) -> UffFile:
     """Read histories and frequency response functions (dataset 58) and nodes (15, 2411) of a universal file, in SI units.
 
-    Spacing may be even or not, data text or binary, real or complex. Units other than SI are converted by dataset 164; without
-    one they are taken as SI.
+    The abscissa may be evenly or unevenly spaced, the data text or binary, real or complex. Values are converted to SI by
+    dataset 164; a file without that dataset is taken as SI.
 
     **Arguments**: `path` of the file.
 
@@ -379,7 +382,7 @@ def _read_function(dataset: dict[str, Any], length: float, force: float) -> UffF
 
 
 def _scale(dataset: dict[str, Any], side: str, length: float, force: float) -> float:
-    """Return the factor of a side of a quotient to SI."""
+    """Return the factor from the file's units to SI for one side of the quotient, numerator or denominator."""
     kind = int(dataset[f"{side}_spec_data_type"])
     own = int(dataset[f"{side}_len_unit_exp"]), int(dataset[f"{side}_force_unit_exp"])
     lengths, forces = own if kind == 1 else _EXPONENTS.get(kind, (0, 0))
