@@ -1,7 +1,7 @@
-"""Programs on single numbers, written as C.
+"""Scalar programs written as C.
 
-Everything that depends on parameters alone goes into a function of its own, which is called when a parameter changes; the
-equations then read its results as constants. Each operation is one statement; an operation without a rule is an error.
+Statements that depend on parameters alone go into a separate function, which is called when a parameter changes; the equations
+read its results as constants. Each operation is one statement. An operation without a rule is an error.
 """
 
 from __future__ import annotations
@@ -48,18 +48,17 @@ _RULES: Mapping[str, str] = {
     "copy_p": "{0}",
     **{name: f"{name}({{0}})" for name in _CALLS},
 }
-"""Expressions of operations, by the names of JAX."""
+"""C expressions of operations, by their names in JAX."""
 
 _BRANCHES = {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 """Comparisons that choose a branch of the equations."""
 
 
 class Written(NamedTuple):
-    """A program as C.
+    """Program in C.
 
-    **Attributes**: `prepare`, `body`: statements of the part that depends on parameters alone, and of the rest; the number of
-    `constants` of the first part that the second one reads; `branches`, the number of comparisons of the second part that are
-    event indicators.
+    **Attributes**: `prepare`, the statements that depend on parameters alone; `body`, the other statements; `constants`, the
+    number of results of `prepare` that `body` reads; `branches`, the number of comparisons in `body` that are event indicators.
     """
 
     prepare: list[str]
@@ -69,7 +68,7 @@ class Written(NamedTuple):
 
 
 def number_text(value: Any) -> str:
-    """Return a number as C reads it back bit for bit.
+    """Return a number as C text that gives the same bits when it is read.
 
     >>> number_text(0.1), number_text(-3.0), number_text(True)
     ('0.1', '-3.0', '1')
@@ -85,11 +84,11 @@ def number_text(value: Any) -> str:
 def write_program(
     program: ClosedJaxpr, inputs: Sequence[str], parameters: int, outputs: Sequence[str], *, has_events: bool = False
 ) -> Written:
-    """Write a program on scalars as C.
+    """Write a scalar program as C.
 
-    **Arguments**: `inputs`, the C expression of each argument; the first `parameters` of them change between events only;
-    `outputs`, the C expression that each result is assigned to; `has_events`: assign the difference of the sides of each
-    comparison to an event indicator.
+    **Arguments**: `inputs`, the C expression of each argument; `parameters`, the number of leading arguments that change only
+    at events; `outputs`, the C expression to which each result is assigned; `has_events`: True to assign the difference of the
+    two sides of each comparison to an event indicator.
 
     **Raises** `InputError` with the name of an operation that has no rule.
     """
@@ -129,7 +128,7 @@ class _Writer:
         return Written(self.prepare, self.body, len(self.constants), self.branches)
 
     def _read(self, atom: Var | Literal, *, early: bool) -> str:
-        """Return the C expression of a value in one of the two parts."""
+        """Return the C expression of a value, in `prepare` if `early`, otherwise in `body`."""
         if isinstance(atom, Literal):
             text = number_text(np.asarray(atom.val, _dtype(atom)).item())
             return f"({text})" if text.startswith("-") else text
@@ -143,9 +142,9 @@ class _Writer:
         """Return the C expression of each result of an operation."""
         name, params = equation.primitive.name, equation.params
         values = [self._read(atom, early=early) for atom in equation.invars]
-        if name == "custom_jvp_call":  # the only one in programs on scalars is `sine_and_cosine`
+        if name == "custom_jvp_call":  # in scalar programs only `sine_and_cosine` has a custom rule
             return [f"sin({values[0]})", f"cos({values[0]})"]
-        # A comparison of two magnitudes chooses a pivot, which is no event of the machine.
+        # A comparison of two magnitudes selects a pivot of a linear solve and is not an event of the machine.
         if name in _BRANCHES and not early and _is_real(equation) and not self.magnitudes.issuperset(_variables(equation)):
             return [self._branch(f"{values[0]} {_BRANCHES[name]} {values[1]}", *values)]
         if name in ("max", "min", "clamp"):
@@ -164,12 +163,12 @@ class _Writer:
         return [_RULES[name].format(*values)]
 
     def _larger(self, x: str, y: str, than: str, real: bool) -> str:
-        """Return the larger or smaller of two numbers; NaN if x is."""
+        """Return the larger or smaller of two numbers; NaN if x is NaN."""
         test = f"{x} {than} {y} || {x} != {x}"
         return f"{self._branch(test, x, y) if real else f'({test})'} ? {x} : {y}"
 
     def _branch(self, test: str, x: str, y: str) -> str:
-        """Return a test; the difference of its sides is an event indicator."""
+        """Return a test, and make the difference of its sides an event indicator."""
         if self.has_events:
             self.body.append(f"indicators[{self.branches}] = {x} - {y};")
             self.branches += 1

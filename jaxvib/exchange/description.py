@@ -21,17 +21,17 @@ _BASE: Mapping[str, Mapping[str, int]] = {
     "rad": {"rad": 1},
     "N": {"kg": 1, "m": 1, "s": -2},
 }
-"""Units in base units of SI."""
+"""Units as exponents of SI base units."""
 
 _STRUCTURED = re.compile(r"(der\()?[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*\)?", re.ASCII)
 
 
 class Variable(NamedTuple):
-    """Variable of a unit; its value reference is its place in the list of all variables.
+    """Variable of a functional mock-up unit; its value reference is its index in the list of all variables.
 
-    **Attributes**: `name`; `unit`, "" for none; `kind` (causality) of FMI; `start` None if it is computed; `about`, a
-    description; `low`, `high` bounds or None; `state`, the place of the state whose rate it is, or None; `nominal` or None;
-    `listed`: False for a variable that the description of FMI 2.0 leaves out.
+    **Attributes**: `name`; `unit`, "" for none; `kind`, the causality of FMI; `start`, None if the value is computed; `about`,
+    a description; bounds `low` and `high`, or None; `state`: for the rate of a state, the index of that state, otherwise None;
+    `nominal` value or None; `listed`: False for a variable that the description of FMI 2.0 omits.
     """
 
     name: str
@@ -47,17 +47,17 @@ class Variable(NamedTuple):
 
     @property
     def variability(self) -> str:
-        """The variability of FMI."""
+        """Variability of FMI."""
         return "tunable" if self.kind == "parameter" else "continuous"
 
     @property
     def is_calculated(self) -> bool:
-        """True if the value follows from others from the start."""
+        """True if the value is computed from others at the start too."""
         return self.kind in ("output", "local") and self.start is None
 
 
 def base_units(unit: str) -> dict[str, int]:
-    """Return the exponents of a unit in base units.
+    """Return a unit as exponents of SI base units.
 
     >>> base_units("N s/m"), base_units("kg m^2")
     ({'kg': 1, 's': -1}, {'kg': 1, 'm': 2})
@@ -78,8 +78,8 @@ def describe_model(
 ) -> str:
     """Return the text of modelDescription.xml.
 
-    **Arguments**: the `name` and `identifier` of the model; `token` that its binary must have; `variables` in the order of
-    their value references; `step` of co-simulation and `stop` time of a default experiment, s.
+    **Arguments**: `name` and `identifier` of the model; `token` with which its binary must agree; `variables` in the order of
+    their value references; `step` of co-simulation and `stop` time of the default experiment, s.
     """
     two = fmi == "2.0"
     listed = [(reference, each) for reference, each in enumerate(variables) if each.listed or not two]

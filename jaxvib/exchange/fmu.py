@@ -1,4 +1,4 @@
-"""Functional mock-up units: a scene as C source and a binary, for tools that know nothing of Python."""
+"""Functional mock-up units: a scene as C source and a binary, for tools without Python."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from jaxvib.runtime.compat import HAS_JAXPRS
 __all__ = ["Fmu", "export_fmu"]
 
 _STEPS_PER_RADIAN = 16.0
-"""Steps of co-simulation in a radian of the fastest motion: a phase error of 1e-7 per radian."""
+"""Steps of co-simulation per radian of the fastest motion, which give a phase error of 1e-7 per radian."""
 
 _COMPILERS = ("cc", "gcc", "clang")
 _COMPILER_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden", "-s")
@@ -52,16 +52,16 @@ _PLATFORMS = {
     ("Darwin", "arm64"): ("aarch64-darwin", "aarch64-darwin", ".dylib"),
     ("Windows", "AMD64"): ("win64", "x86_64-windows", ".dll"),
 }
-"""Folders of binaries by FMI 2.0 and 3.0, and the end of their names."""
+"""Folders of binaries in FMI 2.0 and in FMI 3.0, and the file name extension."""
 
 
 class Fmu(NamedTuple):
-    """A functional mock-up unit that was written.
+    """Exported functional mock-up unit.
 
     Returned by `export_fmu`.
 
-    **Attributes**: `path` of the file; `has_binary`: True if it holds a binary of this platform beside the source; `message`, a
-    sentence about that; `statements` of the equations in C.
+    **Attributes**: `path` of the file; `has_binary`: True if it contains a binary for this platform beside the source;
+    `message`, a sentence about the binary; `statements`, the number of C statements of the equations.
     """
 
     path: Path
@@ -83,19 +83,19 @@ def export_fmu(
 ) -> Fmu:
     """Write a scene as a functional mock-up unit (FMU), for model exchange and co-simulation.
 
-    The file holds the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary of this platform. It
-    needs neither Python nor jaxvib. The same scene gives the same bytes.
+    The file contains the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary for this
+    platform. It needs neither Python nor jaxvib. The same scene gives the same bytes.
 
     - Parameters are all numbers of the scene under their names (`machine.stiffness[0]`), with units and bounds; they may change
-      during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which is the classical Runge-Kutta
+      during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the classical Runge-Kutta
       method of order 4
-    - States are outputs: `displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`; so are `acceleration.y1`,
+    - Outputs are the states (`displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`), `acceleration.y1`,
       `foundation_force.up`, `rotor.angle` and `rotor.speed`
-    - Inputs are `force.y1` on each coordinate (N, of angles N m) and, with a motor, `rotor.torque` (N m), which is added to its
-      torque
-    - Event indicators are comparisons in forces that are not smooth (stops, contacts, dry friction) and in a drive whose
-      acceleration jumps: a solver ends its steps where one of them changes its sign
-    - Directional derivatives of rates and outputs by states and inputs are exact
+    - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m), which is added to
+      the torque of the motor
+    - Event indicators are comparisons in nonsmooth forces (stops, contacts, dry friction) and in a drive whose acceleration
+      jumps; a solver ends a step at the time at which an indicator changes its sign
+    - Directional derivatives of rates and outputs with respect to states and inputs are exact
 
     **Arguments**
 
@@ -105,13 +105,13 @@ def export_fmu(
     - `start`: as in `simulate` except "spin_up", or a `State`
     - `mode`: number of the jam to start in; typical: 1, 3, 5
     - `drive`: "scene" (the default), or "input" for inputs in place of the drive: `rotor.speed` and its derivative
-      `rotor.acceleration` for an ideal drive, `rotor.torque` alone for a motor
+      `rotor.acceleration` for an ideal drive, only `rotor.torque` for a motor
     - `binary`: True to compile a binary
 
     **Returns** `Fmu`.
 
-    **Raises** `InputError` for a part of the scene whose equations have no form in C, naming the operation, and for a path that
-    cannot be written to.
+    **Raises** `InputError` for a part of the scene whose equations cannot be written in C (the message names the operation),
+    and for a path that cannot be written to.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -181,7 +181,7 @@ def _step(scene: Scene) -> float:
 
 
 def _programs(scene: Scene, equations: Equations, events: bool, parameters: int) -> tuple[Written, Written]:
-    """Return the rates, and their derivatives in a direction of states and inputs, in C."""
+    """Return C programs for the rates and for their derivatives in a direction of states and inputs."""
     if not HAS_JAXPRS:
         raise InputError("scene", "cannot be written as C, since this version of JAX does not give access to its programs")
     time = jnp.zeros((), scene.drive.speed.dtype)
@@ -211,7 +211,7 @@ def _text(value: object) -> str:
 
 
 def _flat(tree: object) -> list[str]:
-    """Return the numbers of a tree as C and XML read them."""
+    """Return the numbers of a tree as texts for C and XML."""
     return [_text(value) for leaf in jax.tree.leaves(tree) for value in np.asarray(leaf).ravel()]
 
 
@@ -326,7 +326,7 @@ def _c_text(text: str) -> str:
 
 
 def _compiled(files: dict[str, bytes], fmi: Fmi, identifier: str) -> tuple[dict[str, bytes] | None, str]:
-    """Return the binary of this platform, or None, and a sentence about it."""
+    """Return the binary for this platform, or None, and a sentence about it."""
     found = _PLATFORMS.get((platform.system(), platform.machine()))
     compiler = next(filter(None, map(shutil.which, filter(None, (os.environ.get("CC"), *_COMPILERS)))), None)
     if found is None or compiler is None:
@@ -350,7 +350,7 @@ def _compiled(files: dict[str, bytes], fmi: Fmi, identifier: str) -> tuple[dict[
 
 
 def _archive(files: dict[str, bytes]) -> bytes:
-    """Return a ZIP archive that is the same for the same files."""
+    """Return a ZIP archive whose bytes depend only on the files, not on the time."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(files):

@@ -1,4 +1,4 @@
-"""Equations of a scene as a function of its numbers, time, states and inputs, for other tools."""
+"""Equations of a scene as a function of its numbers, of time, states and inputs, for other tools."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ DriveBy = Literal["scene", "input"]
 
 
 class _AppliedForce(Effect):
-    """External forces on the coordinates, (nd,) N, of angles N m."""
+    """External forces on the coordinates, (nd,), N, for angles N m."""
 
     force: Array
     kind: str = eqx.field(static=True, kw_only=True, default="applied_force")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return a support that pulls with the force."""
+        """Return a support force that applies the external forces."""
         size = len(self.force)
 
         def rows(machine: Machine) -> Array:
@@ -68,7 +68,7 @@ class _SpeedInput(IdealDrive):
 
 
 class _TorqueInput(Motor):
-    """Motor with an additional torque on its rotor, or with that torque alone if `motor` is None."""
+    """Motor with an additional torque on its rotor; only that torque acts if `motor` is None."""
 
     speed: Array
     inertia: Array
@@ -77,15 +77,15 @@ class _TorqueInput(Motor):
     kind: str = eqx.field(static=True, kw_only=True, default="torque_input")
 
     def torque(self, speed: Array) -> Array:
-        """Return the torque of the motor and the additional one."""
+        """Return the sum of the motor's torque and the additional torque."""
         return self.extra if self.motor is None else self.motor.torque(speed) + self.extra
 
 
 class Inputs(NamedTuple):
     """Inputs of the equations.
 
-    **Attributes**: `force` on the coordinates (nd,), N, of angles N m; `torque` on the rotor of a motor, N m; `speed` and
-    `acceleration` of a rotor whose motion is an input, rad/s, rad/s^2. None if the scene has no such input.
+    **Attributes**: `force` on the coordinates (nd,), N, for angles N m; `torque` on the rotor of a motor, N m; `speed` and
+    `acceleration` of a rotor whose motion is an input, rad/s and rad/s^2. An input that the scene does not have is None.
     """
 
     force: Any
@@ -95,14 +95,14 @@ class Inputs(NamedTuple):
 
 
 class States(NamedTuple):
-    """State of the equations: `machine`, and the `rotor_angle`, rad, of a rotor whose speed is an input, otherwise None."""
+    """State of the equations: `machine`; `rotor_angle`, rad, if the rotor speed is an input, otherwise None."""
 
     machine: State
     rotor_angle: Any = None
 
 
 class Outputs(NamedTuple):
-    """Outputs beside states and rates: `foundation_force` (nb,) N; `rotor` angle and speed, None if they are states."""
+    """Outputs beside states and rates: `foundation_force` (nb,) N; `rotor`, its angle and speed, None if they are states."""
 
     foundation_force: Any
     rotor: Any = None
@@ -111,9 +111,9 @@ class Outputs(NamedTuple):
 class Equations(NamedTuple):
     """Equations of a scene for another tool.
 
-    **Attributes**: `rates` (scene, time, states, inputs) -> (rates of the states, outputs); the structures of `states` and
-    `inputs`; a `Signal` for each number of `states`, of the rates of velocities (None for rates without a name of their own),
-    of inputs and outputs, in the order of their leaves.
+    **Attributes**: `rates`, a function (scene, time, states, inputs) -> (rates of the states, outputs); initial values of
+    `states` and `inputs`; `state_signals`, `rate_signals`, `input_signals` and `output_signals`, a `Signal` for each number in
+    the order of the leaves. In `rate_signals`, only the rates of velocities have a signal; the others are None.
     """
 
     rates: Callable[[Scene, Array, States, Inputs], tuple[States, Outputs]]
@@ -161,7 +161,7 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
 
 
 def _driven(drive: Drive, angle: Array | None, given: Inputs, by_input: bool) -> Drive:
-    """Return the drive with its inputs."""
+    """Return the drive to which the inputs are applied."""
     if isinstance(drive, Motor):
         return _TorqueInput(drive.speed, drive.inertia, given.torque, None if by_input else drive)
     if by_input:
@@ -201,7 +201,7 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
 
 
 def has_events(scene: Scene) -> bool:
-    """True if the equations have branches: forces that are not smooth, or a drive whose acceleration jumps."""
+    """True if the equations have branches: nonsmooth forces, or a drive whose acceleration jumps."""
     smooth = all(term.is_smooth for effect in scene.all_effects for term in effect.terms())
     return not smooth or bool(scene.drive.jump_ts())
 
