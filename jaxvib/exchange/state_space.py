@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["StateSpace", "state_space"]
 
 _MAX_RESIDUAL = 1e-6
-"""Largest acceleration of a load in a jam, relative to that of its drag alone."""
+"""Largest residual acceleration of a load in a jam, relative to the acceleration by its drag alone."""
 
 _AT_REST = (
     "linear machine with the masses of its loads at their places, at the rotor speed {speed:.6g} rad/s; inputs are forces on "
@@ -57,7 +57,7 @@ class StateSpace(NamedTuple):
 
     - `A` (nx, nx), `B` (nx, nu), `C` (ny, nx), `D` (ny, nu), SI units
     - `states`, `inputs`, `outputs`: a `Signal` (`name`, `unit`) for each entry of x, u and y
-    - `x0`, `u0`, `y0`: the operating point; x, u and y are deviations from it. 0 at rest
+    - `x0`, `u0`, `y0`: the operating point, 0 for a machine at rest; x, u and y are deviations from it
     - `about`: a sentence about the equations
     """
 
@@ -78,7 +78,7 @@ class StateSpace(NamedTuple):
         return np.linalg.eigvals(self.A)
 
     def frequency_response(self, omega: Any) -> np.ndarray:
-        """Return C (i w - A)^-1 B + D, amplitudes of outputs per input at the frequencies `omega` (nw,) rad/s, (nw, ny, nu)."""
+        """Return C (i w - A)^-1 B + D, the amplitudes of outputs per input at `omega` (nw,) rad/s; shape (nw, ny, nu)."""
         frequencies = np.atleast_1d(np.asarray(omega, float))[:, None, None]
         inner = np.linalg.solve(1j * frequencies * np.eye(len(self.A)) - self.A, self.B.astype(complex))
         return self.C @ inner + self.D
@@ -88,7 +88,7 @@ class StateSpace(NamedTuple):
         return optional_module("scipy.signal", "mat").StateSpace(self.A, self.B, self.C, self.D)
 
     def control(self) -> control.StateSpace:
-        """Return the model for python-control, with the names of its signals; a point in a name becomes "_".
+        """Return the model for python-control, with the names of its signals; a dot in a name becomes "_".
 
         **Raises** `InputError` if python-control is not installed (extra `control`).
         """
@@ -101,7 +101,7 @@ class StateSpace(NamedTuple):
     def save(self, path: str | Path) -> Path:
         """Write a MAT file (".mat", added if it is missing) that MATLAB, Octave and SciPy read.
 
-        It holds A, B, C, D, x0, u0, y0, the text `about`, and names and units as cell arrays: state_names, state_units,
+        It contains A, B, C, D, x0, u0, y0, the text `about`, and names and units as cell arrays: state_names, state_units,
         input_names, input_units, output_names, output_units.
 
         **Arguments**: `path` of the file.
@@ -128,28 +128,28 @@ def state_space(
 ) -> StateSpace:
     """Return the state-space model of a scene's machine, at rest or in a jam.
 
-    At rest, with the masses of the loads in M and the linear part of nonlinear supports in K and C:
+    At rest, M includes the masses of the loads, and K and C include the linear parts of nonlinear supports:
 
         M q'' + (C + n G) q' + K q = f + P^T f_e,      x = (q, q'),      y = (q, q', q'', T_K q + T_C q')
 
-    In a jam it is the linearization of the averaged equations (`envelope`) about it:
+    In a jam, the model is the linearization of the averaged equations (`envelope`) about the jam:
 
-    - states are the complex amplitudes of the carrier (real and imaginary parts), the speeds of the loads and their phases
-      relative to the first one
+    - the states are the complex amplitudes of the carrier (real and imaginary parts), the load speeds, and the phases of the
+      loads relative to the first one
     - the input is the rotor speed
-    - outputs are the mean speed of the loads, the amplitudes of the coordinates and of the foundation force
-    - the largest real part of its poles is the `growth` of `phase_jams`
+    - the outputs are the mean load speed and the amplitudes of the coordinates and of the foundation force
+    - the largest real part of the poles is the `growth` of `phase_jams`
 
     **Arguments**
 
-    - `scene`; at rest only its machine, loads and nonlinear supports count
+    - `scene`; a model at rest depends only on its machine, loads and nonlinear supports
     - `at`: "rest" (the default), or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`
-    - `rotor_speed` n, rad/s, of a machine at rest with a gyroscopic matrix (default: the drive's speed); typical: 0 to 500
+    - `rotor_speed` n, rad/s, for a machine at rest with a gyroscopic matrix (default: the drive's speed); typical: 0 to 500
 
     **Returns** `StateSpace`.
 
-    **Raises** `InputError` for a jam that does not exist, or is no equilibrium of the averaged equations of this scene, for
-    effects that they leave out, and for a rotor speed beside a jam.
+    **Raises** `InputError` for a jam that does not exist or is not an equilibrium of the averaged equations of this scene, for
+    effects that these equations do not include, and for a rotor speed together with a jam.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -211,7 +211,7 @@ def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
         raise InputError(
             "at", "is the jam of a machine with other coordinates or another number of loads; take one of this scene"
         )
-    averaged_field(scene)  # refuses what the averaged equations leave out before anything is compiled
+    averaged_field(scene)  # raises errors for effects outside the averaged equations before anything is compiled
     found = jax.tree.map(np.asarray, _jam_matrices(scene, jam.omega, phase, jam.displacement))
     (a, b, c, d), x0, y0, residual = found
     if not residual < _MAX_RESIDUAL:
@@ -235,7 +235,7 @@ def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
 def _jam_matrices(
     scene: Scene, omega: Array, phase: Array, displacement: Array
 ) -> tuple[tuple[Array, Array, Array, Array], Array, Array, Array]:
-    """A, B, C, D; the operating point of states and outputs; the residual of the loads' equations."""
+    """Return A, B, C, D; the operating point of states and outputs; the residual of the loads' equations."""
     nd, count, carrier = displacement.shape[0], phase.shape[0], linear_model(scene).carrier
 
     def amplitudes(x: Array) -> Amplitudes:
@@ -247,7 +247,7 @@ def _jam_matrices(
     def flow(x: Array, speed: Array) -> Array:
         moving = amplitudes(x)
         change = averaged_field(eqx.tree_at(lambda s: s.drive.speed, scene, speed))(jnp.zeros_like(omega), moving)
-        # Amplitudes turn with the mean angle of the loads; here they turn with the first load.
+        # The averaged amplitudes refer to the mean angle of the loads; here they are referred to the first load.
         turn = 1j * change.phase[0]
         rates = [change.displacement - turn * moving.displacement, change.velocity - turn * moving.velocity]
         parts = [part for rate in rates for part in (rate.real, rate.imag)]
