@@ -1,4 +1,4 @@
-"""Layout of the parts of a machine of platforms in a picture, without springs that cross other parts."""
+"""Layout of platforms, springs and exciter in a picture, in which springs cross as few platforms as possible."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ __all__ = ["Tie", "lanes"]
 
 
 class Tie(NamedTuple):
-    """A link between two platforms, or a support of one on the foundation: their levels (`low`, `high`), 0 for the foundation;
-    its `stiffness` N/m and `damping` N s/m. The exciter stands on its platform as a tie of that level to itself, without
-    either."""
+    """Link between two platforms, or support of a platform.
+
+    **Attributes**: `low` and `high`, the levels of its ends, 0 for the foundation; `stiffness` N/m and `damping` N s/m. The
+    exciter is represented by a tie from the level of its platform to the same level, without stiffness and damping.
+    """
 
     low: int
     high: int
@@ -19,15 +21,14 @@ class Tie(NamedTuple):
 
     @property
     def exciter(self) -> bool:
-        """True if it is the place of the exciter."""
+        """True if the tie represents the exciter."""
         return self.low == self.high
 
 
 def lanes(ties: list[Tie], levels: int) -> list[int]:
-    """The order from left to right in which ties stand, such that they cross few platforms that they do not hold, and platforms
-    are short.
+    """Return the order of ties from left to right in which few ties cross platforms of other ties, and platforms are short.
 
-    Neighbouring and distant ties are swapped until no swap is an improvement.
+    Pairs of ties are swapped until no swap is an improvement.
 
     >>> lanes([Tie(0, 1), Tie(0, 2), Tie(1, 2)], 2)
     [0, 2, 1]

@@ -1,4 +1,4 @@
-"""Machines as drawings: platforms from the side, a rotor along its axis, a rotor that tilts from both."""
+"""Drawings of machines: platforms from the side, a rotor along its axis, a rotor with tilt in both views."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FORCE: Look = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
 def _tie(
     start: tuple[float, float], end: tuple[float, float], stiffness: float, damping: float, length: float = 1.5
 ) -> list[Part]:
-    """A spring and a damper side by side; the one alone where the other is 0. `length` at rest."""
+    """Return a spring and a damper side by side, without one that is 0. `length` is their length at rest."""
     both = stiffness > 0.0 and damping > 0.0
     off = 0.17 if both else 0.0
     side = np.array([start[1] - end[1], end[0] - start[0]]) / max(np.hypot(end[0] - start[0], end[1] - start[1]), 1e-9)
@@ -39,12 +39,15 @@ def _tie(
 
 
 def _spring_text(stiffness: float, damping: float) -> str:
-    """The numbers of a spring and a damper, a line each."""
+    """Return the values of a spring and a damper, one line for each."""
     return "\n".join([shown(stiffness, "N/m")] * (stiffness > 0.0) + [shown(damping, "N s/m")] * (damping > 0.0))
 
 
 class View(abc.ABC):
-    """A scene as a drawing in units of its own. `limits` (left, right, bottom, top); its `wheel`, the rotor with the loads."""
+    """Drawing of a scene in its own units of length.
+
+    **Attributes**: `limits` (left, right, bottom, top) of the drawing; `wheel`, the rotor with the loads.
+    """
 
     limits: tuple[float, float, float, float]
     wheel: Wheel
@@ -61,31 +64,34 @@ class View(abc.ABC):
 
     @abc.abstractmethod
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """Drawn parts, the same in the same order for every pose; `reach` is the number of drawn units for a metre of
-        displacement."""
+        """Return the drawn parts, the same parts in the same order for every pose.
+
+        `reach` is the number of units of the drawing per metre of displacement.
+        """
 
     def magnified(self, displacement: np.ndarray) -> float:
-        """Factor, relative to the circle of the loads, at which displacements (nt, nd) are drawn so that the largest is well
-        visible; one digit. `parts` takes it times `wheel.scale`."""
+        """Return the magnification of displacements (nt, nd), relative to the circle of the loads, at which the largest one is
+        clearly visible; one digit. The argument `reach` of `parts` is this factor times `wheel.scale`."""
         length = [k for k, unit in enumerate(self.scene.machine.structure().units) if unit == "m"]
         largest = float(np.max(np.abs(displacement[:, length]), initial=1e-300))
         return float(f"{0.3 / largest / self.wheel.scale:.1g}")
 
     @abc.abstractmethod
     def texts(self, pose: Pose, reach: float) -> list[Text]:
-        """Names and numbers of the parts, as `parts`."""
+        """Return the names and values of the parts; the arguments are those of `parts`."""
 
     @abc.abstractmethod
     def supports(self) -> list[tuple[float, float]]:
-        """Positions of the supports on the foundation."""
+        """Return the positions of the supports on the foundation."""
 
     @abc.abstractmethod
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Force of each support on the foundation, (supports, 2) N across and up, without supports that are effects."""
+        """Return the force of each support on the foundation, (supports, 2) N, across and up, without effects."""
 
     def arrows(self, pose: Pose, total: np.ndarray, per_newton: float) -> list[Part]:
-        """The forces on the foundation as arrows: of each support where it stands, and the `total` (nb,) N, darker, beside the
-        machine.
+        """Return arrows of the forces on the foundation.
+
+        The force of each support is drawn at the support, the `total` (nb,) N in black beside the machine.
         """
         whole = (0.0, float(total[0])) if total.size == 1 else (float(total[0]), float(total[1]))
         found = [
@@ -98,7 +104,7 @@ class View(abc.ABC):
 
 
 class PlatformView(View):
-    """Platforms above each other, numbered from the foundation upward, each spring in a lane of its own."""
+    """Platforms above each other, numbered from the foundation upward, with each spring in a separate lane."""
 
     pitch, thick, lane = 1.9, 0.34, 2.0
 
@@ -130,7 +136,7 @@ class PlatformView(View):
         return level * self.pitch + (reach * float(self.rows[level - 1] @ pose.displacement) if level else 0.0)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """The foundation, the springs and dampers, the platforms, the exciter."""
+        """Return the foundation, the springs and dampers, the platforms, the exciter."""
         found = [Part(ground((-0.2, 0.0), (self.width, 0.0)), _BED)]
         for k, tie in enumerate(self.ties):
             if not tie.exciter:
@@ -145,7 +151,7 @@ class PlatformView(View):
         return found + self.wheel.parts((self.x[len(self.ties) - 1], self._height(self.exciter, pose, reach)), pose)
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
-        """Masses on the platforms, numbers beside the springs."""
+        """Return the masses on the platforms and the values beside the springs."""
         found = []
         for k, tie in enumerate(self.ties):
             if not tie.exciter:
@@ -153,7 +159,7 @@ class PlatformView(View):
                 place = (self.x[k] + 0.42, middle)
                 found.append(Text(*place, _spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
         for level, (left, right) in enumerate(self.spans, start=1):
-            # On the longer piece of the platform beside the exciter.
+            # The text is on the longer piece of the platform beside the exciter.
             x = self.x[len(self.ties) - 1]
             edges = [(left, x - self.wheel.rim), (x + self.wheel.rim, right)] if level == self.exciter else [(left, right)]
             a, b = max(edges, key=lambda edge: edge[1] - edge[0])
@@ -163,18 +169,20 @@ class PlatformView(View):
         return found
 
     def supports(self) -> list[tuple[float, float]]:
-        """The feet of the supports."""
+        """Return the lower ends of the supports."""
         return [(self.x[k], 0.0) for k, tie in enumerate(self.ties) if tie.low == 0]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """k_i y_i + b_i y_i', upward."""
+        """Return k_i y_i + b_i y_i' of each support, upward."""
         force = self.foundation_stiffness[0] * pose.displacement + self.foundation_damping[0] * pose.velocity
         return np.array([[0.0, force[tie.high - 1]] for tie in self.ties if tie.low == 0])
 
 
 class FrontView(View):
-    """A rotor seen along its axis, on a spring and a damper each way; with loads that move along the axis the section of their
-    track."""
+    """Rotor seen along its axis, on a spring and a damper in each direction.
+
+    For loads that move along the axis, the section of their track is drawn too.
+    """
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -187,7 +195,7 @@ class FrontView(View):
         return float(across), float(up)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """The foundation below and a wall to the left, springs and dampers, the rotor."""
+        """Return the foundation below, a wall on the left, springs and dampers, the rotor."""
         x, y = self._centre(pose, reach)
         k, c = self.foundation_stiffness[1], self.foundation_damping[1]
         stiffness, damping = float(np.max(k)), float(np.max(c))
@@ -198,7 +206,7 @@ class FrontView(View):
         return found + (self._section(pose) if self.section else [])
 
     def _section(self, pose: Pose) -> list[Part]:
-        """The track cut across, magnified: the axis to the left, balls where they are in it."""
+        """Return the magnified cross-section of the track with the balls in it; the axis is on the left."""
         loads = self.scene.loads
         first, *others = (np.asarray(u, float) for u in loads.rest())
         turn = np.linspace(0.0, 2.0 * np.pi, 61)
@@ -221,7 +229,7 @@ class FrontView(View):
         return found
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
-        """The mass, and the support's numbers, which hold both ways."""
+        """Return the mass, and the values of the supports, which are equal in both directions."""
         label = _spring_text(float(np.max(self.foundation_stiffness[1])), float(np.max(self.foundation_damping[1])))
         small: Look = {"fontsize": "small"}
         mass = f"M = {shown(float(self.mass[0, 0]), 'kg')}"
@@ -235,17 +243,17 @@ class FrontView(View):
         ]
 
     def supports(self) -> list[tuple[float, float]]:
-        """The feet on the foundation and on the wall."""
+        """Return the ends of the supports on the foundation and on the wall."""
         return [(0.0, -2.4), (-2.7, 0.0)]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """T_K q + T_C q': up on the foundation, across on the wall."""
+        """Return T_K q + T_C q': the force up on the foundation, across on the wall."""
         force = self.foundation_stiffness @ pose.displacement + self.foundation_damping @ pose.velocity
         return np.array([[0.0, force[1]], [force[0], 0.0]])
 
 
 class ShaftView(View):
-    """A rotor that tilts: its shaft from the side, distances from its mass centre, and to the right along its axis."""
+    """Rotor with tilt: the shaft from the side, with distances from the centre of mass, and on the right along the axis."""
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -267,7 +275,7 @@ class ShaftView(View):
         return reach * float(self._rows(float(s))[axis] @ pose.displacement)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """The foundation, supports, shaft and body, a disc at each station with its loads, and the rotor along its axis."""
+        """Return foundation, supports, shaft and body, a disc with loads at each station, and the rotor along its axis."""
         found = [Part(ground((-3.2, -2.2), (3.2, -2.2)), _BED)]
         for s, k, c in self.stands:
             found += _tie((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
@@ -291,7 +299,7 @@ class ShaftView(View):
         return found + self.wheel.parts(centre, pose)
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
-        """Mass and inertias, supports and stations with their places from the mass centre."""
+        """Return mass, inertias and supports, and the positions of supports and stations from the centre of mass."""
         small: Look = {"fontsize": "small"}
         turning = self.mount.gyroscopic
         inertia = f"M = {shown(float(self.mass[0, 0]), 'kg')}\nA = {shown(float(self.mass[2, 2]), 'kg m²')}"
@@ -310,11 +318,11 @@ class ShaftView(View):
         return found
 
     def supports(self) -> list[tuple[float, float]]:
-        """The feet of the supports."""
+        """Return the lower ends of the supports."""
         return [(self._x(s), -2.2) for s, _, _ in self.stands]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """k x + c x' of each support, the part upward, which is what is seen from the side."""
+        """Return the upward component of k x + c x' of each support, which is visible from the side."""
         rows = [self._rows(s)[1] for s, _, _ in self.stands]
         return np.array(
             [
@@ -325,7 +333,7 @@ class ShaftView(View):
 
 
 def view_of(scene: Scene) -> View:
-    """The drawing of a scene, chosen by the places that its machine has."""
+    """Return the drawing of a scene, chosen by the kind of places of its machine."""
     machine = scene.machine
     if machine.places == "plane" or (machine.places == "point" and machine.mounting().axes != (0, 1)):
         problem = f"is {machine.kind!r}; machines are drawn that have platforms or a shaft, or that move across and up"

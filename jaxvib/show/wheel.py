@@ -1,4 +1,4 @@
-"""The rotor with its loads, seen along its axis; and numbers with the units that a drawing has."""
+"""Rotor with its loads, seen along its axis, and numbers in the units of a drawing."""
 
 from __future__ import annotations
 
@@ -17,9 +17,12 @@ __all__ = ["Pose", "Wheel", "at_rest", "caption", "places_of", "shown"]
 
 
 class Pose(NamedTuple):
-    """Positions of all parts at an instant: `displacement` (nd,) m and `velocity` (nd,) m/s, of tilts rad and rad/s, the loads'
-    coordinates `angle`, (count,) each, and the angle `turn` of the rotor, rad; `own`, the loads' own positions (count,) each,
-    where they are known already."""
+    """Positions of all parts at an instant.
+
+    **Attributes**: `displacement` (nd,) m and `velocity` (nd,) m/s, for tilts rad and rad/s; `angle`, the loads' coordinates,
+    (count,) each; `turn`, the angle of the rotor, rad; `own`, the loads' positions relative to its centre, (count,) each, or
+    None if they have not been computed yet.
+    """
 
     displacement: np.ndarray
     velocity: np.ndarray
@@ -38,7 +41,7 @@ _UNITS = {
 
 
 def shown(value: float, unit: str) -> str:
-    """A number in the unit that a drawing has.
+    """Return a number with its unit as a drawing shows it.
 
     >>> shown(5e4, "N/m"), shown(0.12, "m"), shown(0.05, "kg")
     ('50 N/mm', '120 mm', '50 g')
@@ -49,23 +52,23 @@ def shown(value: float, unit: str) -> str:
 
 
 def _span(values: np.ndarray, unit: str) -> str:
-    """One number that all share, or the range of several."""
+    """Return the common value of several numbers, or their range."""
     low, high = float(np.min(values)), float(np.max(values))
     return shown(low, unit) if high - low <= 1e-12 * abs(high) else f"{shown(low, unit)} to {shown(high, unit)}"
 
 
 def places_of(loads: Loads, angle: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Own positions of loads with these coordinates, m: across, up, and along the axis where they move there."""
+    """Return the loads' positions relative to the rotor's centre, m: across, up, and along the axis if they move along it."""
     return [np.asarray(x, float) for x in loads.position(*map(jnp.asarray, angle))]
 
 
 def track_radius(loads: Loads) -> float:
-    """Distance of the loads from the axis at rest, m."""
+    """Return the distance of the loads from the axis at rest, m."""
     return float(jnp.max(loads.arm()))
 
 
 def at_rest(scene: Scene) -> Pose:
-    """The pose of a sketch: nothing displaced, loads spread evenly so that each is seen."""
+    """Return the pose of a sketch: no displacement, and loads spread evenly so that each is visible."""
     first, *others = (np.asarray(u, float) for u in scene.loads.rest())
     spread = first + 2.0 * np.pi * np.arange(scene.loads.count) / scene.loads.count + np.pi * 5.0 / 6.0
     zero = np.zeros(len(scene.machine.structure().coordinates))
@@ -73,7 +76,7 @@ def at_rest(scene: Scene) -> Pose:
 
 
 def caption(scene: Scene) -> str:
-    """Loads, drive and effects in a few words and numbers, for the head of a sketch."""
+    """Return a short description of loads, drive and effects for the title of a sketch."""
     loads, drive = scene.loads, scene.drive
     each = " each" if loads.count > 1 else ""
     named = loads.kind.replace("_", " ") + ("s" if loads.count > 1 else "")
@@ -90,7 +93,7 @@ def caption(scene: Scene) -> str:
 
 
 class Wheel:
-    """The rotor of a scene with its loads, seen along its axis: `radius` of the loads' circle in the drawing."""
+    """Rotor of a scene with its loads, seen along its axis; `radius` of the loads' circle in the drawing."""
 
     def __init__(self, scene: Scene, radius: float):
         self.loads, self.radius = scene.loads, radius
@@ -100,12 +103,12 @@ class Wheel:
         self.rim = radius + max(1.15 * self.size, 0.1)
 
     def places(self, pose: Pose) -> list[np.ndarray]:
-        """Positions of the loads relative to the axis in the drawing: across, up, and along if they move in that direction."""
+        """Return the loads' positions relative to the axis in the drawing: across, up, and along if they move along it."""
         own = places_of(self.loads, pose.angle) if pose.own is None else pose.own
         return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in own]
 
     def parts(self, centre: tuple[float, float], pose: Pose) -> list[Part]:
-        """The rim, the loads' circle, two spokes that turn with the rotor, and the loads."""
+        """Return the rim, the loads' circle, two spokes that turn with the rotor, and the loads."""
         x, y = centre
         found = [
             Part(circle(centre, self.rim), {"fc": "#f4f4f4", "ec": "black", "lw": 1.4, "zorder": 3}, True),
