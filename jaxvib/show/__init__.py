@@ -1,1 +1,1 @@
-"""Machines as pictures and films: sketches of scenes, animations of their motions."""
+"""Pictures and films of machines: sketches of scenes, animations of their motions."""

@@ -28,19 +28,19 @@ from jaxvib.units import Number, number
 __all__ = ["animate"]
 
 _TURN = 0.42
-"""Turns of the rotor or a load from one picture to the next beyond which the eye is deceived."""
+"""Largest rotation between pictures, turns. Near half a turn, the rotor seems to turn at another speed or backward."""
 
 _SMOOTH = 0.09
-"""Turns of the rotor from one picture to the next, where nothing else is said."""
+"""Default rotation between pictures, turns of the rotor."""
 
 _MAX_PICTURES = 600
-"""Largest number of pictures of a film."""
+"""Maximum number of pictures of a film."""
 
 _NARROWEST, _WIDEST = 1.0, 50.0
-"""Widths of a picture, inches."""
+"""Range of the width of a picture, inches."""
 
 _PICTURES_AWAY = 100.0
-"""Heights of the picture by which the machine may be drawn away from its place."""
+"""Largest drawn displacement of the machine, in heights of the picture."""
 
 
 @validated
@@ -58,18 +58,18 @@ def animate(
 ) -> Film:
     """Return a film of a run or of an exact jam in slow motion, with a clock.
 
-    Platforms, springs, rotor and loads move. Arrows are the forces of the supports on the foundation (black: of all of them).
-    Below are the displacements and the force over time.
+    Platforms, springs, rotor and loads move. Arrows are the forces of the supports on the foundation (black: their sum). The
+    displacements and the force over time are plotted below.
 
     **Arguments**
 
     - `motion`: a `Run`, or an `Orbit` with the `scene` that it belongs to
     - `path` of the file, as GIF (".gif") or as one HTML page with its pictures inside (".html"); None writes nothing
-    - `begin`, `end`: the part that is shown, s or text; default: the last four vibrations of a run, or as many of an orbit
-    - `seconds` that the film lasts; typical: 5 to 10; default: so many that the rotor turns by a tenth of a turn in a picture
+    - `begin`, `end`: the part that is shown, s or text; default: the last four periods of a run, or four periods of an orbit
+    - `seconds`: duration of the film; typical: 5 to 10; default: the rotor turns by about a tenth of a turn between pictures
     - `fps`: pictures per second; typical: 20 (the default)
     - `magnify`: magnification of displacements relative to the loads' circle, stated in the picture; typical: 1 to 50; default:
-      the largest displacement is well seen
+      a factor at which the largest displacement is clearly visible
     - `width` of the picture, inches of 100 dots; typical: 6.4 (the default). Drawing takes most of the time, in proportion to
       `seconds` times `fps`
 
@@ -107,7 +107,7 @@ def animate(
             f"advances the rotor by {turns / count:.3g} turns from one picture to the next, which looks like another speed"
         )
         raise InputError("end", f"{problem}; end at {most:.4g} s or before, or let the film last more seconds")
-    # An orbit closes: its last picture is the one before its first.
+    # An orbit is periodic: the picture after the last one would be the first one.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
     dense = np.linspace(time[0], time[-1], max(400, count))
     shown, strips = (
@@ -132,7 +132,7 @@ def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
 
 
 def _stretch(motion: Run | Orbit, begin: Number | None, end: Number | None) -> tuple[float, float]:
-    """Beginning and end of the film, s."""
+    """Return the beginning and the end of the film, s."""
     if isinstance(motion, Run):
         window = motion.window
         last = float(window.time[-1])
@@ -148,7 +148,7 @@ def _stretch(motion: Run | Orbit, begin: Number | None, end: Number | None) -> t
 
 
 def _fastest(motion: Run | Orbit, scene: Scene) -> float:
-    """The greatest speed of rotor or loads, rad/s."""
+    """Return the highest speed of rotor and loads, rad/s."""
     if isinstance(motion, Run):
         kept = motion.window
         return float(max(np.max(np.abs(kept.rotor_speed)), np.max(np.abs(kept.state.azimuth_rate)), 1e-300))
@@ -191,7 +191,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     slower = (shown.time.size / fps) / (shown.time[-1] - shown.time[0])
     note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x as large"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
-    # Texts that are longer than the picture is wide shall not make it smaller.
+    # Texts wider than the picture must not shrink it.
     for text in stage.texts:
         text.set_in_layout(False)
     cursors = _strips((lower, below), scene, strips)
@@ -217,7 +217,7 @@ def _move(artist: Line2D | Polygon, points: np.ndarray) -> None:
 
 
 def _strips(axes: tuple[Axes, Axes], scene: Scene, shown: Stretch) -> list[Line2D]:
-    """Displacements and force over the time shown, each with a line that goes along."""
+    """Plot displacements and force over time, and return a moving time cursor for each."""
     upper, lower = axes
     structure = scene.machine.structure()
     for k, name in enumerate(structure.coordinates):

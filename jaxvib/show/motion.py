@@ -1,4 +1,4 @@
-"""The motion that a film shows: a stretch of a run between its samples, or a period of an exact jam."""
+"""Motion of a film: a part of a run, interpolated between its samples, or an exact jam."""
 
 from __future__ import annotations
 
@@ -17,12 +17,15 @@ from jaxvib.steady.orbits.describe import Orbit
 __all__ = ["Stretch", "of_orbit", "of_run"]
 
 _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
-"""Largest angle, rad, of a load between two samples of a run for which the motion between them is known."""
+"""Largest rotation of a load between two samples of a run, rad, for which interpolation is accurate enough."""
 
 
 class Stretch(NamedTuple):
-    """A motion at some times (nt,) s: `displacement`, `velocity` (nt, nd), the loads' coordinates `angle`, (nt, count) each,
-    the rotor's `turn` (nt,) rad, the `force` on the foundation (nt, nb) N."""
+    """Motion at some times.
+
+    **Attributes**: `time` (nt,) s; `displacement`, `velocity` (nt, nd); `angle`, the loads' coordinates, (nt, count) each;
+    `turn`, the angle of the rotor, (nt,) rad; `force` on the foundation, (nt, nb) N.
+    """
 
     time: np.ndarray
     displacement: np.ndarray
@@ -33,9 +36,10 @@ class Stretch(NamedTuple):
 
 
 def of_run(run: Run, time: np.ndarray) -> Stretch:
-    """A run at these times, by cubic interpolation through the states that it kept, with their rates.
+    """Return a run at these times, by cubic Hermite interpolation between the stored states.
 
-    **Raises** `InputError` for times that it did not keep, or keeps too few states of.
+    Velocities and forces are interpolated linearly. **Raises** `InputError` for times outside the stored states, and for states
+    that are too far apart.
     """
     kept = _kept(run, time)
     t = np.asarray(kept.time, float)
@@ -69,7 +73,7 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
 
 
 def _kept(run: Run, time: np.ndarray) -> Trajectory:
-    """The states that a run kept over these times: the dense ones of its window where they reach."""
+    """Return stored states of a run that cover these times: the dense ones of its window if they do."""
     slack = 1e-9 * max(float(run.window.time[-1]), 1e-300)
     kept = [run.window, *([] if run.trajectory is None else [run.trajectory])]
     for states in kept:
@@ -81,7 +85,7 @@ def _kept(run: Run, time: np.ndarray) -> Trajectory:
 
 
 def _whole(angle: np.ndarray, rate: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Angles (nt, ...), known but for whole turns, as ones that go on as their rates say."""
+    """Return continuous angles (nt, ...) from angles modulo a turn; their rates determine the number of whole turns."""
     step = np.diff(time).reshape(-1, *[1] * (angle.ndim - 1))
     foreseen = 0.5 * step * (rate[1:] + rate[:-1])
     change = np.diff(angle, axis=0)
@@ -90,7 +94,10 @@ def _whole(angle: np.ndarray, rate: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def of_orbit(orbit: Orbit, scene: Scene, time: np.ndarray) -> Stretch:
-    """An exact jam of a `scene` at these times, from the sums that it is. **Raises** `InputError` for one that is not known."""
+    """Return an exact jam of a `scene` at these times, from its Fourier series.
+
+    **Raises** `InputError` for a jam that does not exist, or a scene with other coordinates or loads.
+    """
     omega = float(orbit.omega)
     if not np.isfinite(omega) or not np.isfinite(np.asarray(orbit.amplitude)).all():
         raise InputError("orbit", f"is no motion to be shown: {orbit.message}")

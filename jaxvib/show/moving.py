@@ -1,4 +1,4 @@
-"""A machine as an SVG picture: at rest, or moving as a jam of light loads says."""
+"""SVG pictures of a machine: at rest, or moving in a jam of light loads."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from jaxvib.steady.jams.jam import Jam
 __all__ = ["moving", "still"]
 
 _FRAMES = 20
-"""Poses of a period, between which browsers draw straight lines: circles are true to 1 %."""
+"""Poses in a period. Browsers interpolate linearly between them; circular paths are accurate to about 1 %."""
 
 _SECONDS = 1.6
 """Duration of a period in the picture, s."""
 
 
 def moving(scene: Scene, jam: Jam) -> str:
-    """The sketch of a scene, moving as a jam mode says, with the forces on the foundation as arrows; the rotor runs ahead of
-    the loads at its own speed. Loads stand where they stay together, upon each other.
+    """Return the sketch of a scene that moves in a jam mode, with the forces on the foundation as arrows.
+
+    The rotor turns faster than the loads, at its own speed. Loads that stay together are drawn at the same place.
 
     **Arguments**: `scene` of platforms, and a `jam` of it, from `jam_modes`.
 
-    **Returns** the text of an SVG file, which repeats one period for ever. **Raises** `ComputationError` for a jam mode that
-    does not exist or has no bound; it says which.
+    **Returns** the text of an SVG file, which repeats one period endlessly. **Raises** `ComputationError` for a jam mode that
+    does not exist or whose motion is not finite; the message names the mode.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -46,7 +47,7 @@ def moving(scene: Scene, jam: Jam) -> str:
     wave = np.exp(1j * theta)[:, None] * amplitude
     displacement, velocity = np.real(wave), np.real(1j * omega * wave)
     angles = theta[:, None] + np.zeros_like(first)
-    own = places_of(scene.loads, (angles, *others))  # of all poses at once
+    own = places_of(scene.loads, (angles, *others))  # one call for all poses
     poses = [
         Pose(q, v, (angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in own])
         for k, (q, v, angle) in enumerate(zip(displacement, velocity, angles, strict=True))
@@ -66,7 +67,7 @@ def moving(scene: Scene, jam: Jam) -> str:
 
 
 def still(scene: Scene) -> str:
-    """The sketch of a scene at rest as the text of an SVG file, made in a fraction of the time of `jaxvib.sketch`.
+    """Return the sketch of a scene at rest as the text of an SVG file, in a fraction of the time of `jaxvib.sketch`.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES

@@ -1,4 +1,4 @@
-"""A sketch of a scene: platforms, springs, dampers, rotor, loads, with their numbers."""
+"""Sketch of a scene: platforms, springs, dampers, rotor and loads, with their values."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from jaxvib.units.known import require_known
 __all__ = ["checked_scene", "fit", "sketch"]
 
 _INCH = 0.62
-"""Inches of a drawing's unit."""
+"""Inches per unit of a drawing."""
 
 
 @validated
 def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
-    """Draw a scene at rest: its masses, springs, dampers, rotor and loads, with their numbers and units.
+    """Draw a scene at rest: its masses, springs, dampers, rotor and loads, with their values and units.
 
-    Platforms stand above each other, numbered from the foundation upward; a rotor is seen along its axis, and one that tilts
-    also from the side. Loads are spread over their circle so that each is seen. Sizes are not to scale, except for the loads on
-    their circle.
+    Platforms are drawn above each other, numbered from the foundation upward. A rotor is drawn along its axis, a rotor with
+    tilt also from the side. Loads are spread over their circle so that each is visible. Only the loads and their circle are to
+    scale.
 
     **Arguments**: `scene`, of any machine; `ax`: axes to draw onto.
 
-    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an argument that is no scene, or a scene
-    whose numbers are not known (within `jit`, `grad`).
+    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an argument that is not a scene, or a scene
+    with traced numbers (within `jit` or `grad`).
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -47,12 +47,12 @@ def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
         put(axis, part)
     for text in view.texts(pose, 0.0):
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
-    axis.set_title(caption(scene), loc="left", fontsize="small", y=1.0)  # a place given, none is looked for at each drawing
+    axis.set_title(caption(scene), loc="left", fontsize="small", y=1.0)  # a fixed y is faster than automatic placement
     return figure if ax is None else ax
 
 
 def checked_scene(scene: object) -> Scene:
-    """The scene. **Raises** `InputError` for what is none, and for one whose numbers are not known."""
+    """Return the scene. **Raises** `InputError` for an object that is not a scene, and for a scene with traced numbers."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     require_known(scene, "scene", "a drawing", "draw it outside")
@@ -60,7 +60,7 @@ def checked_scene(scene: object) -> Scene:
 
 
 def fit(axis: Axes, view: View) -> None:
-    """Axes without ticks, in the drawing's units."""
+    """Set the limits of axes to those of the drawing, with equal scales, and hide ticks and frame."""
     left, right, bottom, top = view.limits
     axis.set_xlim(left, right)
     axis.set_ylim(bottom, top)
