@@ -1,8 +1,8 @@
 """Parallel evaluation of many cases on all cores and accelerators, with one compiled program for all chunks.
 
-Sweeps, ensembles, run-ups, maps and searches use it. `in_parallel` is for cases with host code (a diagram, a criterion),
-`in_chunks` for cases that are entries of arrays: it fills the last chunk up, so that another number of cases needs no other
-program.
+Sweeps, ensembles, run-ups, maps and searches use it. `in_parallel` is for cases with host code (a diagram, a criterion).
+`in_chunks` is for cases that are entries of arrays; it pads the last chunk, and therefore uses the same program for any number
+of cases.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ def cores() -> int:
 def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Generator[tuple[Item, Found], None, None]:
     """Evaluate a function of many items in threads, on all cores and accelerators; yield each item with its result.
 
-    Results come in the order in which they are finished. Threads that need the same new program wait for the one that
-    compiles it. At most one more item than threads is taken from the iterator, so that memory does not grow with the number
-    of items. JAX's options are those of the caller's thread. After an error, of the function or of the consumer of the
-    results, no further item is computed.
+    Results come in the order in which they are finished. Threads that need the same new program wait for the thread that
+    compiles it. The number of items in progress exceeds the number of threads by at most one, and therefore memory does not
+    grow with the number of items. JAX's options are those of the caller's thread. After an error of the function or of the
+    consumer of the results, no further item is computed.
 
     >>> sorted(in_parallel(lambda x: x * x, [3, 1, 2]))
     [(1, 1), (2, 4), (3, 9)]
@@ -74,7 +74,7 @@ def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Gen
 
 
 def _same_options(function: Callable[[Item], Found]) -> Callable[[Item, object], Found]:
-    """Return the function of an item and a device, with JAX's options of the present thread."""
+    """Return a function of an item and a device that calls `function` with the JAX options of the current thread."""
     wanted = {name: getattr(jax.config, name) for name in _OPTIONS}
 
     def with_options(item: Item, device: object) -> Found:
@@ -92,13 +92,17 @@ def in_chunks(
 ) -> PyTree[np.ndarray]:
     """Evaluate a function for any number of cases, `size` at a time, and concatenate the results in their order.
 
-    The last chunk is filled up with copies of the last case. Under a JAX transformation the chunks are computed one after
-    another within the program.
+    The last chunk is padded with copies of the last case. Under a JAX transformation the chunks are computed one after another
+    within the program.
 
-    **Arguments**: `size` of a chunk; `function` of trees of arrays (size, ...) and of the `shared` values of all cases;
-    `cases` trees of arrays (n, ...).
+    **Arguments**
 
-    **Returns** the function's tree with NumPy arrays (n, ...), under a transformation JAX arrays.
+    - `size`: number of cases in a chunk
+    - `function`: function of trees of arrays (size, ...) and of the `shared` values
+    - `cases`: trees of arrays (n, ...)
+    - `shared`: values that are the same for all cases
+
+    **Returns** the tree of the function's results with NumPy arrays (n, ...), or with JAX arrays under a transformation.
 
     >>> in_chunks(4, lambda x, y: {"sum": x + y}, np.arange(6.0), shared=(1.0,))
     {'sum': array([1., 2., 3., 4., 5., 6.])}
@@ -130,9 +134,9 @@ def in_chunks(
 def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[object] = (None,)) -> list[Found]:
     """Return the function's results for 0, 1, ..., `number` - 1, in this order, computed in threads.
 
-    Each thread, also the caller's, takes the next number as soon as it is free, which is faster than handing out items one by
-    one. Options and errors as in `in_parallel`; a thread has one of the `devices`. While JAX is debugging (operation by
-    operation, or looking for NaN) the caller's thread computes everything.
+    Each thread, including the caller's, takes the next number when it is free, which is faster than a submission of each item
+    to the pool. Each thread uses one of the `devices`. Options and errors are treated as in `in_parallel`. If JAX is debugging
+    (operation by operation, or with checks for NaN), the caller's thread computes everything.
 
     >>> in_threads(lambda k: k * k, 3)
     [0, 1, 4]
@@ -165,12 +169,12 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
 
 
 def in_background(*tasks: Callable[[], object]) -> None:
-    """Begin tasks in threads, with JAX's options of this thread. The caller does not wait for them, and their errors are
-    ignored.
+    """Begin tasks in threads, with the JAX options of this thread, without waiting for them; their errors are ignored.
 
-    A question that calls several `cached` functions one after the other knows their programs before their numbers. Its first
-    answer takes less time if they are compiled side by side: `task = lambda: integrate.prepare(...)`. A call of the function
-    then waits for its program, and raises the error if there is one.
+    This reduces the time of the first evaluation of a function that calls several `cached` functions one after the other. The
+    programs of the later functions are known before their arguments have values, and can be compiled at the same time:
+    `task = lambda: integrate.prepare(...)`. A later call of the `cached` function waits for its program, and raises the error
+    if there was one.
     """
 
     def run(task: Callable[[], object]) -> None:
@@ -183,6 +187,9 @@ def in_background(*tasks: Callable[[], object]) -> None:
 
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    """Return the threads beside the caller's. They are kept, since starting threads takes longer than handing them a run.
-    Callers cancel tasks that have not begun instead of waiting for them; therefore a task may use threads itself."""
+    """Return the pool of threads other than the caller's.
+
+    The pool is reused, because starting threads takes longer than submitting a run. Callers cancel tasks that have not begun
+    instead of waiting for them; therefore a task may itself use threads.
+    """
     return ThreadPoolExecutor(max(64, cores()))

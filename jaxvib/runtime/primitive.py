@@ -1,4 +1,4 @@
-"""Primitives with rules of their own for derivatives, batches and transposes of functions that JAX does not trace."""
+"""Primitives with custom rules for derivatives, batches and transposes, for functions that JAX does not trace."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ HAS_RULES = HAS_JAXPRS and all(
         (mlir, "register_lowering"),
     )
 )
-"""True if JAX lets other packages define primitives. Otherwise derivatives of cached functions are traced in each process."""
+"""True if JAX lets other packages define primitives. If not, each process traces the derivatives of cached functions again."""
 
 
 def primitive(
@@ -46,18 +46,18 @@ def primitive(
     trace: Callable[..., list[Array]] | None = None,
     abstract: Callable[..., Sequence] | None = None,
 ) -> Callable[..., list[Array]]:
-    """Define a primitive of arrays, with further parameters by name, by its rules.
+    """Define a primitive of arrays and keyword parameters by its rules.
 
-    **Arguments**
+    **Arguments**: the rules, each a function
 
-    - `evaluate`: arrays to outputs, for known numbers
-    - `batch`: arrays and the axis of each to outputs and their axes
-    - `differentiate`: arrays and tangents to outputs and their tangents
-    - `transpose`: cotangents and arrays to cotangents
-    - `trace`: arrays to outputs, inside `jit`
-    - `abstract`: types of arrays to types of outputs
+    - `evaluate`: from arrays that are not traced to outputs
+    - `batch`: from arrays and their batch axes to outputs and their batch axes
+    - `differentiate`: from arrays and tangents to outputs and their tangents
+    - `transpose`: from cotangents of the outputs and arrays to cotangents of the arrays
+    - `trace`: from arrays to outputs, inside `jit`
+    - `abstract`: from types of arrays to types of outputs
 
-    **Returns** a function of arrays. Without `HAS_RULES` it is `evaluate`.
+    **Returns** a function of arrays, which is `evaluate` itself if `HAS_RULES` is False.
     """
     if not HAS_RULES:
         return evaluate
@@ -77,7 +77,7 @@ def primitive(
 
 
 def is_zero(tangent: object) -> bool:
-    """Return True if a rule of a `primitive` gets a symbolic zero in place of a tangent."""
+    """Return True if a tangent that is passed to a rule of a `primitive` is a symbolic zero."""
     return isinstance(tangent, ad.Zero)
 
 
@@ -87,7 +87,10 @@ def zero_of(x: Array) -> object:
 
 
 def apply_pullback(pullback: Callable[[list], Sequence[Array]], cotangents: list) -> list[Array]:
-    """Apply a function from `jax.vjp` to cotangents that may be `zero_of`; JAX 0.10.0 gets arrays of zeros instead."""
+    """Apply a pullback of `jax.vjp` to cotangents, some of which may be symbolic zeros from `zero_of`.
+
+    JAX 0.10.0 does not accept symbolic zeros; arrays of zeros replace them.
+    """
     try:
         return list(pullback(cotangents))
     except ValueError:

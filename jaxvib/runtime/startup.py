@@ -1,4 +1,4 @@
-"""Settings of a process before the first question: XLA's options for the CPU, and the cache of compiled programs."""
+"""Settings of a process before the first computation: XLA's options for the CPU, and the cache of compiled programs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def start() -> None:
     """Call `prepare_cpu()` and `use_cache()`, unless they were called before or JAXVIB_AUTOMATIC=off in the environment.
 
     The first use of a public name of jaxvib, other than errors and these two functions, calls it. A warning is issued if JAX
-    has computed already, so that XLA's options have no effect, and if programs cannot be cached.
+    has already computed, because XLA's options then have no effect, and if programs cannot be cached.
     """
     if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
         return

@@ -1,6 +1,6 @@
-"""Descriptions in JSON of trees of dataclasses, tuples, lists and dictionaries, and trees from descriptions.
+"""Conversion of trees of dataclasses, tuples, lists and dictionaries to descriptions in JSON, and back.
 
-JSON holds no code: a description can name classes and functions of known packages, but none of them is called.
+A description contains no code: it can name classes and functions of known packages, but none of them is called.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Description: TypeAlias = "bool | int | float | str | list[Description] | dict[st
 """Values of JSON."""
 
 KNOWN_PACKAGES = {"jaxvib", "optimize", "jax", "equinox", "diffrax", "optimistix", "optax", "lineax"}
-"""Packages whose classes and functions a description may name: their sources or versions are part of keys."""
+"""Packages whose classes and functions a description may name, because their sources or versions are part of keys."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Slot:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Tree with a `Slot` in place of each array. Two are equal if their structures and all other leaves are equal."""
+    """Tree with a `Slot` in place of each array; two skeletons are equal if their structures and all other leaves are equal."""
 
     tree: Any
 
@@ -57,11 +57,11 @@ class Skeleton:
 
     @property
     def size(self) -> int:
-        """The number of arrays."""
+        """Number of arrays."""
         return sum(isinstance(leaf, Slot) for leaf in self.flat[0])
 
     def filled(self, arrays: Iterable[object]) -> Any:
-        """The tree with these arrays in its slots."""
+        """Return the tree with these arrays in its slots."""
         leaves, treedef = self.flat
         given = tuple(arrays)
         return jax.tree.unflatten(treedef, [given[x.place] if isinstance(x, Slot) else x for x in leaves])
@@ -74,18 +74,18 @@ class Skeleton:
 
 
 def leaf_key(leaf: Any) -> Hashable:
-    """Return the part of a leaf that a program depends on: the type of an array, otherwise the leaf itself."""
+    """Return the part of a leaf on which a program depends: the type of an array, otherwise the leaf itself."""
     if isinstance(leaf, (jax.Array, np.ndarray)):
         return jax.typeof(leaf)
-    return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 equals -0.0, but gives another program
+    return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 equals -0.0, but their programs differ
 
 
 class Undescribable(Exception):
-    """Raised for a value without description: a function without a name, or of a class of an unknown package."""
+    """Error for a value without a description: a function without a name, or an object of a class of an unknown package."""
 
 
 def describe(value: object, array: Callable[[Any], Description]) -> Description:
-    """Describe a tree; `array` describes an array in it.
+    """Return the description of a tree; the function `array` describes its arrays.
 
     **Raises** `Undescribable`.
 
@@ -115,7 +115,7 @@ def describe(value: object, array: Callable[[Any], Description]) -> Description:
 def rebuild(description: Description, arrays: Iterator[object]) -> Any:
     """Build the tree of a description; `arrays` yields its arrays in the order in which `describe` reached them.
 
-    **Raises** `Undescribable` for a description that `describe` cannot have given.
+    **Raises** `Undescribable` for a description that `describe` cannot produce.
 
     >>> rebuild({"dict": [["a", {"tuple": [1, None]}]]}, iter(()))
     {'a': (1, None)}
@@ -147,7 +147,7 @@ def _fields(kind: type) -> list[str]:
 
 
 def _instance(kind: object, values: list[object]) -> object:
-    """Return an object with these values in its fields, without its constructor, which may convert and check them."""
+    """Return an object with these field values, without a call of its constructor, which might convert and check them."""
     if not isinstance(kind, type):
         raise Undescribable(f"{kind} is no class")
     names = _fields(kind)
@@ -160,7 +160,7 @@ def _instance(kind: object, values: list[object]) -> object:
 
 
 def _name(value: object) -> str:
-    """Return `module:name` of a class or function that this name leads to."""
+    """Return `module:name` of a class or function; raise `Undescribable` if this name does not lead back to it."""
     name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
     if _named(name) is not value:
         raise Undescribable(f"{value!r} cannot be found by its name")
@@ -176,5 +176,5 @@ def _named(name: str) -> object:
     except (ImportError, AttributeError) as error:
         raise Undescribable(f"{name} cannot be found") from error
     if (getattr(found, "__module__", None), getattr(found, "__qualname__", None)) != (module, path):
-        raise Undescribable(f"{name} is not defined in {module}")  # names that this module imports
+        raise Undescribable(f"{name} is not defined in {module}")  # the module only imports it
     return found
