@@ -1,4 +1,4 @@
-"""Errors of jaxvib, and checks that are the same everywhere: allowed words, files read and written."""
+"""Errors of jaxvib, and common checks: allowed names, paths, and files that are read or written."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ __all__ = [
 ]
 
 MAX_TEXT_BYTES = 2**24
-"""Largest file that is read as a text that a person wrote."""
+"""Largest size, bytes, of a text file that is read."""
 
 CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
-"""Characters that steer a terminal, or turn the direction of writing; line breaks and tabs are none of them."""
+"""Characters that control a terminal or change the direction of writing, except line breaks and tabs."""
 
 _MAX_WORD, _MAX_MESSAGE = 300, 2000
-"""Letters of a word, and of a message, beyond which the middle is left out."""
+"""Largest numbers of characters of a word and of a message; the middle of longer ones is left out."""
 
 
 def legible(text: object) -> str:
-    """A text on one line for a terminal: control characters as escapes, the middle of long words and texts left out.
+    """Return a text on one line for a terminal, with control characters as escapes and long words and texts shortened.
 
     >>> legible("a\\x1b[31m" + 1000 * "b")[:20]
     'a\\\\x1b[31mbbbbbbbbbbb'
@@ -75,12 +75,12 @@ class InputError(ValueError):
         super().__init__(f"{self.field} {self.problem}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str]]:
-        return type(self), (self.field, self.problem)  # processes hand errors to each other
+        return type(self), (self.field, self.problem)  # for pickle, which passes errors between processes
 
 
 @contextlib.contextmanager
 def within(place: str) -> Iterator[None]:
-    """Put a place before the names of fields in errors.
+    """Prefix the names of fields in errors by `place`.
 
     >>> with within("exciters[1]."):
     ...     raise InputError("drive.speed", "is -1 rad/s; it must be greater than 0")
@@ -102,11 +102,11 @@ def quoted(value: object, longest: int = 60) -> str:
     >>> quoted("left"), quoted(10**5000)
     ("'left'", 'a whole number of 16610 bits')
     """
-    if isinstance(value, int) and abs(value).bit_length() > 1024:  # Python refuses to write numbers of more than 4300 digits
+    if isinstance(value, int) and abs(value).bit_length() > 1024:  # Python does not convert integers of more than 4300 digits
         return f"a whole number of {abs(value).bit_length()} bits"
     try:
         text = " ".join(repr(value).split())
-    except Exception:  # the representation is the user's code
+    except Exception:  # `repr` of a user's class may raise any error
         text = f"a {type(value).__name__}"
     return text if len(text) <= longest else f"{text[: longest - 4].rstrip()} ..."
 
@@ -125,7 +125,7 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
 
 
 def require_path(value: object, field: str) -> Path:
-    """Return a path. **Raises** `InputError` for what is none, for an empty one and for the character NUL.
+    """Return a path. **Raises** `InputError` for a value that is no path, for an empty path and for one with the character NUL.
 
     >>> require_path(3, "path")
     Traceback (most recent call last):
@@ -142,8 +142,9 @@ def require_path(value: object, field: str) -> Path:
 
 @contextlib.contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """Give a path beside the file to write to, and move it into the file's place at the end: a file that was there before stays
-    whole until then. **Raises** `InputError` if the file cannot be written.
+    """Yield the path of a temporary file in the same folder, which replaces the file at `path` at the end of the context.
+
+    An existing file at `path` is unchanged until then. **Raises** `InputError` if the file cannot be written.
 
     >>> import pathlib, tempfile
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "a.txt"
@@ -154,8 +155,8 @@ def written(path: Path) -> Iterator[Path]:
     """
     part = None
     try:
-        home = path.resolve()  # through a link to the file that it names
-        if home.exists() and not home.is_file():  # a device such as /dev/null is not replaced
+        home = path.resolve()  # the target of a symbolic link is replaced, not the link
+        if home.exists() and not home.is_file():  # a device such as /dev/null must not be replaced
             yield path
             return
         part = home.with_name(f".{os.getpid()}-{threading.get_ident()}.part{path.suffix}")
@@ -169,14 +170,14 @@ def written(path: Path) -> Iterator[Path]:
     finally:
         if part is not None:
             with contextlib.suppress(OSError):
-                part.unlink()  # not there after a move
+                part.unlink()  # raises an error if the file has replaced the one at `path`
 
 
 def open_regular(path: str | Path) -> IO[bytes]:
-    """Open a file for reading. **Raises** `OSError` for one that is missing, or a folder, a pipe or a device."""
+    """Open a file for reading. **Raises** `OSError` if it is missing, or is a folder, a pipe or a device."""
 
     def opener(name: str, flags: int) -> int:
-        file = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # a pipe that nobody writes to would wait
+        file = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # a pipe without a writer would block
         if not stat.S_ISREG(os.fstat(file).st_mode):
             os.close(file)
             raise OSError(None, "it is a folder, a pipe or a device, not a file")
@@ -189,9 +190,9 @@ def open_regular(path: str | Path) -> IO[bytes]:
 
 
 def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
-    """Text of a file that a person wrote; `what` says in messages which file is expected, such as "a TOML file".
+    """Return the text of a file; `what` describes the expected file in error messages, such as "a TOML file".
 
-    **Raises** `InputError` for a file that cannot be read, is no UTF-8 text, or has more than `most` bytes.
+    **Raises** `InputError` for a file that cannot be read, is not UTF-8 text, or has more than `most` bytes.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError("path", f"is {quoted(path)}; give the path of {what}")
@@ -209,9 +210,9 @@ def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
 
 
 class ComputationError(RuntimeError):
-    """Error for a computation without an answer although its input is allowed; `status` names the reason.
+    """Error for a computation that has no result although its input is allowed; `status` names the reason.
 
-    Functions that raise it take `throw=False` to return the status in place of raising.
+    Functions that raise it accept `throw=False`, which returns the status instead.
 
     **Arguments**, also attributes: `status`, a name such as "absent" or "max_steps_reached"; `message`, a sentence.
 

@@ -1,12 +1,13 @@
 """Comparison of the code of this process with the source files.
 
-The keys of stored programs hold a digest of the source files. A process in which a file was edited after the import of jaxvib,
-or in which a function, a constant or a member of a class was replaced (by a mock, a notebook, a patch), has other code than the
-digest says: it must neither store programs nor read those of others.
+The keys of stored programs contain a digest of the source files. The code of a process differs from this digest if a file was
+edited after the import of jaxvib, or if a function, a constant or a member of a class was replaced (by a mock, a notebook, a
+patch). Such a process must neither store programs nor read stored ones.
 
-Modules of the package become instances of a class that records the names set from outside; no other module is changed. The
-members of classes are compared with those at the import, the files by their times of change. Not noticed are changes inside
-arrays, dictionaries and other mutable objects, a new `__code__` of a function, and replacements in other packages.
+The class of each module of the package is replaced by one that records which names are set from outside; other modules are not
+changed. The members of classes are compared with those at the import, and files by their modification times. This does not
+detect changes inside arrays, dictionaries and other mutable objects, a new `__code__` of a function, or replacements in other
+packages.
 """
 
 from __future__ import annotations
@@ -27,26 +28,26 @@ __all__ = ["CodeState", "clear_derived", "code_state", "digest_of_sources", "wat
 PACKAGES = ("jaxvib", "optimize")
 
 _CHANGING = {"__abstractmethods__", "__annotate_func__", "__annotations__", "__annotations_cache__", "__doc__"}
-"""Attributes of classes that Python itself sets again."""
+"""Attributes of classes that Python itself changes after the definition."""
 
 _ABSENT = object()
 
 _Stamp: TypeAlias = "tuple[int, int, int] | None"
-"""Time of change, size and number of a file; None without a file."""
+"""Modification time, size and inode number of a file; None if it does not exist."""
 
 
 class CodeState(NamedTuple):
-    """State of the code: a `number` that grows with each change; `is_on_disk` is True if the code is that of the sources."""
+    """State of the code: `number` increases with each change; `is_on_disk` is True if it is that of the source files."""
 
     number: int
     is_on_disk: bool
 
 
 class _WatchedModule(ModuleType):
-    """Module that records the names set or deleted from outside."""
+    """Module that records which of its names are set or deleted from outside."""
 
     def __setattr__(self, name: str, value: object) -> None:
-        if type(value) is ModuleType and value.__name__ == f"{self.__name__}.{name}":  # the end of the import of a submodule
+        if type(value) is ModuleType and value.__name__ == f"{self.__name__}.{name}":  # end of a submodule's import
             watch(value)
         else:
             _code.record(self, name)
@@ -58,7 +59,7 @@ class _WatchedModule(ModuleType):
 
 
 class _Code:
-    """Original definitions and files of the watched modules, and the present state."""
+    """Original definitions and files of the watched modules, and the current state of the code."""
 
     def __init__(self) -> None:
         self.root = Path(__file__).parents[1]
@@ -76,7 +77,7 @@ class _Code:
         self.was_set = True
 
     def differences(self) -> Iterator[tuple[object, ...]]:
-        """Owner, name and present value of each replaced definition, edited files, and modules of unknown source."""
+        """Yield owner, name and current value of each replaced definition, then edited files and modules of unknown source."""
         for (module, name), original in list(self.originals.items()):
             if (value := vars(module).get(name, _ABSENT)) is not original:
                 yield module, name, value
@@ -97,7 +98,7 @@ class _Code:
 
 
 def watch(module: ModuleType) -> None:
-    """Watch a module at the end of its import, the submodules that it imported, and those that it will import."""
+    """Watch a module at the end of its import, the submodules that it has imported, and those that it will import."""
     module.__class__ = _WatchedModule
     if module.__file__ not in _code.stamps or _is_stale(module.__file__):
         _code.doubtful.append(module)
@@ -121,7 +122,7 @@ def _stamp(file: str | Path) -> _Stamp:
 
 
 def _is_stale(file: str) -> bool:
-    """True if Python took older bytecode: it does not notice an edit within a second that leaves the size as it is."""
+    """Return True if Python used outdated bytecode: it does not detect an edit within the same second that keeps the size."""
     source, bytecode = _stamp(file), _stamp(importlib.util.cache_from_source(file))
     if source is None or bytecode is None:
         return False
@@ -130,7 +131,7 @@ def _is_stale(file: str) -> bool:
 
 @functools.cache
 def digest_of_sources() -> str:
-    """Digest of the source files at the first call."""
+    """Return the digest of the source files, computed at the first call."""
     digest = hashlib.sha256()
     for file in map(Path, _code.stamps):
         content = file.read_bytes()
@@ -139,19 +140,19 @@ def digest_of_sources() -> str:
 
 
 def code_state(*, look: bool = False) -> CodeState:
-    """State of the code in this process.
+    """Return the state of the code in this process.
 
-    **Arguments**: `look` compares classes and files too (some 2 ms); the default compares modules, after one of their names
-    was set.
+    **Arguments**: `look`: True compares modules, classes and files (about 2 ms); False, the default, compares them only after a
+    name of a module was set.
     """
     if look or _code.was_set:
-        digest_of_sources()  # before the comparison, which then shows that the digest is that of the imported code
+        digest_of_sources()  # before the comparison, which then confirms that the digest is that of the imported code
         _code.update()
     return _code.state
 
 
 def clear_derived() -> None:
-    """Empty the caches (`functools.cache`) of the functions of both packages but those of `jaxvib.runtime` and this module."""
+    """Clear the caches (`functools.cache`) of all functions of both packages, except in `jaxvib.runtime` and this module."""
     for module in [module for module in list(sys.modules.values()) if isinstance(module, _WatchedModule)]:
         for value in list(vars(module).values()):
             if isinstance(value, _Cache) and not value.__module__.startswith(("jaxvib.runtime", __name__)):

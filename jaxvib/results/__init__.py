@@ -1,1 +1,1 @@
-"""Protocol of results: status and sentence, text and figure, plain and labelled data, files."""
+"""Common interface of results: status and message, summary and figure, plain and labelled data, files."""

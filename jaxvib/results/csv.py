@@ -1,4 +1,4 @@
-"""Tables of the fields of a result along one axis, as CSV files."""
+"""Tables of the fields of a result along one axis, and CSV files of them."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
 
 
 def main_axis(result: eqx.Module) -> str:
-    """Return the axis along which a result has most arrays, "" if it has none."""
+    """Return the most frequent first axis of the arrays of a result; "" if none has an axis."""
     found = collections.Counter(axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes))
     return max(found, key=lambda axis: found[axis], default="")
 
 
 def table_along(result: eqx.Module, axis: str) -> dict[str, np.ndarray]:
-    """Return the columns of the table of `write_csv` by their heads. **Raises** `InputError` for an axis that is not there."""
+    """Return the columns of the table of `write_csv` by their heads. **Raises** `InputError` for an unknown axis."""
     labels = labels_of(result)
     units = labels.get("unit", ())
     table: dict[str, np.ndarray] = {}
@@ -77,13 +77,13 @@ def table_along(result: eqx.Module, axis: str) -> dict[str, np.ndarray]:
 
 
 def _label(labels: Labels, axis: str, k: int, n: int) -> str:
-    """Label of the k-th of n entries along an axis; a single one has no label."""
+    """Return the label of the k-th of n entries along an axis; without labels its number, or "" for a single entry."""
     known = labels.get(axis, ())
     return str(known[k]) if len(known) == n else "" if n == 1 else str(k + 1)
 
 
 def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: Sequence[str]) -> str:
-    """Unit of this coordinate from a unit such as "m or rad"."""
+    """Return the unit of the coordinate at `place` from a unit such as "m or rad"."""
     choices = unit.split(" or ")
     if len(choices) == 2 and "coordinate" in axes and units:
         return choices[("m", "rad").index(units[place[axes.index("coordinate")]])]

@@ -1,4 +1,4 @@
-"""Fields of results: units and axes as metadata, and plain and labelled data made from them."""
+"""Fields of results: units and axes as metadata, and the plain and labelled data that follow from them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["as_dict", "as_text", "columns", "in_unit", "is_named_tuple", "is_single", "labels_of", "part", "plain", "to_xarray"]
 
 EACH = "*"
-"""Stands for the `outer_axes` of the class that a field is in."""
+"""Placeholder for the `outer_axes` of the class to which a field belongs."""
 
 T = TypeVar("T")
 
@@ -29,14 +29,14 @@ Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | 
 """Values that JSON can represent."""
 
 Labels: TypeAlias = Mapping[str, Sequence[str]]
-"""Labels along axes, by the axis's name; of "unit" those of the coordinates."""
+"""Labels along axes by the axis's name, and the units of the coordinates by the name "unit"."""
 
 Column: TypeAlias = tuple[str, tuple[str, ...], np.ndarray, str]
-"""The name of an array, of its axes, its values, its unit."""
+"""Name of an array, names of its axes, values and unit."""
 
 
 class InUnit(TypedDict):
-    """See `in_unit`."""
+    """Metadata of `in_unit`."""
 
     unit: str
     axes: tuple[str, ...]
@@ -44,14 +44,14 @@ class InUnit(TypedDict):
 
 
 class Part(TypedDict):
-    """See `part`."""
+    """Metadata of `part`."""
 
     part: tuple[str, ...]
     prefix: str
 
 
 class AsText(TypedDict):
-    """See `as_text`."""
+    """Metadata of `as_text`."""
 
     write: Callable[[Any], str]
     read: Callable[[str], object]
@@ -59,10 +59,13 @@ class AsText(TypedDict):
 
 
 def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
-    """Metadata of a field that holds numbers: their unit ("" for none) and the names of their axes in order.
+    """Return the metadata of a field of numbers: their unit ("" for none) and the names of their axes in order.
 
-    **Arguments**: `unit`, of numbers that are a length for one coordinate and an angle for another "m or rad" and so on;
-    `axes`, where "*" stands for the class's `outer_axes`; `name` in labelled data, the field's own if left out.
+    **Arguments**
+
+    - `unit`: one unit, or two if it depends on the coordinate, such as "m or rad" for lengths and angles
+    - `axes`: names of the axes; "*" is a placeholder for the `outer_axes` of the class
+    - `name`: name in labelled data; default: the name of the field
 
     >>> in_unit("rad/s", "load")
     {'unit': 'rad/s', 'axes': ('load',), 'name': ''}
@@ -71,27 +74,32 @@ def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
 
 
 def part(*axes: str, prefix: str = "") -> Part:
-    """Metadata of a field that holds another tree of numbers, or a tuple of them, with these axes before their own.
+    """Return the metadata of a field that contains another tree of numbers, or a tuple of such trees.
 
-    **Arguments**: `prefix` of its names in labelled data. Several trees of a tuple are numbered, and each has its own "load".
+    **Arguments**: `axes`: names of axes that precede those of the tree; `prefix` of its names in labelled data. Several trees
+    of a tuple are numbered, and each has a separate axis "load".
     """
     return {"part": axes, "prefix": prefix}
 
 
 def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callable[[T], Labels]) -> AsText:
-    """Metadata of a field that files and plain data hold as text; `labels` of axes that it knows, by the axis's name."""
+    """Return the metadata of a field that is stored as text in files and plain data.
+
+    **Arguments**: `write` and `read`: conversion to the text and from it; `labels`: function of the field's value that returns
+    labels of axes.
+    """
     return {"write": write, "read": read, "labels": labels}
 
 
 def is_named_tuple(value: object) -> TypeGuard[NamedTuple]:
-    """True if a value is a tuple whose entries have names."""
+    """Return True for a named tuple."""
     return isinstance(value, tuple) and hasattr(value, "_fields")
 
 
 def as_dict(result: eqx.Module) -> dict[str, Plain]:
-    """A result as plain Python values, ready for JSON: SI units, statuses by name, None for what is no finite number.
+    """Return a result as plain Python values for JSON, in SI units, with the `status` and the `message` before the fields.
 
-    Complex numbers are pairs [real, imaginary]. Beside the fields stand the `status` and the `message`.
+    Statuses are represented by their names, complex numbers by pairs [real, imaginary], and NaN and infinity by None.
     """
     status = getattr(result, "status", None)
     head = {} if status is None else {"status": plain(status), "message": sentence(status)}
@@ -99,7 +107,7 @@ def as_dict(result: eqx.Module) -> dict[str, Plain]:
 
 
 def plain(value: object) -> Plain:
-    """A value as JSON holds it, see `as_dict`. **Raises** `TypeError` for one that it cannot."""
+    """Return a value as JSON can represent it, see `as_dict`. **Raises** `TypeError` for a value of another class."""
     if is_status(value):
         return status_names(value).tolist()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -127,11 +135,11 @@ def _plain_fields(value: DataclassInstance) -> dict[str, Plain]:
 
 
 def to_xarray(result: eqx.Module) -> xarray.Dataset:
-    """The numbers of a result as a labelled dataset, units in the attribute "units" (needs the extra `xarray`).
+    """Return the numbers of a result as a labelled dataset with units in the attribute "units"; needs the extra `xarray`.
 
-    Axes that only an outer `vmap` made are called "batch", from the outermost one "batch_1", "batch_2" where there are several.
+    The axis of an outer `vmap` is called "batch"; several are called "batch_1", "batch_2", ..., the outermost first.
 
-    **Raises** `InputError` where xarray is not installed.
+    **Raises** `InputError` if xarray is not installed.
     """
     try:
         import xarray as xr
@@ -154,12 +162,12 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
 
 
 def columns(result: eqx.Module) -> Iterator[Column]:
-    """Every array of a result: its name, the names of its axes, its values, its unit."""
+    """Yield name, names of axes, values and unit of every array of a result."""
     return _columns(result, "", (), {})
 
 
 def is_single(result: eqx.Module) -> bool:
-    """True if a result has known numbers and no axis of an outer `vmap`."""
+    """Return True if the numbers of a result have values and no axis of an outer `vmap`."""
     try:
         return all(value.ndim == len(axes) for _, axes, value, _ in columns(result))
     except jax.errors.TracerArrayConversionError:
@@ -167,7 +175,7 @@ def is_single(result: eqx.Module) -> bool:
 
 
 def labels_of(result: eqx.Module) -> Labels:
-    """Labels of axes by the axis's name, of "unit" those of the coordinates."""
+    """Return the labels of axes by the axis's name, and the units of the coordinates by the name "unit"."""
     labels: dict[str, Sequence[str]] = {}
     for field in dataclasses.fields(result):
         if "labels" in field.metadata and getattr(result, field.name) is not None:
@@ -176,14 +184,14 @@ def labels_of(result: eqx.Module) -> Labels:
 
 
 def _one_unit(unit: str, units: Sequence[str]) -> str:
-    """Common unit of all coordinates from a unit such as "m or rad", if they have one."""
+    """Return the common unit of all coordinates from a unit such as "m or rad"; return it unchanged if their units differ."""
     choices = unit.split(" or ")
     alike = len(choices) == 2 and len(set(units)) == 1
     return choices[("m", "rad").index(units[0])] if alike else unit
 
 
 def _columns(tree: eqx.Module, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]) -> Iterator[Column]:
-    """Every array of a tree: its name, its axes, its values, its unit."""
+    """Yield name, names of axes, values and unit of every array of a tree."""
     outer_axes = getattr(tree, "outer_axes", ())
     for field in dataclasses.fields(tree):
         value, metadata = getattr(tree, field.name), field.metadata

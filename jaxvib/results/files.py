@@ -1,7 +1,8 @@
-"""Results in files: NumPy archives of arrays with a text that says where each belongs.
+"""Files of results: NumPy archives of arrays, with a JSON text that describes the structure of the result.
 
-Nothing is ever unpickled, and no constructor is called that a file names: objects are rebuilt from their fields, named tuples
-from their entries, and only those that jaxvib and optimize define. An archive holds a digest of its contents.
+Reading is safe: nothing is unpickled, and no constructor named in a file is called. Objects are rebuilt from their fields,
+named tuples from their entries, and only classes that jaxvib and optimize define are allowed. An archive contains a digest of
+its contents.
 """
 
 from __future__ import annotations
@@ -32,23 +33,23 @@ from jaxvib.runtime.compat import enumeration_of
 __all__ = ["load", "save"]
 
 _LAYOUT, _DIGEST = "result", "digest"
-"""Entries of the archive: the layout, a JSON text, and the digest of it and of all arrays."""
+"""Names of archive entries: the layout, which is a JSON text, and the digest of the layout and all arrays."""
 
 _PACKAGES = ("jaxvib", "optimize")
 """Packages whose classes a file may name."""
 
 _KINDS = "biufcUS"
-"""Kinds of NumPy's types that a file may hold: numbers, truth values, texts."""
+"""Kinds of NumPy's types that a file may contain: numbers, Booleans and texts."""
 
 
 def save(result: eqx.Module, path: str | Path) -> Path:
-    """Writes a result to a NumPy archive (".npz", added where it is missing) that `load` reads back bit for bit.
+    """Write a result to a NumPy archive that `load` reads back bit for bit; ".npz" is appended to the name if it is missing.
 
-    Arrays are entries of the archive, a scene is a TOML text, all else stands in a JSON text. A file that was there before
-    is replaced once the new one is complete.
+    Arrays are entries of the archive, a scene is stored as a TOML text, and everything else in a JSON text. An existing file is
+    replaced when the new one is complete.
 
-    **Returns** the path written to. **Raises** `InputError` for a result that holds what cannot be written, and for a path that
-    cannot be written to.
+    **Returns** the path of the file. **Raises** `InputError` for a result with a value that cannot be stored, and for a path
+    that cannot be written to.
     """
     arrays: dict[str, np.ndarray] = {}
     layout = json.dumps(_encoded(result, arrays))
@@ -101,12 +102,15 @@ _ODD = (
     ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, OSError, RuntimeError,
     TypeError, ValueError, zipfile.BadZipFile,
 )  # fmt: skip
-"""Errors of reading a file that holds anything at all; `RecursionError` is a `RuntimeError`."""
+"""Errors that the reading of a file with arbitrary content may raise; `RecursionError` is a `RuntimeError`."""
 
 
 def _arrays(file: Any) -> dict[str, np.ndarray]:
-    """Arrays of an archive by name. **Raises** an error of `_ODD` for entries that are compressed, or larger than the file: a
-    few bytes of those can fill any memory."""
+    """Return the arrays of an archive by name.
+
+    **Raises** an error of `_ODD` if an entry is compressed, or if the entries are larger than the file, because a few bytes of
+    such an entry can fill any memory.
+    """
     with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
         size = file.seek(0, io.SEEK_END)
@@ -138,7 +142,7 @@ def _digest(layout: str, arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
-    """A value as JSON can hold it, its arrays put among `arrays` and named."""
+    """Return a value as JSON can represent it, with names in place of its arrays, which are added to `arrays`."""
     if value is None or (isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic)):
         return value
     if is_status(value):
@@ -183,7 +187,7 @@ def _class(kind: type) -> str:
 
 
 def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str], object] | None = None) -> Any:
-    """The value that `_encoded` made this of; `read` is that of a field that is written as a text of its own."""
+    """Return the value of which `value` is the encoded form; `read` is the function of the metadata `as_text` of a field."""
     if isinstance(value, str) and CONTROL.search(value):
         raise ValueError("control characters")
     if isinstance(value, list):
@@ -192,12 +196,12 @@ def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str],
         return value
     match value:
         case {"text": str(text), "double": bool(double)} if read is not None:
-            with jax.enable_x64(double):  # the precision that it was saved in
+            with jax.enable_x64(double):  # the precision in which it was saved
                 return read(text)
         case {"status": str(name), "names": str(names)}:
             return member(_class_named(name, eqx.Enumeration), arrays[names])
         case {"array": str(name), "kind": "jax"}:
-            with jax.enable_x64(True):  # single precision could not hold all
+            with jax.enable_x64(True):  # otherwise JAX would convert arrays of double precision to single
                 return jnp.asarray(arrays[name])
         case {"array": str(name), "kind": "scalar"}:
             return arrays[name][()]
@@ -220,7 +224,7 @@ def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str],
 
 
 def _rebuilt(kind: type, fields: Mapping[str, Plain], arrays: Mapping[str, np.ndarray]) -> object:
-    """An object with these fields as they were: a constructor would read units and check values once more."""
+    """Return an object with these stored fields; its constructor, which would convert and check them again, is not called."""
     whole = object.__new__(kind)
     for field in dataclasses.fields(kind):
         given = field.name in fields
@@ -232,8 +236,11 @@ def _rebuilt(kind: type, fields: Mapping[str, Plain], arrays: Mapping[str, np.nd
 
 
 def _class_named(name: str, base: type) -> Any:
-    """The class of that name, found in its module or else among the public names: a result or a part of one, a status, a named
-    tuple, defined by one of the packages. **Raises** `ValueError` for any other."""
+    """Return the class of a name, from its module or else from the public names of the package.
+
+    **Raises** `ValueError` for a class that neither package defines, or that is not of the kind of `base`: a named tuple for
+    `tuple`, a dataclass for `object`, a status for `equinox.Enumeration`.
+    """
     module, _, inner = name.partition(":")
     if module.split(".")[0] not in _PACKAGES or not inner.isidentifier():
         raise ValueError(f"{name} is no class of a result")

@@ -1,6 +1,6 @@
 """Common base of all results."""
 
-# No postponed annotations here: Equinox knows an abstract field by its annotation itself.
+# No postponed annotations in this module: Equinox recognizes an abstract field by its evaluated annotation.
 
 import abc
 import base64
@@ -45,9 +45,9 @@ class Result(eqx.Module):
     """
 
     outer_axes = ()
-    """Names of the axes that "*" stands for in the metadata of fields."""
+    """Names of the axes that replace "*" in the metadata of fields."""
 
-    if TYPE_CHECKING:  # to a type checker an abstract field is one that no constructor takes
+    if TYPE_CHECKING:  # for a type checker an abstract field is one that is no argument of the constructor
         status: Any = eqx.field(init=False)
     else:
         status: eqx.AbstractVar[eqx.Enumeration]
@@ -55,7 +55,7 @@ class Result(eqx.Module):
     @property
     @final
     def message(self) -> str:
-        """Sentence of the status; of several, each sentence once with its number of occurrences."""
+        """Sentence of the status; for several statuses, each sentence once with its number of occurrences."""
         return sentence(self.status)
 
     @property
@@ -73,17 +73,17 @@ class Result(eqx.Module):
         """Plot the result by matplotlib; `plot(ax=axes)` draws onto given axes, one for each panel, and returns them."""
 
     def __repr__(self) -> str:
-        """The summary; the shapes of the arrays for a batch of results and for one without known numbers."""
+        """Return the summary, or the shapes of the arrays for a batch of results and for a traced result."""
         return self.summary() if fields.is_single(self) else super().__repr__()
 
     def _repr_html_(self) -> str:
-        """The representation and, for a single result, its figure, for notebooks."""
+        """Return the representation and, for a single result, its figure, for notebooks."""
         text = f"<pre>{html.escape(repr(self))}</pre>"
         if not fields.is_single(self):
             return text
         try:
             figure = self.plot()
-        except InputError:  # a result without the points of a figure, such as a run saved without its trajectory
+        except InputError:  # the result lacks the data of its figure, such as a run saved without its trajectory
             return text
         data = io.BytesIO()
         figure.savefig(data, format="png", dpi=80)

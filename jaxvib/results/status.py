@@ -1,4 +1,4 @@
-"""Statuses: the name of one, its sentence, and the error that is raised for it."""
+"""Statuses: their names, their sentences, and the errors that are raised for them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ Status = TypeVar("Status", bound=eqx.Enumeration)
 
 
 class Computed(eqx.Enumeration):
-    """The status of a result that cannot fail once its input is accepted."""
+    """Status of a result whose computation cannot fail if its input is valid."""
 
     done = "the answer was computed"
 
 
 def is_status(value: object) -> TypeGuard[eqx.Enumeration]:
-    """True if a value is a member of an enumeration, or an array of members."""
+    """Return True for a member of an enumeration or an array of members."""
     return isinstance(value, type(Computed.done))
 
 
 def member(enumeration: type[Status], names: str | np.ndarray) -> Status:
-    """The member of that name; of an array of names (any shape) as many, on JAX's device.
+    """Return the member of a name, or an array of members for an array of names (any shape), on JAX's device.
 
     >>> bool(member(Computed, "done") == Computed.done)
     True
@@ -41,9 +41,9 @@ def member(enumeration: type[Status], names: str | np.ndarray) -> Status:
 
 
 def status_names(status: eqx.Enumeration) -> np.ndarray:
-    """The name of each member in a status of any shape, an array of text of that shape.
+    """Return the names of the members of a status of any shape, as an array of texts of the same shape.
 
-    **Raises** `TypeError` for a status that is not known yet, under a JAX transformation.
+    **Raises** `TypeError` for a traced status, which has no value.
     """
     (numbers,) = jax.tree.leaves(status)
     try:
@@ -54,7 +54,7 @@ def status_names(status: eqx.Enumeration) -> np.ndarray:
 
 
 def status_name(status: eqx.Enumeration) -> str:
-    """The name of a single status.
+    """Return the name of a single status.
 
     >>> status_name(Computed.done)
     'done'
@@ -63,14 +63,14 @@ def status_name(status: eqx.Enumeration) -> str:
 
 
 def sentence(status: eqx.Enumeration) -> str:
-    """Sentence of a status; of several, each sentence once with its number of occurrences.
+    """Return the sentence of a status; for several statuses, each sentence once with its number of occurrences.
 
     >>> sentence(Computed.done)
     'the answer was computed'
     """
     names = status_names(status)
     enumeration = enumeration_of(status)
-    if names.ndim == 0:  # by its name: a status that went through NumPy is no member any more
+    if names.ndim == 0:  # by its name, because a status converted to NumPy is not equal to a member
         return enumeration[getattr(enumeration, str(names))]
     counts = {name: int(np.sum(names == name)) for name in enumeration_names(enumeration)}
     parts = [f"{enumeration[getattr(enumeration, name)]} ({k} of {names.size})" for name, k in counts.items() if k]
@@ -78,5 +78,5 @@ def sentence(status: eqx.Enumeration) -> str:
 
 
 def failure(status: eqx.Enumeration, hint: str = "") -> ComputationError:
-    """The error to raise for a single status: its name, its sentence, and a `hint` that follows the sentence."""
+    """Return the error for a single status, with its name, its sentence, and a `hint` that follows the sentence."""
     return ComputationError(status_name(status), sentence(status) + hint)

@@ -1,4 +1,4 @@
-"""Numbers of users: their units are read here and nowhere else; inside, everything is SI."""
+"""Conversion and checks of users' numbers. This is the only package that reads units; all other code uses SI."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class Bounds(NamedTuple):
-    """Allowed values of a number: from `low` to `high`, without an end that is open.
+    """Allowed values of a number, from `low` to `high`; an open end is not included.
 
     >>> Bounds(0.0, open_low=True).words, Bounds(0.0, high=1.0).words, Bounds(0.0).allow(np.asarray([-1.0, 0.0])).tolist()
     ('greater than 0', 'at least 0 and at most 1', [False, True])
@@ -62,7 +62,7 @@ class Bounds(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The bounds in a sentence, "" if there are none."""
+        """Bounds as part of a sentence; "" if there are none."""
         low = f"{'greater than' if self.open_low else 'at least'} {self.low:g}" if self.low > -math.inf else ""
         high = f"{'less than' if self.open_high else 'at most'} {self.high:g}" if self.high < math.inf else ""
         return " and ".join(filter(None, (low, high)))
@@ -73,7 +73,7 @@ _COLLECTED: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar(
 
 @contextlib.contextmanager
 def bounds_of_unknowns() -> Iterator[list[Array]]:
-    """Collect, while parts of a scene are built, a condition for each number that has no value yet: that it is allowed."""
+    """Yield a list to which each traced number adds a Boolean array while parts of a scene are built: True if it is allowed."""
     found: list[Array] = []
     token = _COLLECTED.set(found)
     try:
@@ -83,11 +83,11 @@ def bounds_of_unknowns() -> Iterator[list[Array]]:
 
 
 _MAX_NUMBERS = 10**7
-"""The longest list of numbers; larger ones come as arrays."""
+"""Largest length of a list of numbers; more numbers must be passed as an array."""
 
 
 def _checked(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, place: str = "") -> None:
-    """Check known values; a traced one has no value yet, see `bounds_of_unknowns`."""
+    """Check values against bounds. The condition for a traced value is added to the list of `bounds_of_unknowns`."""
     if traced(value):
         collected = _COLLECTED.get()
         if collected is not None:
@@ -119,20 +119,22 @@ def number(
     high: float = math.inf,
     open_high: bool = False,
 ) -> Array:
-    """One number as a floating-point scalar array in SI units, checked against `Bounds`.
+    """Return one number as a floating-point scalar array in SI units, checked against `Bounds`.
 
-    **Raises** `InputError` for a wrong unit, a list, a value that is not finite or not within the bounds.
+    **Raises** `InputError` for a wrong unit, a list, and a value that is not finite or not within the bounds.
 
     >>> float(number("2 t", "kg", "machine.mass"))
     2000.0
     """
-    # With a dtype JAX moves NumPy's array to the device; without, it compiles a program for each shape.
+    # With a dtype, JAX copies NumPy's array to the device; without one, it would compile a program for each shape.
     return jnp.asarray(_number(value, unit, field, Bounds(low, open_low, high, open_high)), dtype=float)
 
 
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
-    """`number` as NumPy has it where JAX does not yet: it goes to a program with the call, in a tenth of the time that moving
-    it there first takes."""
+    """Return one number like `number`, but as a NumPy array unless it is a JAX array already.
+
+    A call of a program copies a NumPy array to the device in a tenth of the time of a separate copy before the call.
+    """
     return _number(value, unit, field, Bounds(low, open_low))
 
 
@@ -154,11 +156,11 @@ def numbers(
     open_high: bool = False,
     shared: bool = False,
 ) -> Array:
-    """`length` numbers as an array in SI units; `length` None takes any number of them, one at least.
+    """Return `length` numbers as an array in SI units; `length` None allows any length of at least 1.
 
-    A single number stands for all of them: it is repeated, or kept as one scalar that all share if `shared`.
+    A single number applies to all entries. It is repeated, or returned as a scalar if `shared` is True or `length` is None.
 
-    **Raises** `InputError` as `number` does, and for a list of another length.
+    **Raises** `InputError` in the same cases as `number`, and for a list of another length.
 
     >>> numbers(["44 N/mm", 5e4], "N/m", "machine.stiffness", 2).tolist()
     [44000.0, 50000.0]
@@ -202,12 +204,12 @@ def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], boun
 
 
 def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array | np.ndarray:
-    """Value in SI; an array that JAX does not hold yet is converted by NumPy, so that no program need be compiled for it."""
+    """Return the checked value in SI; NumPy converts a value that is not a JAX array, which avoids a compilation by JAX."""
     try:
         if isinstance(value, jax.Array):
             array = jnp.asarray(value, dtype=float)
         else:
-            with np.errstate(over="ignore"):  # what single precision cannot hold is infinite, which `_checked` refuses
+            with np.errstate(over="ignore"):  # too large for single precision: infinite, which `_checked` refuses
                 array = np.asarray(value, dtype=float).astype(jnp.result_type(float))
     except OverflowError as error:
         raise InputError(field, f"is {quoted(value)}, which is too large; give a number below 1e308") from error
@@ -220,13 +222,13 @@ def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], 
 
 
 _MAX_COUNT = 2**31 - 1
-"""The largest count: arrays are indexed by numbers of 32 bits on accelerators."""
+"""Largest count, because accelerators index arrays by integers of 32 bits."""
 
 
 def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
-    """A whole number of things, at least `low`, of which `each` takes so many bytes.
+    """Return a whole number of objects, at least `low`, each of which needs `each` bytes.
 
-    **Raises** `InputError` for anything else, and for more than fit into half of this machine's memory.
+    **Raises** `InputError` for any other value, and if the objects need more than half of this machine's memory.
 
     >>> count(0, "loads.count")
     Traceback (most recent call last):
@@ -246,7 +248,7 @@ def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
 
 
 def random_numbers(seed: object) -> np.random.Generator:
-    """Return the generator of random numbers that belongs to a seed, a whole number of at least 0.
+    """Return the generator of random numbers for a seed, which must be a whole number of at least 0.
 
     >>> random_numbers(-1)
     Traceback (most recent call last):
@@ -257,7 +259,7 @@ def random_numbers(seed: object) -> np.random.Generator:
 
 
 def shown_unit(unit: str, size: float) -> tuple[str, float]:
-    """The unit that a designer reads values of about that size in, and by what SI values are multiplied."""
+    """Return the unit in which engineers usually state values of about `size`, and the factor from the SI value to it."""
     if unit == "N/m" and size >= 1e3:
         return "N/mm", 1e-3
     if unit in ("m", "meter") and 0.0 < size < 1.0:

@@ -1,4 +1,4 @@
-"""Checks of numbers that may have no value yet: JAX is transforming the computation they are part of (jit, grad, vmap)."""
+"""Checks of numbers that may be traced and then have no value: JAX transforms the computation (jit, grad, vmap)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def is_known(*trees: PyTree) -> bool:
-    """True if every number in the trees has a value. Modules that plan a computation ask this, once for a question.
+    """Return True if every number in the trees has a value. Modules that plan a computation call it once for a computation.
 
     >>> is_known({"mass": 1.0}, None)
     True
@@ -27,7 +27,7 @@ def is_known(*trees: PyTree) -> bool:
 
 
 def when_known(check: Callable[..., T], *values: PyTree) -> T | None:
-    """Return `check(*values)`, with numbers of Python and NumPy's arrays, or None if one of the numbers has no value yet.
+    """Return `check(*values)` of the values as Python numbers and NumPy arrays, or None if one of the numbers is traced.
 
     >>> when_known(lambda mass: mass > 0.0, np.asarray(2.0))
     True
@@ -41,7 +41,10 @@ def _plain(leaf: object) -> object:
 
 
 def require_known(tree: PyTree, field: str, asking: str, instead: str) -> None:
-    """**Raises** `InputError` if a number of `field` has no value: the function `asking` decides by values in Python."""
+    """Raise `InputError` if a number in `tree` has no value.
+
+    The message names the argument `field`, the function `asking`, which needs the value in Python, and the remedy `instead`.
+    """
     if not is_known(tree):
         problem = (
             f"holds numbers that JAX is transforming (jit, grad, vmap, ...), and {asking} decides by their values in Python"

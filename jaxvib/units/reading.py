@@ -1,4 +1,4 @@
-"""Units: texts and pint quantities as SI numbers."""
+"""Conversion of texts with units and of pint quantities to SI numbers."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ __all__ = ["Number", "Numbers", "Quantity", "in_own_unit", "require_real", "to_f
 
 @runtime_checkable
 class Quantity(Protocol):
-    """A number with a unit, such as pint's."""
+    """Number with a unit, such as a quantity of pint."""
 
     def m_as(self, units: str, /) -> Any:
-        """Its magnitude in a unit."""
+        """Return the magnitude in a unit."""
         ...
 
 
 Number: TypeAlias = float | Array | np.ndarray | np.number | str | Quantity
-"""A number as public functions accept it: a float, an array, a traced value, a string with a unit, a pint quantity."""
+"""Number in an argument of a public function: a float, an array, a traced value, a string with a unit, a pint quantity."""
 
 Numbers: TypeAlias = Number | Sequence[Number]
-"""Several of them, or one that stands for all."""
+"""Several numbers, or a single number for all entries."""
 
 
 _TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(\s*[^\W\d_]|\s+1\s*/|\s*[%°])((?:(?!\s\d)[^,;()])*)")
-"""One number with a decimal point, then one unit, which may begin with "1/": other texts are mistakes, even those that a unit
-library could evaluate."""
+"""Pattern of one number with a decimal point, then one unit, which may begin with "1/". Other texts are refused as mistakes,
+even if pint could evaluate them."""
 
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
 
@@ -49,7 +49,7 @@ _SPELLINGS = {
 """Other spellings of units of speed, as on rating plates and in catalogues."""
 
 _PER_MINUTE = ("1/min", "min^-1", "min**-1", "min⁻¹")
-"""Spellings that are turns only where a speed is needed."""
+"""Spellings of revolutions per minute, if the argument is a speed."""
 
 _JOINED = {
     "Ns": "N s",
@@ -61,7 +61,7 @@ _JOINED = {
     "kgm": "kg m",
     "kgmm": "kg mm",
 }
-"""Products that are often written without a space; pint reads "Nm" as a number of meters per gram."""
+"""Products that are often written without a space. Without this list, pint would read "Nm" as a number of meters per gram."""
 
 _JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d|[²³])?(?![^\W\d_])")
 
@@ -74,14 +74,14 @@ _FACTORS = {
     "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4},
     "rad/s": {"rad/s": 1.0, "rpm": math.pi / 30.0, "Hz": 2.0 * math.pi},
 }
-"""Units of most drawings. pint reads all others, and takes half a second to import."""
+"""Factors of the units in most drawings. Other units are read by pint, whose import takes half a second."""
 
 _UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
-"""Errors of pint, which reads a unit as Python, beside its own ones, for a text that is no unit."""
+"""Errors of pint, other than those of its own classes, for a text that is no unit, which pint parses as a Python expression."""
 
 
 def unit_name(unit: str) -> str:
-    """Name of a unit for messages: "no unit" for a plain number."""
+    """Return the name of a unit for messages: "no unit" for a plain number."""
     return unit or "no unit"
 
 
@@ -125,7 +125,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
             return magnitude * factor
         return _magnitude(_quantity(magnitude, written, value, unit, field), unit, field, value)
     if isinstance(value, Quantity):
-        if not hasattr(value, "units"):  # not pint's: it converts by itself
+        if not hasattr(value, "units"):  # a quantity of another library, with its own conversion
             return value.m_as(unit or "dimensionless")
         return _magnitude(value, unit, field, str(value))
     require_real(value, unit, field)
@@ -133,7 +133,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 
 
 def require_real(value: object, unit: str, field: str) -> None:
-    """Check that a value is a real number or an array of real numbers: the one check of all numbers of users.
+    """Check that a value is a real number or an array of real numbers. All numbers of users pass this check.
 
     **Raises** `InputError` for Booleans, complex numbers, dates, masked values, bytes, lists, None and objects that are no
     number.
@@ -150,7 +150,7 @@ def require_real(value: object, unit: str, field: str) -> None:
 
 
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
-    """Return the error about a text that is not in `unit`, None for a text without a readable unit of its own."""
+    """Return the error for a text that is not in `unit`; `unit` is None if the text should have any unit, but has none."""
     wanted = "no number with a unit" if unit is None else f"not in {unit}" if unit else "no plain number"
     return InputError(
         field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
@@ -158,7 +158,7 @@ def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
 
 
 def _parsed(unit: str) -> Any:
-    """Return pint's unit for a text. **Raises** what `_UNREADABLE` and pint list."""
+    """Return pint's unit for a text. **Raises** an error of `_UNREADABLE` or of pint for a text that is no unit."""
     import pint
 
     name = _SPELLINGS.get(unit, unit)
@@ -168,7 +168,7 @@ def _parsed(unit: str) -> Any:
 
 
 def _quantity(magnitude: float, written: str, value: str, unit: str | None, field: str) -> Any:
-    """Return a pint quantity for a number and the text of its unit. **Raises** `InputError` for a text that is no unit."""
+    """Return a pint quantity of a number and the text of its unit. **Raises** `InputError` for a text that is no unit."""
     import pint
 
     try:
@@ -178,8 +178,10 @@ def _quantity(magnitude: float, written: str, value: str, unit: str | None, fiel
 
 
 def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
-    """Return the magnitude of a pint quantity, written as `text`, in `unit`. **Raises** `InputError` for another dimension,
-    and for a bare 1/s where a speed is needed."""
+    """Return the magnitude in `unit` of a pint quantity that the user wrote as `text`.
+
+    **Raises** `InputError` for another dimension, and for 1/s without an angle if `unit` is that of a speed.
+    """
     import pint
 
     if not hasattr(given, "units"):  # a quantity of another library
@@ -208,7 +210,7 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
 
 
 def _roots(units: Any) -> tuple[dict[str, float], float, float]:
-    """Return the powers of the base units of a pint unit other than angles, the power of its angles, and that of hertz."""
+    """Return the powers of a pint unit: of its base units other than angles by their names, of its angles, and of hertz."""
     import pint
 
     _, roots = pint.get_application_registry().get_root_units(units)
@@ -218,7 +220,9 @@ def _roots(units: Any) -> tuple[dict[str, float], float, float]:
 
 
 def unit_ratio(one: str, other: str) -> float | None:
-    """Return the value of 1 `one` in `other`, None for units of different dimensions; hertz are turns beside angles.
+    """Return the value of 1 `one` in the unit `other`, or None if their dimensions differ.
+
+    One hertz is one revolution per second if the other unit contains an angle.
 
     >>> round(unit_ratio("Hz", "rad/s"), 3), unit_ratio("kg", "N")
     (6.283, None)
