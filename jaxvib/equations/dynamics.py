@@ -1,4 +1,4 @@
-"""The equations of motion of a scene: carrier and exciters, solved for their accelerations."""
+"""Equations of motion of a scene: carrier and exciters, solved for their accelerations."""
 
 from __future__ import annotations
 
@@ -34,22 +34,23 @@ __all__ = ["Dynamics", "dynamics_of", "vector_field"]
 
 
 class _Support(eqx.Module):
-    """Place of a `SupportForce`: `rows` (k, nd) of its displacements; `input_matrix` (nd, k), acceleration per force there."""
+    """Place of a `SupportForce`: `rows` (k, nd) of its displacements; `input_matrix` (nd, k), accelerations per force there."""
 
     rows: Array
     input_matrix: Array
 
 
 class Dynamics(eqx.Module):
-    """A scene made ready for time integration: everything that does not change with time is computed once.
+    """Equations of a scene for time integration. Everything that does not change with time is computed once.
 
-    The accelerations of the carrier are those without exciters plus what exciters push. P are the rows of all mounts that move
-    loads or an unbalanced rotor, one below the other:
+    The accelerations of the carrier are those without exciters plus those due to the forces of the exciters. P contains the
+    rows of all mounts that move loads or an unbalanced rotor, one below the other.
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
-    - `input_matrix` M^-1 P^T (nd, nP), acceleration per force on the rows; `accelerance` P M^-1 P^T (nP, nP); `rows` P (nP, nd)
+    - `input_matrix` M^-1 P^T (nd, nP): acceleration per force on the rows
+    - `accelerance` P M^-1 P^T (nP, nP), and `rows` P (nP, nd)
     - `mass` M (nd, nd) if P has more rows than there are coordinates, otherwise None
-    - `turns`: for each exciter the row (1, nd) of the turn of its housing, None if it does not turn
+    - `turns`: for each exciter the row (1, nd) of the rotation of its housing, None if it does not turn
     - `exciters`, see `RotorDynamics`; `supports`, a place for each `SupportForce`
     """
 
@@ -68,9 +69,9 @@ class Dynamics(eqx.Module):
         """Return the time derivative of `state` at time `t`.
 
         Each exciter is eliminated first, see `RotorDynamics.eliminate`. With the added mass W and the reaction g of all
-        exciters, the accelerations a of P's rows then follow from (1 + accelerance W) a = a_free - accelerance g: one equation
-        per row, however many platforms and loads there are. If there are more rows than coordinates, q'' follows from
-        (M + P^T W P) q'' = M q''_free - P^T g.
+        exciters, the accelerations a of P's rows then follow from (1 + accelerance W) a = a_free - accelerance g. This is one
+        equation per row, for any number of platforms and loads. If there are more rows than coordinates, q'' follows from
+        (M + P^T W P) q'' = M q''_free - P^T g instead.
         """
         pairs = list(zip(self.exciters, state.exciters, strict=True))
         speeds = [exciter.drive.rotor_speed(t, own.rotor) for exciter, own in pairs]
@@ -87,7 +88,7 @@ class Dynamics(eqx.Module):
 
         contacts = [motion.rolling for motion in motions]
         if any(map(depends_on_acceleration, contacts)):
-            # A normal force that depends on the accelerations has the sign that it has without its friction.
+            # The sign of a normal force that depends on the accelerations is taken from the motion without its friction.
             plain, _ = solve([without_coupling(contact) for contact in contacts])
             cases = zip(self.exciters, contacts, plain, strict=True)
             contacts = [signed(contact, exciter.at_loads(a)) for exciter, contact, (_, a) in cases]
@@ -112,7 +113,7 @@ class Dynamics(eqx.Module):
         return flow
 
     def _close(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
-        """Return the accelerations of the rows of each exciter, and of the carrier."""
+        """Return the accelerations of the rows of each exciter, and those of the carrier."""
         ends = np.cumsum([len(part.reaction) for part in parts]).tolist()
         blocks = [range(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
         own = [block for block in blocks for _ in block]
@@ -125,7 +126,7 @@ class Dynamics(eqx.Module):
             return [[jnp.sum(self.rows[k] * carrier) for k in block] for block in blocks], carrier
 
         def felt(i: int, k: int) -> Array | float:
-            """Acceleration of row i per acceleration of row k by the added mass, which acts within an exciter."""
+            """Return the acceleration of row i per that of row k due to the added mass, which acts within an exciter."""
             return sum(self.accelerance[i, j] * weights[j][k] for j in own[k])
 
         n, free = ends[-1], times(self.rows, unforced)
@@ -139,7 +140,7 @@ class Dynamics(eqx.Module):
     def _solve_in_coordinates(
         self, mass: Array, unforced: Array, weights: list[dict[int, Array | float]], reaction: list[Array | float]
     ) -> Array:
-        """Return the accelerations of the carrier; each row has its added mass with others, and its reaction."""
+        """Return the accelerations of the carrier from the added mass of each row with other rows, and its reaction."""
         force = times(mass, unforced)
         for row, line, g in zip(self.rows, weights, reaction, strict=True):
             felt = functools.reduce(operator.add, (w * self.rows[k] for k, w in line.items()))
@@ -169,14 +170,14 @@ def vector_field(scene: Scene) -> Dynamics:
     143.8746
 
     Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,
-    equation (1). A gyroscopic matrix acts with the rotor's speed alone: the effect of its change, C theta'' psi / 2, is left
-    out as in the paper.
+    equation (1). The gyroscopic force depends on the rotor speed only. The term of the rotor's acceleration, C theta'' psi / 2,
+    is neglected as in the paper.
     """
     return dynamics_of(assemble(scene))
 
 
 def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_solve) -> Dynamics:
-    """Return `vector_field` of a scene that is assembled already; `solve` gives x of a x = b, a the mass matrix."""
+    """Return `vector_field` of a scene that is already assembled. `solve` returns x of a x = b, where a is the mass matrix."""
     scene, carrier, gyroscopic = model.scene, model.carrier, model.mounts[0].gyroscopic
     exciters = tuple(map(_exciter_dynamics, scene.exciters, model.mounts, itertools.repeat(scene.effects)))
     turns = tuple(None if mount.turn is None else mount.turn[None] for mount in model.mounts)
@@ -204,7 +205,7 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
 
 
 def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]) -> RotorDynamics:
-    """Return the dynamics of an exciter under its effects and those that it shares with others."""
+    """Return the dynamics of an exciter under its own effects and those of the scene."""
     effects, loads = (*shared, *exciter.effects), exciter.loads
     rotor = (mount.levers, mount.rotor_levers, exciter.turning_drive, exciter.unbalance)
     row_count = len(mount.rows) if has_term(effects, RotorImbalance) else len(mount.levers)

@@ -1,4 +1,4 @@
-"""Machines: the linear structure, and places on it."""
+"""Machines: their linear structure, and places on it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Carrier(eqx.Module):
 
         M q'' + C q' + K q = forces,        force on the foundation = T_K q + T_C q'
 
-    The mass of the loads is not part of `mass`: each load brings its own at its place, see `Mount`.
+    `mass` does not include the loads: each load adds its mass at its own place, see `Mount`.
 
     **Attributes** (nd coordinates, nb directions of the force on the foundation)
 
@@ -155,7 +155,7 @@ class Machine(Part):
         return None
 
     def structure(self) -> Carrier:
-        """Names, directions and shapes of the carrier, without its numbers."""
+        """Return the names, directions and shapes of the carrier, without its numbers."""
         return _shapes(self)[0]
 
     def mounting(self, at: Place = None) -> Mount:
@@ -170,7 +170,7 @@ def _shapes(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
 
 
 def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
-    """Return shape and dtype without rules of promotion."""
+    """Return the shape and the dtype of an array, or those of the array that JAX makes of a Python number."""
     known = leaf if isinstance(leaf, (jax.Array, np.ndarray)) else jnp.asarray(leaf)
     return known.shape, known.dtype
 
@@ -179,7 +179,10 @@ def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
 def _structure(
     rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype, platform: int | None
 ) -> tuple[Carrier, Mount]:
-    """Trace once for all machines of a structure and the current `precision`: a trace takes longer than many runs."""
+    """Trace the carrier and the mount once for all machines of one structure and one `precision`.
+
+    The result is cached because a trace takes longer than many runs.
+    """
     machine, position = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
 
     def shapes(machine: Machine, position: Array | None) -> tuple[Carrier, Mount]:

@@ -1,4 +1,4 @@
-"""Validation of scenes by public functions, since `equinox.tree_at` can replace numbers of a scene without a check."""
+"""Validation of scenes. Public functions call it because `equinox.tree_at` replaces numbers of a scene without a check."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from jaxvib.units.known import is_known, when_known
 __all__ = ["allowed_unknowns", "make_scene", "validate_scene"]
 
 _VALID_SCENES: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
-"""Scenes that were validated, by their identity: a scene never changes."""
+"""Validated scenes by their `id`. Scenes are immutable, therefore a validated scene stays valid."""
 
 
 def validate_scene(scene: Scene) -> Scene:
-    """Return the scene with arrays for all its numbers. If all are known, check that the constructors allow them.
+    """Return the scene with arrays for all its numbers. If no number is traced, check that the constructors allow them.
 
     **Raises** `InputError` for an object that is not a scene, and for a number that is not allowed.
 
@@ -51,7 +51,7 @@ def validate_scene(scene: Scene) -> Scene:
         scene = jax.tree.unflatten(structure, arrays)
     if is_known(arrays):
         numbers = structure, *((leaf.shape, leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, arrays))
-        with evaluating():  # outside an enclosing derivative, which would make it slower
+        with evaluating():  # outside an enclosing derivative, because the validation is slower under it
             try:
                 hash(structure)
             except TypeError:
@@ -63,9 +63,9 @@ def validate_scene(scene: Scene) -> Scene:
 
 
 def allowed_unknowns(scene: Scene) -> Array | None:
-    """Return a traced Boolean, True if constructors allow the numbers of a scene that have no value yet.
+    """Return a traced Boolean, True if the constructors allow the traced numbers of a scene.
 
-    None if all of its numbers are known, and therefore validated.
+    None if all numbers have values; they are then already validated.
 
     >>> import equinox as eqx, jax, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -84,7 +84,10 @@ def allowed_unknowns(scene: Scene) -> Array | None:
 
 
 def _allowed_value(scene: Scene) -> Array | None:
-    """Return None if constructors allow the known numbers of a scene, as under `grad` without `jit`, otherwise False."""
+    """Return None if the constructors allow the numbers of a scene, otherwise False.
+
+    All numbers have values here, as under `grad` without `jit`.
+    """
     try:
         validate_scene(scene)
     except InputError:
@@ -96,7 +99,7 @@ _CARRIED = ("loads", "unbalance")
 
 
 def _rebuild(scene: Scene) -> None:
-    """Build each part of a scene once more. **Raises** `InputError` for a known number that is not allowed."""
+    """Build each part of a scene again. **Raises** `InputError` for a number that has a value and is not allowed."""
     rebuild_part(scene.machine, "machine")
     for k, exciter in enumerate(scene.exciters):
         with within(scene.place_of(k)):
@@ -115,7 +118,7 @@ def _rebuild(scene: Scene) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _SceneKey:
-    """Scene identified by all its numbers: under a derivative the same scene is made several times."""
+    """Scene identified by all its numbers, because a derivative creates the same scene several times."""
 
     numbers: Hashable
     scene: Scene = dataclasses.field(compare=False)
@@ -133,7 +136,7 @@ def _require_valid(key: _SceneKey) -> None:
 
 
 def make_scene(make: Callable[..., Scene], *values: object) -> Scene:
-    """Return the scene that a user's function makes of some values. **Raises** `InputError` as `validate_scene`.
+    """Return the scene that a user's function `make` returns for `values`. **Raises** `InputError` as `validate_scene`.
 
     >>> make_scene(lambda x: None, 1.0)
     Traceback (most recent call last):
@@ -148,7 +151,7 @@ def make_scene(make: Callable[..., Scene], *values: object) -> Scene:
 
 
 def _number(name: str, leaf: object) -> Array:
-    """Return a leaf as a floating-point array. **Raises** `InputError` for text and for known numbers that are not finite."""
+    """Return a leaf as a floating-point array. **Raises** `InputError` for text, and for values that are not finite."""
     if not isinstance(leaf, str):
         require_real(leaf, "", name)
     if not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact):

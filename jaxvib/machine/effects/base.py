@@ -1,4 +1,4 @@
-"""Effects, gravity, and imbalances. An effect that is not in the scene is not in the traced program."""
+"""Effects, gravity and imbalances. The traced program contains only the effects of the scene."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _AXES = {"up": 1, "axis": 2}
 
 
 class Typical(NamedTuple):
-    """Effect with usual numbers, for a scene without it; `says` describes these numbers."""
+    """Effect with usual numbers, for a scene that does not have it; `says` describes these numbers."""
 
     effect: Effect
     says: str
@@ -64,7 +64,7 @@ def has_term(effects: Iterable[Effect], *kinds: type[Term]) -> bool:
 
 
 def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
-    """Return the acceleration of gravity of a scene with these `effects`, m/s^2, by the axis that it pulls against."""
+    """Return the acceleration of gravity of a scene with these `effects`, m/s^2, by axis. Gravity acts against the axis."""
     total: dict[int, Array] = {}
     for field in terms_of(effects, GravityField):
         total[field.axis] = total[field.axis] + field.g if field.axis in total else field.g
@@ -72,7 +72,7 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
 
 
 def has_half_turn(effects: Iterable[Effect]) -> bool:
-    """True if equations with these `effects` stay the same under phi + pi, -q, so that a jam has even harmonics only.
+    """True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged; jams then have even harmonics only.
 
     Friction may keep this symmetry. Gravity on the loads, an imbalance and forces between loads break it.
     """
@@ -112,7 +112,10 @@ class Effect(Part):
 
     @abc.abstractmethod
     def terms(self) -> tuple[Term, ...]:
-        """Return the terms that the effect adds to the equations. Nothing is computed here: terms hold methods and numbers."""
+        """Return the terms that the effect adds to the equations.
+
+        Terms contain methods and numbers; nothing is computed here.
+        """
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
@@ -130,13 +133,13 @@ class Effect(Part):
         """**Raises** `InputError` if the effect cannot act on this `machine` or these `loads`."""
 
     def prepare(self, loads: Loads) -> Effect:
-        """Return the effect with everything computed that depends on the numbers of the `loads`, but not on time."""
+        """Return the effect after computing everything that depends on the numbers of the `loads` but not on time."""
         return self
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array | None:
         """Return the fastest rate that the effect adds to the motion of the `loads`, rad/s or 1/s, which steps must resolve.
 
-        None if the effect adds no faster motion than the loads have without it. `speed` is that of the rotor, rad/s.
+        None if no motion that the effect adds is faster than that of the loads without it. `speed` is the rotor speed, rad/s.
         """
         return None
 
@@ -172,13 +175,13 @@ class Gravity(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Gravity in the rotor's plane, or along the axis if loads move in that direction."""
+        """Return gravity in the rotor's plane, or along the axis if loads move in that direction."""
         if len(jax.eval_shape(loads.position, *loads.rest())) > _AXES["axis"]:
             return Typical(cls(along="axis"), "g = 9.81 m/s^2 along the axis, if it is vertical")
         return Typical(cls(), "g = 9.81 m/s^2 in the rotor's plane, if the axis is horizontal")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the field and the loads' potential energy in it."""
+        """Return the gravity field, and the potential energy of the loads in it."""
         return GravityField(_AXES[self.along], self.g), LoadPotential(self.energy, is_smooth=True)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
@@ -223,7 +226,7 @@ class StaticImbalance(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Return `BALANCE_GRADE` of all the mass that moves with the rotor."""
+        """Return the imbalance at `BALANCE_GRADE` of all the mass that moves with the rotor."""
         moment = _moved_inertia(machine)[0] * BALANCE_GRADE / speed
         return Typical(cls(moment), f"{1e3 * float(moment):.3g} g m, grade G6.3 of all the mass that moves with the rotor")
 
@@ -262,7 +265,7 @@ class MomentImbalance(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return `BALANCE_GRADE` at the radius of gyration on either side; None if the machine cannot tilt."""
+        """Return the imbalance at `BALANCE_GRADE` at the radius of gyration on either side; None if the machine cannot tilt."""
         mass, inertia = _moved_inertia(machine)
         if inertia is None:
             return None

@@ -90,8 +90,10 @@ class LoadContact(Effect):
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
     def validate_start(self, loads: Loads, u: Coordinates) -> None:
-        """**Raises** `InputError` if `loads` on a circle at the coordinates `u` are not in order within a turn, or if others
-        overlap."""
+        """**Raises** `InputError` if loads cannot start at the coordinates `u`.
+
+        Loads on a circle must be in order within one turn. Other loads must not overlap.
+        """
         if not loads.circular:
             self._require_distances(loads, u)
             return
@@ -129,14 +131,14 @@ class LoadContact(Effect):
         )
 
     def energy(self, loads: Loads, u: Coordinates) -> Array:
-        """Return k (2 r - s)^2 / 2 of the pairs that overlap, (count,) J, for `loads` at the coordinates `u`."""
+        """Return k (2 r - s)^2 / 2, (count,) J, of the pairs of `loads` that overlap at the coordinates `u`."""
         parts = [0.5 * self.stiffness * jnp.maximum(-gap, 0.0) ** 2 for gap in _clearances(loads, u)]
-        if parts[-1].shape != (loads.count,):  # opposite loads make half as many pairs
+        if parts[-1].shape != (loads.count,):  # with an even count there are only half as many pairs of opposite loads
             parts[-1] = jnp.concatenate([parts[-1], jnp.zeros_like(parts[-1])])
         return sum(parts[1:], parts[0])
 
     def resistance(self, loads: Loads, u: Coordinates, rate: Coordinates) -> Coordinates:
-        """Return the forces -c s' of the pairs that overlap, for `loads` at the coordinates `u` with rates `rate`.
+        """Return the forces -c s' of the pairs of `loads` that overlap at the coordinates `u` with rates `rate`.
 
         A contact never pulls.
         """
@@ -155,18 +157,21 @@ class LoadContact(Effect):
         )
 
     def _damping(self, loads: Loads) -> Array:
-        """Return c, from the restitution if that is set."""
+        """Return c. If the restitution is set, c follows from it."""
         if self.restitution is None:
             return self.damping
         return 2.0 * damping_ratio(self.restitution) * jnp.sqrt(self.stiffness * self._reduced_mass(loads))
 
     def _reduced_mass(self, loads: Loads) -> Array:
-        """Return mu, for the lightest loads if they differ."""
+        """Return mu. If the loads differ, it is that of the lightest ones."""
         return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (ball_radius(loads) / loads.arm()[0]) ** 2)
 
 
 _MIN_START_DISTANCE = 0.9
-"""Least distance of loads at a start, in their diameters: another run may start while loads press on each other."""
+"""Smallest distance between loads at a start, in diameters.
+
+It is below 1 because a run may start from a state of another run in which loads press on each other.
+"""
 
 
 def damping_ratio(restitution: Array) -> Array:
@@ -191,7 +196,10 @@ _NEWTON_STEPS = 5
 
 
 def _loss(ratio: Array) -> Array:
-    """Return -log e: (pi - 2 beta) tan beta, sin beta = zeta; 2 gamma coth gamma, cosh gamma = zeta."""
+    """Return -log e of a damping `ratio` zeta.
+
+    It is (pi - 2 beta) tan beta with sin beta = zeta if zeta <= 1, otherwise 2 gamma coth gamma with cosh gamma = zeta.
+    """
     near = ratio - 1.0
     middle = jnp.abs(near) < 1e-3
     under, over = jnp.where(ratio < 0.999, ratio, 0.5), jnp.where(ratio > 1.001, ratio, 2.0)
@@ -202,7 +210,11 @@ def _loss(ratio: Array) -> Array:
 
 
 def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
-    """Return distances between surfaces, negative for an overlap: of each load and the k-th next, each pair once."""
+    """Return the distances between surfaces, negative for an overlap.
+
+    The k-th array contains the distances of each load to the k-th load after it; each pair occurs once. On a circle there is
+    only k = 1.
+    """
     own = ball_radius(loads)
     if isinstance(loads, CircularLoads):
         (phi,) = u

@@ -80,7 +80,7 @@ class CubicSupport(_Support):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return a support that is 1 % stiffer at the amplitude a in the mean of a swing, (3/4) k3 a^2 = 0.01 k.
+        """Return a support that, averaged over an oscillation of the amplitude a, is 1 % stiffer: (3/4) k3 a^2 = 0.01 k.
 
         It is at the supported platform with the largest motion, or around the rotor's axis.
         """
@@ -150,7 +150,7 @@ class Stop(_Support):
         self.platform, self.position = _read_place(Stop, self.kind, platform, position)
 
     def _penetration(self, displacement: Array) -> tuple[Array, Array]:
-        """Return the penetration beyond the gap (negative: free), and its direction (k,)."""
+        """Return the penetration beyond the gap (negative without contact), and its direction (k,)."""
         if displacement.shape[0] == 1:
             x = displacement[0]
             sign = {"above": jnp.ones_like(x), "below": -jnp.ones_like(x)}.get(self.side, jnp.where(x < 0.0, -1.0, 1.0))
@@ -164,7 +164,10 @@ class Stop(_Support):
         return (SupportForce(self.rows, self.energy, self.resistance),)
 
     def rows(self, machine: Machine) -> Array:
-        """Return the rows of the place on a `machine`, (1, nd) or (2, nd). **Raises** `InputError` for a side of a ring."""
+        """Return the rows of the place on a `machine`, (1, nd) or (2, nd).
+
+        **Raises** `InputError` for a ring with a `side` other than "both".
+        """
         rows = super().rows(machine)
         if rows.shape[0] > 1 and self.side != "both":
             raise InputError("effects.stop.side", f"is {quoted(self.side)}; around a rotor's axis it must be 'both'")
@@ -176,8 +179,10 @@ class Stop(_Support):
         return 0.5 * self.stiffness * jnp.maximum(penetration, 0.0) ** 2
 
     def resistance(self, displacement: Array, velocity: Array) -> Array:
-        """Return c x' while the stop presses, (k,) N, at the `displacement` (m) with the `velocity` (m/s). A stop never
-        pulls."""
+        """Return c x' while the stop presses, (k,) N, at the `displacement` (m) and the `velocity` (m/s).
+
+        A stop never pulls.
+        """
         penetration, direction = self._penetration(displacement)
         closing = self.damping * jnp.sum(direction * velocity)
         return jnp.where(penetration > 0.0, jnp.maximum(closing, -self.stiffness * penetration), 0.0) * direction

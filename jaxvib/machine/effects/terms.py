@@ -1,8 +1,8 @@
 """Terms that effects add to the equations of a scene. Each theory states the types of terms that it includes.
 
-A term is made while a question is asked and holds functions (methods of its effect) or numbers. Energies are in J, forces in
+Terms are created during a computation and contain functions (methods of their effect) or numbers. Energies are in J, forces in
 N; the generalised force of a load's angle is a torque in N m. A load's coordinates `u` and their rates are tuples of (count,)
-arrays. Terms are final: a new effect combines them.
+arrays. The types of terms are final; a new effect combines existing ones.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 Coordinates: TypeAlias = tuple[Array, ...]
-"""An array (count,) for each coordinate of a load."""
+"""Arrays (count,), one for each coordinate of a load."""
 
 Energy: TypeAlias = Callable[[Loads, Coordinates], Array]
 Resistance: TypeAlias = Callable[[Loads, Coordinates, Coordinates], Coordinates]
@@ -46,7 +46,8 @@ Resistance: TypeAlias = Callable[[Loads, Coordinates, Coordinates], Coordinates]
 class GravityField:
     """Uniform gravity, which changes the normal forces of loads. Its force on the loads themselves is a `LoadPotential`.
 
-    **Attributes**: `axis` of a load's position that it pulls against (0 across, 1 up, 2 along the rotor's axis); `g` m/s^2.
+    **Attributes**: `axis` of a load's position against which gravity acts (0 across, 1 up, 2 along the rotor's axis); `g`,
+    m/s^2.
     """
 
     axis: int
@@ -57,7 +58,7 @@ class GravityField:
 @final
 @dataclass(frozen=True)
 class LoadPotential:
-    """Potential energy of each load in its own position.
+    """Potential energy of each load as a function of its own position.
 
     The energy is a single-valued function of the position. Its mean torque over a turn is therefore 0.
 
@@ -75,9 +76,10 @@ class LoadPotential:
 @final
 @dataclass(frozen=True)
 class LoadResistance:
-    """Force on each load that takes energy out of its motion, such as the drag of the air.
+    """Force on each load that dissipates energy of its motion, such as air drag.
 
-    **Attributes**: `resistance` of loads at `u` with rates, the generalised force on each coordinate; `is_smooth`.
+    **Attributes**: `resistance`, function of the loads, `u` and the rates of `u`, returns the generalised force on each
+    coordinate; `is_smooth`: True if the force has all derivatives.
     """
 
     resistance: Resistance
@@ -91,10 +93,13 @@ class LoadResistance:
 @final
 @dataclass(frozen=True)
 class LoadInteraction:
-    """Forces between loads. They cancel in the torque on loads that lie together, and make the order of the loads count.
+    """Forces between loads. They cancel in the torque on coincident loads. With them the order of the loads matters.
 
-    **Attributes**: `energy` of the pairs, J, (count,); `resistance`, the generalised forces that take energy out of the
-    relative motion, or None; `validate_start`, which raises `InputError` if loads cannot start at `u` (..., count), or None.
+    **Attributes**
+
+    - `energy` of the pairs, J, (count,)
+    - `resistance`: generalised forces that dissipate energy of the relative motion, or None
+    - `validate_start`: function that raises `InputError` if loads cannot start at `u` (..., count), or None
     """
 
     energy: Energy
@@ -103,7 +108,7 @@ class LoadInteraction:
     is_smooth: ClassVar[bool] = False
 
     def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:
-        """Return the generalised forces on each load, those of the potential and those of the resistance."""
+        """Return the generalised forces on each load: those of the potential, and those of the resistance."""
         force = _potential_force(self.energy, loads, u)
         return [force] if self.resistance is None else [force, self.resistance(loads, u, rate)]
 
@@ -142,11 +147,15 @@ class RotorImbalance:
 
 
 class Friction(NamedTuple):
-    """Friction torque `lever` |N| on each load, N = reaction + normal . a, a the acceleration of the point that carries it.
+    """Friction torque `lever` |N| on each load.
 
-    `lever` (count,) m, signed as the torque on the load; `reaction` (count,) N; `normal` two (count,) arrays (across, up) in
-    kg, or None if the reaction does not depend on accelerations; `others` the levers of a load's further coordinates, if
-    friction acts on them; `one_sided`: True if there is no friction while N is negative.
+    N = reaction + normal . a is the normal force, a the acceleration of the point that carries the load.
+
+    - `lever` (count,) m, with the sign of the torque on the load
+    - `reaction` (count,) N
+    - `normal`: two (count,) arrays (across, up) in kg, or None if N does not depend on accelerations
+    - `others`: levers of a load's further coordinates, if friction acts on them
+    - `one_sided`: True if there is no friction while N is negative
     """
 
     lever: Array
@@ -160,18 +169,18 @@ class Friction(NamedTuple):
         return self.forces(a)[0]
 
     def forces(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
-        """Return the torque and the generalised forces on a load's further coordinates that friction acts on."""
+        """Return the torque of the friction, and its generalised forces on the further coordinates of a load."""
         reaction = self._reaction(a)
         size = jnp.maximum(reaction, 0.0) if self.one_sided else jnp.abs(reaction)
         return tuple(lever * size for lever in (self.lever, *self.others))
 
     def signed(self, a: Mapping[int, Array]) -> Friction:
-        """Return the friction linear in the accelerations, its reaction assumed to have the sign that it has at `a`."""
+        """Return friction that is linear in the accelerations: N keeps the sign that it has at `a`."""
         sign = jnp.where(self._reaction(a) < 0.0, 0.0 if self.one_sided else -1.0, 1.0)
         return self._replace(lever=self.lever * sign, others=tuple(lever * sign for lever in self.others))
 
     def linear(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
-        """Return the `forces` of a friction that is `signed` already."""
+        """Return the `forces` of a friction returned by `signed`."""
         reaction = self._reaction(a)
         return tuple(lever * reaction for lever in (self.lever, *self.others))
 
@@ -186,8 +195,10 @@ class Friction(NamedTuple):
 class ContactFriction:
     """Friction of each load against the rotor.
 
-    **Attributes**: `friction` of loads at `u` with rates, the rotor at a speed, under gravity by axis; see `Friction`.
-    `is_half_turn_symmetric`: True if the equations with it stay the same under phi + pi, -q.
+    **Attributes**
+
+    - `friction`: function of the loads, `u`, the rates of `u`, the rotor speed, and gravity by axis; it returns `Friction`
+    - `is_half_turn_symmetric`: True if phi -> phi + pi, q -> -q leaves the equations with the friction unchanged
     """
 
     friction: Callable[[Loads, Coordinates, Coordinates, Array, Mapping[int, Array]], Friction]
@@ -208,7 +219,7 @@ class DrillingSpinRelease:
 class SlipRelease:
     """Freedom of rolling loads to slide (`Spin.slip`).
 
-    The contact holds a force along the track up to `coefficient` times N. A slip below `width`, m/s, dies out.
+    The contact transmits a force along the track of at most `coefficient` times N. A slip below `width`, m/s, decays.
     """
 
     coefficient: Array
@@ -221,8 +232,13 @@ class SlipRelease:
 class SupportForce:
     """Nonlinear support of a machine.
 
-    **Attributes**: `rows` of a machine, (k, nd), which give the displacements x of the supported point, see `Machine.rows_at`;
-    `energy` of x, J; `resistance` of x and its rate, the dissipative force on the foundation, (k,) N, or None; `is_smooth`.
+    **Attributes**
+
+    - `rows`: function of the machine that returns rows (k, nd); rows q are the displacements x of the supported point, see
+      `Machine.rows_at`
+    - `energy`, J: function of x
+    - `resistance`: function of x and its rate, the dissipative force on the foundation, (k,) N; or None
+    - `is_smooth`: True if the force has all derivatives
     """
 
     rows: Callable[[Machine], Array]
@@ -231,7 +247,7 @@ class SupportForce:
     is_smooth: bool = False
 
     def force(self, displacement: Array, velocity: Array) -> Array:
-        """Return the force on the foundation, (k,) N. The force on the carrier is opposite."""
+        """Return the force on the foundation, (k,) N. The force on the carrier has the opposite sign."""
         force = jax.grad(self.energy)(displacement)
         return force if self.resistance is None else force + self.resistance(displacement, velocity)
 

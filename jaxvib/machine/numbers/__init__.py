@@ -1,6 +1,6 @@
-"""Units, bounds and words of the numbers of a scene: metadata of the fields that hold them.
+"""Units, bounds and words of the numbers of a scene, as metadata of the fields.
 
-Constructors read their arguments by it; `named` names the numbers of a whole scene with it.
+Constructors use this metadata to read their arguments. The module `named` uses it to name the numbers of a whole scene.
 """
 
 from __future__ import annotations
@@ -26,11 +26,15 @@ _KEY = "number"
 
 
 class NumberSpec(NamedTuple):
-    """Meaning of the number, or of the array of numbers, in a field of a part of a scene; made by `unit`.
+    """Meaning of a number, or of an array of numbers, in a field of a part of a scene; `unit` returns it.
 
-    **Attributes**: `units` of all entries, or one for each of them; `bounds`; `words`: its name for a designer; `each`: the
-    owner of an entry of an array, such as "platform", "" for a single number; `typical`: the size of a number that may be 0,
-    in SI, None if 0 is its bound.
+    **Attributes**
+
+    - `units`: one unit for all entries, or one for each entry
+    - `bounds`
+    - `words`: name for a designer
+    - `each`: owner of an entry of an array, such as "platform"; "" for a single number
+    - `typical`: typical size in SI of a number that may be 0; None if 0 is its bound
     """
 
     units: tuple[str, ...]
@@ -41,17 +45,17 @@ class NumberSpec(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """The unit, or the units of the entries, for tables."""
+        """Unit, or units of the entries, for tables."""
         return ", ".join(self.units)
 
     @property
     def zero_is_absent(self) -> bool:
-        """True if a 0 in an array stands for something that the machine does not have, such as a spring."""
+        """True if a 0 in an array means that the machine does not have the part, such as a spring."""
         return bool(self.each) and self.bounds.low == 0.0
 
 
 PLAIN = NumberSpec(("",), Bounds())
-"""Meaning of a number whose field has no metadata: any number, in SI."""
+"""Spec of a number whose field has no metadata: any number, in SI."""
 
 
 def unit(
@@ -64,10 +68,10 @@ def unit(
     each: str = "",
     typical: float | None = None,
 ) -> Mapping[str, NumberSpec]:
-    """Metadata of a field of a machine, a load, a drive or an effect that holds a number or an array of numbers.
+    """Return the metadata of a field of a machine, a load, a drive or an effect with a number or an array of numbers.
 
-    **Arguments**: as the attributes of `NumberSpec`; `low` and `high` are allowed themselves unless they are open. Entries with
-    `each="load"` may be one number that all loads share; in `words` "{load}" stands for the kind of load.
+    **Arguments**: as the attributes of `NumberSpec`. The bounds `low` and `high` are allowed values unless they are open. With
+    `each="load"`, one number may hold for all loads. In `words`, "{load}" stands for the kind of load.
 
     >>> import equinox as eqx
     >>> class Seal(eqx.Module):
@@ -80,16 +84,16 @@ def unit(
 
 @functools.lru_cache(maxsize=256)
 def number_specs(part: type) -> Mapping[str, NumberSpec]:
-    """The meaning of each number of a part of a scene by the name of its field."""
+    """Return the spec of each number of a part of a scene, by the name of its field."""
     fields = dataclasses.fields(part)
     found = {field.name: field.metadata[_KEY] for field in fields if _KEY in field.metadata}
     return {name: spec._replace(words=spec.words or name.replace("_", " ")) for name, spec in found.items()}
 
 
 def read_numbers(part: type[eqx.Module], section: str, length: int | None = None, /, **values: Numbers) -> dict[str, Array]:
-    """Arguments of a constructor as arrays in SI units, checked by the metadata of the fields of their names.
+    """Return the arguments of a constructor as arrays in SI units, validated by the metadata of the fields of the same names.
 
-    **Arguments**: `section`: the table of a scene file, for messages, or ""; `length` of arrays, None for any.
+    **Arguments**: `section`, the table of a scene file for messages, or ""; `length` of arrays, None for any length.
 
     **Raises** `InputError` for a wrong unit, a value out of bounds, and a list of another length.
 

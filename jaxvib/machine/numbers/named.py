@@ -1,6 +1,6 @@
 """Numbers of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
 
-Every floating-point number of a machine, a load, a drive or an effect has a name; `numbers` has their units, bounds and words.
+Every floating-point number of a machine, a load, a drive or an effect has a name. Its unit, bounds and words are in `numbers`.
 """
 
 from __future__ import annotations
@@ -33,10 +33,15 @@ _SECTIONS: dict[str, type[eqx.Module]] = {"machine": Machine, "loads": Loads, "d
 
 
 class NamedNumber(NamedTuple):
-    """A number of a scene, or an array of numbers with one unit.
+    """Number of a scene, or array of numbers with one unit.
 
-    **Attributes**: `name`; `path` of attributes and indices from the scene to the array; `entry` of the array, None for all of
-    it; `size`: how many numbers it is; `spec` of the field.
+    **Attributes**
+
+    - `name`
+    - `path` of attributes and indices from the scene to the array
+    - `entry` of the array; None for the whole array
+    - `size`: count of the numbers
+    - `spec` of the field
     """
 
     name: str
@@ -47,32 +52,35 @@ class NamedNumber(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """The unit of the number, or of all entries."""
+        """Unit of the number, or of all entries."""
         return self.spec.units[self.entry if self.entry is not None and len(self.spec.units) > 1 else 0]
 
     @property
     def entries(self) -> set[tuple[_Path, int]]:
-        """Each number by itself, to find numbers that two names share."""
+        """Path and index of each single number, by which numbers that two names share are found."""
         return {(self.path, k) for k in (range(self.size) if self.entry is None else (self.entry,))}
 
     def leaf(self, scene: Scene) -> Array:
-        """The array that the number is in."""
+        """Return the array that contains the number."""
         found: Any = scene
         for step in self.path:
             found = found[step] if isinstance(step, int) else getattr(found, step)
         return found
 
     def read(self, scene: Scene) -> Array:
-        """The values (size,), SI."""
+        """Return the values (size,), SI."""
         leaf = jnp.asarray(self.leaf(scene))
         return jnp.reshape(leaf if self.entry is None else leaf[self.entry], (-1,))
 
     def value(self, given: Number, field: str) -> float:
-        """A value of a user in SI. **Raises** `InputError`, of `field`, for a wrong unit and a value out of bounds."""
+        """Return a user's value in SI.
+
+        **Raises** `InputError` that names `field`, for a wrong unit and a value out of bounds.
+        """
         return float(number(given, self.unit, field, **self.spec.bounds._asdict()))
 
     def single(self, scene: Scene) -> tuple[NamedNumber, ...]:
-        """The numbers of an array, each with its own name; a single number itself."""
+        """Return the numbers of an array, each with its own name; for a single number, the number alone."""
         if self.entry is not None or not np.ndim(self.leaf(scene)):
             return (self,)
         return tuple(self._replace(name=f"{self.name}[{k}]", entry=k, size=1) for k in range(self.size))
@@ -82,7 +90,7 @@ class NamedNumber(NamedTuple):
         return self.entry is None and self.spec.zero_is_absent and np.ndim(self.leaf(scene)) > 0
 
     def words(self, scene: Scene) -> list[str]:
-        """Name of each number for a designer, such as "stiffness of support 2"."""
+        """Return the name of each number for a designer, such as "stiffness of support 2"."""
         which = self.path[1] if self.path[0] == "exciters" else 0
         exciter = scene.exciters[which if isinstance(which, int) else 0]
         load = "load" if exciter.loads is None else exciter.loads.kind.rpartition("_")[2]
@@ -105,7 +113,7 @@ class NamedNumber(NamedTuple):
         return [f"{words} {k + 1}" if several else words for k in which]
 
     def _numbered(self, scene: Scene, words: str) -> str:
-        """The words with the number of an effect that the scene has several of."""
+        """Return `words`, with the number of the effect if the scene has several effects of its kind."""
         if self.path[0] != "effects" or not isinstance(index := self.path[1], int):
             return words
         kinds = [effect.kind for effect in scene.effects]
@@ -117,7 +125,9 @@ class NamedNumber(NamedTuple):
 
 
 def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
-    """All continuous numbers of a scene by name; an array of one unit has one name, of several units one for each entry.
+    """Return all continuous numbers of a scene by name.
+
+    An array of one unit has one name. In an array of several units each entry has its own name.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -137,13 +147,13 @@ def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
 
 
 def _is_continuous(value: object) -> bool:
-    """True for a floating-point number or an array of them, traced ones included."""
+    """True for a floating-point number or an array of them, also if it is traced."""
     known = isinstance(value, (float, np.generic, np.ndarray, jax.Array))
     return known and jnp.issubdtype(jnp.result_type(value), jnp.floating)
 
 
 def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
-    """The parts of a scene, with their names and paths; effects that may stand several times are counted, from 0."""
+    """Yield the name, the path and the part of each part of a scene. Repeatable effects are numbered from 0."""
     yield "machine", ("machine",), scene.machine
     for k, exciter in enumerate(scene.exciters):
         place, path = scene.place_of(k), ("exciters", k)
@@ -161,7 +171,7 @@ def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
 
 
 def _steps(part: eqx.Module, steps: Sequence[Any]) -> tuple[_Path, NumberSpec]:
-    """The path within a part, and the spec of the field that it ends in."""
+    """Return the path within a part, and the spec of the field at its end."""
     inner: list[str | int] = []
     spec, owner = PLAIN, cast(Any, part)
     for step in steps:
@@ -176,10 +186,10 @@ def _steps(part: eqx.Module, steps: Sequence[Any]) -> tuple[_Path, NumberSpec]:
 
 
 def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
-    """The number, or the array of numbers, of that name.
+    """Return the number, or the array of numbers, with the name `name`.
 
-    **Raises** `InputError`, of `field`, for a name that the scene does not have, and for one that is no continuous number, such
-    as a count.
+    **Raises** `InputError` that names `field`, for a name that the scene does not have, and for the name of something other
+    than a continuous number, such as a count.
     """
     there, field = numbers_of(scene), f"{field}.{name}"
     if not isinstance(name, str):
@@ -196,7 +206,7 @@ def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
 
 
 def _why_unnamed(scene: Scene, name: str) -> str:
-    """The reason why a name has no number."""
+    """Return the reason why `name` is not the name of a number."""
     part, _, last = name.rpartition(".")
     owner = next((each for prefix, _, each in _parts(scene) if prefix == part), None)
     if last not in getattr(type(owner), "__dataclass_fields__", ()):
@@ -208,7 +218,7 @@ def _why_unnamed(scene: Scene, name: str) -> str:
 
 
 def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array | np.ndarray) -> Scene:
-    """The scene with these values (sum of the sizes,), SI, one after the other."""
+    """Return the scene with `values` (sum of the sizes,), SI, for the numbers `found` in their order."""
     leaves: dict[_Path, Array] = {}
     start = 0
     for each in found:
@@ -220,9 +230,10 @@ def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array | np.n
 
 
 def present_numbers(scene: Scene, found: NamedNumber, field: str) -> tuple[NamedNumber, ...]:
-    """The array itself, or its entries other than 0 if it keeps its zeros; what is not there is added only if it is named.
+    """Return the array, or only its entries other than 0 if the array keeps its zeros.
 
-    **Raises** `InputError`, of `field`, for an array that is 0 in every entry.
+    An absent spring or damper is added only if the user names its entry. **Raises** `InputError` that names `field`, for an
+    array that keeps its zeros and is 0 in every entry.
     """
     values = np.asarray(found.leaf(scene))
     if not found.keeps_zeros(scene) or np.all(values != 0.0):
@@ -234,13 +245,13 @@ def present_numbers(scene: Scene, found: NamedNumber, field: str) -> tuple[Named
 
 
 def put_present(scene: Scene, found: NamedNumber, value: float) -> Scene:
-    """The scene with this value in every entry; those that are absent stay so, see `present_numbers`."""
+    """Return the scene with `value` in every entry. Absent springs and dampers stay absent, see `present_numbers`."""
     now, new = found.read(scene), jnp.full(found.size, value)
     return put_numbers(scene, (found,), jnp.where(now != 0.0, new, now) if found.keeps_zeros(scene) else new)
 
 
 def read_value(name: str, value: Number) -> float:
-    """A value for the number of that name of any scene, in SI.
+    """Return a value in SI for the number `name` of any scene.
 
     **Raises** `InputError` for a name that no part of a scene has, a wrong unit, and a value out of bounds.
     """
@@ -252,7 +263,7 @@ def read_value(name: str, value: Number) -> float:
 
 
 def spec_of(name: str) -> NumberSpec | None:
-    """The meaning of a number by its name alone: that of the first kind of part that has it, None if no part has it."""
+    """Return the spec of a number from its name alone: that of the first kind of part with such a field, otherwise None."""
     part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
     part = part.removeprefix("exciters.")
     if part.startswith("effects."):

@@ -106,7 +106,7 @@ class PlaneBody(Machine):
         )
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the motion of the axis at the point `at`, and the turn of the exciter's housing with the body."""
+        """Return the motion of the axis at the point `at`, and the rotation of the exciter's housing with the body."""
         return Mount(rows=(self.rows_at(at, "at"),), axes=(0, 1), turn=jnp.asarray(np.eye(3)[2], self.mass.dtype))
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
@@ -119,7 +119,7 @@ class PlaneBody(Machine):
 
 
 def _rows(at: Array) -> Array:
-    """Rows (2, 3) of a point."""
+    """Return the rows (2, 3) of the point `at`."""
     lever = jnp.stack([-at[1], at[0]])
     return jnp.concatenate([jnp.eye(2, dtype=at.dtype), lever[:, None]], axis=1)
 
