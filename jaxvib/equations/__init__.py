@@ -1,1 +1,1 @@
-"""The one place where a scene becomes equations: full, averaged, linear, forces."""
+"""Equations of a scene: full, averaged and linear equations, forces, energy and power. Scenes become equations only here."""

@@ -1,4 +1,4 @@
-"""Coincident loads as rigid bodies on the linear carrier, and the torques on them."""
+"""Coincident loads as rigid bodies on the linear carrier, and torques on these bodies."""
 
 from __future__ import annotations
 
@@ -19,19 +19,23 @@ from jaxvib.machine.scene import Scene
 __all__ = ["COINCIDENT_TERMS", "CoincidentModel", "Points", "coincident_model", "light_friction", "require_coincident"]
 
 COINCIDENT_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
-"""Terms that exact jams include. Forces between loads cancel in the torque on loads that lie together."""
+"""Terms that exact jams include. Forces between loads cancel in the torque on coincident loads."""
 
 Points = Array | np.ndarray
 
 
 class CoincidentModel(eqx.Module):
-    """A scene whose loads are G bodies that do not change their shape, assembled once a question and handed on.
+    """Scene whose loads are G rigid bodies. It is assembled once for each analysis and passed on.
 
-    Loads that are alike are one body, loads that differ a body each.
+    Identical loads are one body. If loads differ, each of them is a body.
 
-    **Attributes**: `linear` the carrier with its loads; `loads`, `effects` of the scene; `unbalance` S (G,) kg m, `inertia`
-    I = sum kappa m R^2 and `drag` sum b_W R^2 (G,) of each body; `offsets` (count,) rad: where each load is on its body, an
-    angle ahead of the body's own; `half_turn` see `has_half_turn` of effects.
+    **Attributes**
+
+    - `linear`: carrier with its loads
+    - `loads` and `effects` of the scene
+    - `unbalance` S, kg m, `inertia` I = sum kappa m R^2 and `drag` sum b_W R^2 of each body, (G,)
+    - `offsets` (count,) rad: angle of each load minus the angle of its body
+    - `half_turn`: see `has_half_turn` of effects
     """
 
     linear: JammedModel
@@ -44,19 +48,19 @@ class CoincidentModel(eqx.Module):
     half_turn: bool = eqx.field(static=True)
 
     def circle(self, phi: Points) -> tuple[Array, Array]:
-        """e(phi) and de/dphi (np, ...): where a load on the unit circle is in the port's directions, and how it moves."""
+        """Return e(phi) and de/dphi (np, ...): a point of the unit circle in the port's directions, and its derivative."""
         cos, sin = jnp.cos(phi), jnp.sin(phi)
         axes = self.linear.mount.axes
         return jnp.stack([(cos, sin)[axis] for axis in axes]), jnp.stack([(-sin, cos)[axis] for axis in axes])
 
     def each_load(self, phi: Points, rate: Array) -> tuple[Array, Array]:
-        """Angles and rates of bodies (G, M) as those of each load (count, M)."""
+        """Return the angles and rates of each load (count, M) from those of the bodies (G, M)."""
         return jnp.asarray(phi) + self.offsets[:, None], jnp.broadcast_to(rate, (self.loads.count, phi.shape[1]))
 
     def rotor_torque(self, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
-        """The rotor's torque on loads at angles `phi`, N m: viscous resistance and dry friction.
+        """Return the torque of the rotor on loads at the angles `phi`, N m: viscous resistance and dry friction.
 
-        `a` (np, ...): the port's acceleration, m/s^2.
+        `a` (np, ...) is the acceleration of the port, m/s^2.
         """
         loads, u, rates = self.loads, (jnp.asarray(phi),), (rate,)
         at = dict(zip(self.linear.mount.axes, a, strict=True))
@@ -66,7 +70,7 @@ class CoincidentModel(eqx.Module):
         return sum((friction.torque(at) for friction in found), torque)
 
     def torque_of_each(self, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
-        """The torque of the rotor and of effects on loads at angles `phi`, N m; `a` as in `rotor_torque`."""
+        """Return the torque of the rotor and of effects on loads at the angles `phi`, N m; `a` as in `rotor_torque`."""
         torque, u = self.rotor_torque(phi, rate, speed, a), (jnp.asarray(phi),)
         for term in terms_of(self.effects, LoadPotential):
             ((force,),) = term.forces(self.loads, u, (rate,))
@@ -74,8 +78,10 @@ class CoincidentModel(eqx.Module):
         return torque
 
     def torque(self, phi: Points, rate: Array, speed: Array, a: Array, of_each: Callable[..., Array] | None = None) -> Array:
-        """The torque on the bodies at angles `phi` (G, M), N m, the sum `of_each` (`torque_of_each`) over the loads of each,
-        (G, M); `a` (np, M)."""
+        """Return the torque on the bodies at the angles `phi` (G, M), (G, M) N m.
+
+        It is the sum over the loads of each body of `of_each`, by default `torque_of_each`. `a` is (np, M).
+        """
         of_each = self.torque_of_each if of_each is None else of_each
         if not self.loads.alike:
             return jax.vmap(lambda p, r, x: of_each(p, r, speed, x), in_axes=1, out_axes=1)(phi, rate, a)
@@ -84,8 +90,10 @@ class CoincidentModel(eqx.Module):
         return jnp.sum(of_each(*self.each_load(phi, rate), speed, a[:, None]), axis=0, keepdims=True)
 
     def torque_slopes(self, phi: Points, rate: Array, speed: Array, a: Array) -> tuple[Array, Array, Array | None]:
-        """Derivatives of `torque` by angle and by rate of each body (G, M) and by the port's acceleration (np, G, M), None
-        without friction, which alone feels it."""
+        """Return the derivatives of `torque` with respect to angle and rate of each body (G, M) and to `a` (np, G, M).
+
+        The last one is None without friction, because no other torque depends on the acceleration `a` of the port.
+        """
         angle = jnp.asarray(phi)
         by_angle = jax.jvp(lambda p: self.torque(p, rate, speed, a), (angle,), (jnp.ones_like(angle),))[1]
         by_rate = jax.jvp(lambda r: self.torque(angle, r, speed, a), (rate,), (jnp.ones_like(rate),))[1]
@@ -97,7 +105,7 @@ class CoincidentModel(eqx.Module):
 
 
 def coincident_model(linear: JammedModel) -> CoincidentModel:
-    """The coincident loads as bodies on their carrier. **Raises** `InputError` for a rotor out of balance."""
+    """Return the coincident loads as bodies on their carrier. **Raises** `InputError` for an unbalanced rotor."""
     loads, effects = linear.loads, linear.scene.all_effects
     _require_balance(effects)
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
@@ -110,7 +118,10 @@ def coincident_model(linear: JammedModel) -> CoincidentModel:
 
 
 def require_coincident(scene: Scene) -> CircularLoads:
-    """The loads of a scene whose jams repeat. **Raises** `InputError` for a rotor out of balance, and as `jammed_loads`."""
+    """Return the loads of a scene whose jams are periodic.
+
+    **Raises** `InputError` for an unbalanced rotor, and as `jammed_loads`.
+    """
     loads = jammed_loads(scene)
     _require_balance(scene.all_effects)
     return loads
@@ -122,8 +133,10 @@ def _require_balance(effects: tuple[Effect, ...]) -> None:
 
 
 def light_friction(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
-    """Torque of dry friction on light loads that turn at `omega`, N m, all together: a carrier that hardly moves adds nothing
-    to their radial load, and their weight, on the average of a turn, neither."""
+    """Return the sum of the torques of dry friction on light loads that turn at `omega`, N m.
+
+    The motion of the carrier is too small to change the radial load, and the mean contribution of the weight over a turn is 0.
+    """
     phi, rate = (jnp.zeros((loads.count,)),), (jnp.full((loads.count,), omega),)
     found = (term.friction(loads, phi, rate, speed, {}) for term in terms_of(effects, ContactFriction))
     return sum((jnp.sum(friction.torque({})) for friction in found), jnp.zeros_like(omega))

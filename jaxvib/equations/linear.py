@@ -233,13 +233,13 @@ def natural_frequencies(scene: Scene) -> Array:
 
         det(K - w^2 (M + sum_j m_j B^T B)) = 0
 
-    **Arguments**: `scene`; only its machine and its loads count.
+    **Arguments**: `scene`, of which only the machine and the loads matter.
 
     **Returns** an array (nd,), rad/s; typical: 10 to 100 for platforms on springs, 100 to 500 for rotors. Derivatives are
     finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
 
-    **Raises** `ComputationError` (status "lost_digits") if rounding hides a frequency, as that of a soft spring beside a link
-    1e8 times as stiff does in single precision; under a JAX transformation it is NaN.
+    **Raises** `ComputationError` (status "lost_digits") if rounding hides a frequency, for example in single precision that of
+    a soft spring beside a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

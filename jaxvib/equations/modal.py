@@ -18,14 +18,14 @@ class ModalResponse(eqx.Module):
 
         D(w)^-1 = Z diag(1 / (i w - s)) W,      e^H B D(w)^-1 B^T e = sum_k r_k / (i w - s_k)
 
-    A frequency costs two products with matrices for a vector, and O(nd) for the receptance of the mount. Derivatives by
-    numbers of the scene do not pass through it: eigenvectors of equal frequencies have none.
+    For each frequency, a vector costs two products with matrices, and the receptance of the mount costs O(nd). There are no
+    derivatives with respect to numbers of the scene, because eigenvectors of equal frequencies have none.
 
     **Attributes**
 
-    - `poles` s (2 nd,) 1/s, det(K + s C + s^2 M) = 0; `outputs` Z (nd, 2 nd); `inputs` W (2 nd, nd)
-    - `residues` r (2 nd,) of the receptance of the mount; `norms` (3,), largest row sums of |K|, |C| and |M|
-    - `is_rough`: True if nearly parallel eigenvectors may cost more than 2 digits
+    - `poles` s (2 nd,) 1/s, the roots of det(K + s C + s^2 M) = 0; `outputs` Z (nd, 2 nd); `inputs` W (2 nd, nd)
+    - `residues` r (2 nd,) of the receptance of the mount; `norms` (3,), the largest row sums of |K|, |C| and |M|
+    - `is_rough`: True if the result may lose more than 2 digits because eigenvectors are nearly parallel
     """
 
     poles: Array
@@ -38,8 +38,8 @@ class ModalResponse(eqx.Module):
     def receptance(self, omega: Array, factor: Array) -> Array:
         """Return `factor` (scalar) times e^H B D^-1 B^T e, m/N, the displacement of the mount per force that turns with it.
 
-        The factor is inside the sum because the derivative by `omega` (scalar, rad/s) is then one sum: 13 times as fast. In
-        real numbers an undamped carrier has an imaginary part of exactly 0.
+        The factor is inside the sum because the derivative with respect to `omega` (scalar, rad/s) is then one sum, which is
+        13 times as fast. The sum uses real numbers because the imaginary part of an undamped carrier is then exactly 0.
         """
         decay, apart = -self.poles.real, omega - self.poles.imag
         weight = factor / (decay**2 + apart**2)
@@ -51,7 +51,7 @@ class ModalResponse(eqx.Module):
         return self.outputs @ ((self.inputs @ force) / jax.lax.complex(-self.poles.real, omega - self.poles.imag))
 
     def norm(self, omega: Array) -> Array:
-        """Return a bound of the row sums of |D(w)|, N/m."""
+        """Return an upper bound of the row sums of |D(w)|, N/m."""
         return self.norms @ jnp.stack([jnp.ones_like(omega), omega, omega**2])
 
 
@@ -62,20 +62,20 @@ def modal_response(
 
         (Omega q)' = Omega v,      v' = -Omega (Omega q) - Gamma v + X^T f,      Gamma = X^T C X
 
-    in coordinates q of the undamped modes X of frequencies Omega. Proportional damping couples no modes: each mode is then a
-    block of its own, solved to rounding, and no case needs to be distinguished.
+    q are the coordinates of the undamped modes X with the frequencies Omega. Proportional damping does not couple the modes:
+    each mode is then a separate block, which is solved to rounding, and needs no separate case.
 
-    **Arguments**: undamped `frequencies` (nd,) rad/s and mass-normalised `shapes` (nd, nd); `stiffness` K,
+    **Arguments**: undamped `frequencies` (nd,) rad/s and `shapes` (nd, nd), normalised by the mass matrix; `stiffness` K,
     `damping` C and `mass` M (nd, nd); `direction` B^T e (nd,).
     """
     n, eps = frequencies.shape[0], jnp.finfo(frequencies.dtype).eps
     positive = jnp.where(frequencies > 0.0, frequencies, jnp.inf)
-    # A motion free to drift gets a spring so soft that no load speed notices it: q must follow from Omega q.
+    # q must follow from Omega q. A motion that is free to drift therefore gets a spring, too soft to matter at any load speed.
     free = jnp.where(jnp.isfinite(jnp.min(positive)), jnp.min(positive), 1.0) * eps ** (1 / 3)
     stiff = jnp.where(frequencies > 0.0, frequencies, free)
     coupling, rounding = shapes.T @ damping @ shapes, jnp.abs(shapes.T) @ jnp.abs(damping) @ jnp.abs(shapes)
     coupling = jnp.where(jnp.abs(coupling) > 4.0 * n * eps * rounding, coupling, 0.0)
-    # Critical damping has one eigenvector for two poles: two thirds of the digits away it has two.
+    # With critical damping two poles share one eigenvector. A relative change of eps^(2/3) in the damping gives two.
     critical = jnp.abs(jnp.diagonal(coupling) / (2.0 * stiff) - 1.0) < eps ** (2 / 3)
     coupling = coupling * (1.0 + eps ** (2 / 3) * jnp.diag(critical.astype(coupling.dtype)))
     blocks = jnp.zeros((n, 2, n, 2), coupling.dtype)  # the two states of a mode side by side

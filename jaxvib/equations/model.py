@@ -1,4 +1,4 @@
-"""Model of a scene: its matrices and places, assembled once per question and passed on."""
+"""Model of a scene: its matrices and places, assembled once for each analysis and passed on."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ __all__ = ["Model", "assemble"]
 
 
 class Model(eqx.Module):
-    """A scene with its numbers as matrices.
+    """Scene with its matrices.
 
-    **Attributes**: `scene`; `carrier`, see `Carrier`; `mounts` of its exciters, see `Mount`, and `mount`, that of the only one;
-    `supports`, rows (k, nd) of the place of each `SupportForce` of the scene's effects.
+    **Attributes**
+
+    - `scene`, and its `carrier`, see `Carrier`
+    - `mounts` of its exciters, see `Mount`; `mount`, that of the only exciter
+    - `supports`: rows (k, nd) of the place of each `SupportForce` of the scene's effects
     """
 
     scene: Scene
@@ -44,7 +47,7 @@ class Model(eqx.Module):
         return force
 
     def natural_force(self, unit: State) -> Array:
-        """Return S n^2, N: the unbalance of the loads turns at the speed n of the rotor; `unit`, the scene's natural units."""
+        """Return S n^2, N: force of the loads' unbalance at the rotor speed n. `unit` contains the scene's natural units."""
         speeds = [each.rate[0] for each in unit.exciters if each.rate] or [unit.velocity / unit.displacement]
         speed = functools.reduce(jnp.maximum, speeds)
         return jnp.mean(jnp.diagonal(self.carrier.mass)) * unit.displacement * speed**2

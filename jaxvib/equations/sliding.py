@@ -1,4 +1,4 @@
-"""Contact of rolling loads with their track: the force that rolling needs, Coulomb's limit, and sliding."""
+"""Contact of rolling loads with their track: force required for rolling, Coulomb's limit, sliding."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ __all__ = ["ContactSolution", "Kinematics", "contact_force", "dot", "kinematics"
 
 
 class Kinematics(NamedTuple):
-    """Columns of J = dp/du of the loads, and c = (dJ/dt) u'; each an x, a y and, if loads move along the axis, a z.
+    """`columns` of J = dp/du of the loads, and `curvature` c = (dJ/dt) u'.
 
-    `lengths` of the columns are known if they are constant along the track, see `Loads.tangent_lengths`.
+    Each is (x, y), or (x, y, z) if the loads move along the axis. `lengths` contains the lengths of the columns if they are
+    constant along the track, see `Loads.tangent_lengths`; otherwise it is None.
     """
 
     columns: list[tuple[Array, ...]]
@@ -48,7 +49,7 @@ class Kinematics(NamedTuple):
 
 
 def kinematics(loads: Loads, u: Coordinates, rate: Coordinates) -> Kinematics:
-    """Return J and (dJ/dt) u' of all loads at once (the position acts elementwise)."""
+    """Return J and (dJ/dt) u' of all loads at once, because the position acts elementwise."""
 
     def along(direction: Coordinates) -> Callable[..., tuple[Array, ...]]:
         return lambda *v: jax.jvp(loads.position, v, direction)[1]
@@ -64,9 +65,10 @@ def contact_force(
 
         [kappa m J^T (J u'' + (dJ/dt) u') + m J^T a - Q]_i / |dp/du_i|
 
-    It is what the motion needs besides the generalised `force` Q.
+    It is the force that the motion requires in addition to the generalised `force` Q.
 
-    **Arguments**: `change` u''; `a` the acceleration of the points that carry the loads, by axis; `kappa`, 1 for mass alone.
+    **Arguments**: `change` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`, which is 1 for the
+    mass without rotation.
     """
     turning, needed = found.turning, []
     for i, (column, metric, f, size) in enumerate(zip(found.columns, found.metric, force, found.sizes, strict=True)):
@@ -78,7 +80,7 @@ def contact_force(
 
 
 class ContactSolution(NamedTuple):
-    """Inertia factor, generalised force and friction of loads, each of which rolls or slides."""
+    """Inertia factor `kappa`, generalised `force` and `friction` of loads, each of which either rolls or slides."""
 
     kappa: Array
     force: list[Array]
@@ -97,10 +99,15 @@ def resolve_contact(
     centre: Sequence[Array],
     friction: Sequence[Friction],
 ) -> ContactSolution:
-    """Decide from the motion in which all loads roll which of them slide, and return the forces on each.
+    """Decide which loads slide, from the motion in which all of them roll, and return the forces on each load.
 
-    **Arguments**: `needed`, the force along the track in that motion, N; `a`, its acceleration of the points that carry loads;
-    generalised forces on a load that is `rolling`, and at its `centre` alone; `friction` of the rolling.
+    **Arguments**
+
+    - `needed`: force along the track in the motion in which all loads roll, N
+    - `a`: acceleration in that motion of the points that carry the loads, by axis
+    - `rolling`: generalised forces on loads that roll
+    - `centre`: generalised forces at the centres of the loads, without those of the contact
+    - `friction` of rolling loads
     """
     kappa = loads.inertia_factor()
     normal = normal_force.at(a)
@@ -112,7 +119,7 @@ def resolve_contact(
     size = jnp.sqrt(jnp.where(slides, dot(along, along), 1.0))
     levers = [jnp.where(slides, limit.coefficient * f / size, 0.0) * arm for f, arm in zip(along, found.sizes, strict=True)]
     rubbing = Friction(levers[0], normal_force.reaction, normal_force.normal, tuple(levers[1:]), loads.one_sided).signed(a)
-    # A slip within the width dies out while the load rolls.
+    # A slip smaller than the width decays while the load rolls.
     dying = [arm * kappa * hold * c / limit.width for c, arm in zip(slip, found.sizes, strict=True)]
     force = [jnp.where(slides, c, r - d) for c, r, d in zip(centre, rolling, dying, strict=True)]
     kept = [
@@ -125,7 +132,7 @@ def resolve_contact(
 
 
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:
-    """Return the rate of the slip along each coordinate: `change` (c')_t and the part of the turning tangents."""
+    """Return the rate of the slip along each coordinate: `change` (c')_t, and the part due to the rotation of the tangents."""
 
     def tangents(*v: Array) -> list[list[Array]]:
         columns = [jax.jvp(loads.position, v, _unit(v, i))[1] for i in range(len(v))]

@@ -1,1 +1,1 @@
-"""The parameters of a scene: machine, loads, drive, effects; frozen, without time."""
+"""Parts of a scene: machine, loads, drive and effects. They are immutable parameters and contain no time."""

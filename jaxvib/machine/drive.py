@@ -88,11 +88,11 @@ class Clockwise(Drive):
         self.drive, self.speed, self.kind = drive, drive.speed, drive.kind
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
-        """Return the speed of the drive, negative."""
+        """Return the speed of the drive with the opposite sign."""
         return -self.drive.rotor_speed(t, _mirrored(rotor))
 
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
-        """Return the angle of the drive, negative."""
+        """Return the angle of the drive with the opposite sign."""
         return -self.drive.rotor_angle(t, _mirrored(rotor))
 
     def rotor_acceleration(self, t: Array) -> Array | None:
@@ -106,7 +106,7 @@ class Clockwise(Drive):
         return None if motor is None else (-motor[0], motor[1])
 
     def jump_ts(self) -> tuple[Array, ...]:
-        """Return the times of the drive."""
+        """Return the times of the jumps of the drive."""
         return self.drive.jump_ts()
 
 
@@ -207,7 +207,7 @@ class Motor(Drive):
         return rotor[0]
 
     def rotor_acceleration(self, t: Array) -> None:
-        """Return None: it follows from the torques."""
+        """Return None: the acceleration follows from the torques."""
 
     def torque_and_inertia(self, speed: Array) -> tuple[Array, Array]:
         """Return `torque` and `inertia`."""

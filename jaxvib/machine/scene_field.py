@@ -1,4 +1,4 @@
-"""Field of a result that holds the scene, as TOML in files, with the names of coordinates and loads."""
+"""Field of a result that contains the scene: its TOML text for files, and the names of coordinates and loads."""
 
 from __future__ import annotations
 
@@ -21,4 +21,4 @@ def _labels(scene: Scene) -> dict[str, Sequence[Any]]:
 
 
 SCENE = as_text(scene_to_toml, scene_from_toml, _labels)
-"""Metadata of a result's field that holds a scene."""
+"""Metadata of a result's field that contains a scene."""

@@ -36,10 +36,10 @@ class TorusBalls(Loads):
         N = m (B f'^2 sin a + rho a'^2 - n . (port's acceleration + gravity upward))
 
     - w is the rotor speed. A ball rolls without slip and without drilling spin
-    - Its rotation adds the inertia kappa - 1 and the terms with w, which do no work: with them the rolling enters by B f' (f' -
-      w) and not by B f'^2, and a ball that turns with the tube feels the centrifugal force of its mass alone
+    - Its rotation adds the inertia kappa - 1 and the terms with w, which do no work. With them the rotation contributes
+      B f' (f' - w) instead of B f'^2; the centrifugal force on a ball that turns with the tube is then that of its mass alone
     - The acceleration of the wall when w changes is neglected, as in the gyroscopic matrix of a rotor
-    - On the equator the ball is that of a plane track of radius R + rho
+    - A ball on the equator moves like a ball in a plane track of radius R + rho
 
     **Attributes** (scalar, or (count,) for `mass` and `drag`); typical values: see `torus_balls`
 
@@ -83,7 +83,7 @@ class TorusBalls(Loads):
         return -quarter, quarter
 
     def offsets(self) -> Array:
-        """Return angles side by side on the outer equator, 2 arcsin(r/(R + rho)) apart."""
+        """Return the angles of balls side by side on the outer equator, 2 arcsin(r/(R + rho)) apart."""
         return side_by_side(self.count, self.ball_radius / (self.radius + self.gap))
 
     def inertia_factor(self) -> Array:
@@ -104,7 +104,7 @@ class TorusBalls(Loads):
     ) -> DrillingSpin:
         """Return s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r and the forces (2/5) m r s (B a', - rho sin a f').
 
-        s is w cos a for a ball that does not rotate in space.
+        A ball that does not rotate in space has s = w cos a.
         """
         (_, a), (turn, climb), m, own = u, rate, self.mass, self.ball_radius
         arm, up = self._arm(a), jnp.sin(a)
@@ -122,7 +122,10 @@ class TorusBalls(Loads):
         return NormalForce(m * (held - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
 
     def natural_frequency(self, speed: Array) -> Array:
-        """Return w sqrt((R + rho) / (kappa rho)): small motions about the outer equator of balls that turn with the rotor."""
+        """Return w sqrt((R + rho) / (kappa rho)), rad/s.
+
+        It is the frequency of small motions about the outer equator of balls that turn with the rotor.
+        """
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
 
 
@@ -218,4 +221,4 @@ gravity = { along = "axis" }                   # the axis is vertical
 static_imbalance = { moment = "6.87 g m" }     # of the rotor: its mass times its eccentricity
 rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths its sign
 """
-"""A commented scene file."""
+"""Scene file with comments."""

@@ -1,1 +1,1 @@
-"""Effects of a scene beyond machine, loads and drive."""
+"""Effects of a scene: physics in addition to machine, loads and drive."""

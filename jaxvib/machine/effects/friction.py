@@ -25,9 +25,9 @@ Reaction = Literal["exact", "run_up", "steady"]
 def sliding_sign(slip: Array, width: Array) -> Array:
     """Return tanh(slip / width), the sign of a sliding speed, smooth over the `width`.
 
-    A joint that would have to stick under the share f < 1 of the largest friction creeps at width artanh(f), which goes to zero
-    with the width. A swing with the largest speed v loses the share (pi^2/24) (width/v)^2 less to dry friction than with the
-    exact sign.
+    With the exact sign, a joint sticks under the fraction f < 1 of the largest friction. With the smooth sign it creeps at the
+    speed width artanh(f), which tends to 0 with the width. An oscillation with the largest speed v loses less energy to dry
+    friction than with the exact sign; the relative difference is (pi^2/24) (width/v)^2.
 
     >>> [round(float(sliding_sign(x, 0.1)), 4) for x in (-1.0, 0.0, 0.05, 1.0)]
     [-1.0, 0.0, 0.4621, 1.0]
@@ -98,11 +98,11 @@ class DryFriction(Effect):
         return Typical(cls(0.0015, diameter), f"a ball bearing, mu2 = 0.0015, of {1e3 * float(diameter):.3g} mm")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the friction, whose radial load keeps its size if loads and carrier turn over."""
+        """Return the friction. Its radial load keeps its size under phi -> phi + pi, q -> -q."""
         return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
-        """**Raises** `InputError` for loads that do not hang on bearings on a circle."""
+        """**Raises** `InputError` for loads without bearings, and for loads that do not move on a circle."""
         if not loads.circular:
             raise InputError("effects.dry_friction", f"needs loads on a circle, and the loads are {quoted(loads.kind)}")
         if not loads.has_bearing:
@@ -112,8 +112,10 @@ class DryFriction(Effect):
             )
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
-        """Return mu2 d/2 and N of `loads` at `u` with rates `rate`, the rotor at `speed` (rad/s), under gravity `g` by axis
-        (m/s^2)."""
+        """Return the friction with the lever mu2 (d/2) sign(speed - phi') and the radial load N.
+
+        **Arguments**: `loads` at `u` with rates `rate`; rotor `speed`, rad/s; gravity `g` by axis, m/s^2.
+        """
         assert isinstance(loads, CircularLoads)
         turn = rate[0]
         lever = dry_lever(self.coefficient, self.diameter, speed - turn, self.width)

@@ -1,4 +1,4 @@
-"""Effects by their names in scene files and audits."""
+"""Registry of effects by their names in scene files and audits."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ EFFECTS = {
     "free_spin": FreeSpin,
     "sliding": Sliding,
 }
-"""Constructors of effects from the fields of their tables."""
+"""Effects by their `kind`; each constructor takes the fields of the effect's table in a scene file."""

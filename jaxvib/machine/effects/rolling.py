@@ -30,10 +30,10 @@ class RollingFriction(Effect):
         Q_u = - (k/r) max(N, 0) J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
 
     - J = dp/du. v is the velocity of the load's centre along the wall relative to the rotor, which turns at w
-    - N is the normal force (`Loads.normal_force`), solved together with the accelerations; r is the radius of the load. A load
-      that does not press has no friction
-    - A load that would have to stick under the share s < 1 of the largest friction creeps at width artanh(s), which goes to
-      zero with the width
+    - N is the normal force (`Loads.normal_force`), solved together with the accelerations; r is the radius of the load. There
+      is no friction on a load that does not press
+    - With the exact sign, a load sticks under the fraction s < 1 of the largest friction. With the smooth sign it creeps at the
+      speed width artanh(s), which tends to 0 with the width
     - The sign of N is that of the motion without this friction
 
     **Arguments** (SI or texts with a unit)
@@ -71,7 +71,7 @@ class RollingFriction(Effect):
         return Typical(cls(3e-5), "k = 0.03 mm, steel on steel")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the friction, whose normal force keeps its size if loads and carrier turn over."""
+        """Return the friction. Its normal force keeps its size under phi -> phi + pi, q -> -q."""
         return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
@@ -79,8 +79,10 @@ class RollingFriction(Effect):
         ball_radius(loads, "effects.rolling_friction")
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
-        """Return -(k/r) J^T d and N of `loads` at `u` with rates `rate`, the rotor at `speed` (rad/s), under gravity `g` by
-        axis (m/s^2)."""
+        """Return the friction with the levers -(k/r) J^T d and the normal force N.
+
+        **Arguments**: `loads` at `u` with rates `rate`; rotor `speed`, rad/s; gravity `g` by axis, m/s^2.
+        """
         normal_force = loads.normal_force(u, rate, g)
         assert normal_force is not None
         slip = (rate[0] - speed, *rate[1:])
@@ -90,7 +92,7 @@ class RollingFriction(Effect):
         else:
             v = jax.jvp(loads.position, u, slip)[1]
             speed_ = _length(v)
-            # tanh(x)/x, also where nothing moves.
+            # tanh(x)/x, with its limit at x = 0.
             moving = speed_ > 1e-6 * self.width
             share = jnp.where(moving, sliding_sign(speed_, self.width) / jnp.where(moving, speed_, 1.0), 1.0 / self.width)
             levers = jax.vjp(loads.position, *u)[1](tuple(share * x for x in v))

@@ -1,4 +1,4 @@
-"""Released contacts of rolling loads: drilling spin about the normal, and sliding."""
+"""Freedoms of the contacts of rolling loads: drilling spin about the normal, and sliding."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class FreeSpin(Effect):
     - s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.drilling`, default:
       0 at the start); typical: up to the rotor speed, 140 rad/s
     - The forces Q act on the ball's two coordinates in addition to those of `TorusBalls`, whose contact keeps s = 0
-    - A point contact exerts no moment about its normal, so the ball's angular velocity about it changes with the direction of
-      the normal only, s' = Omega . n' + (w cos a)'
-    - While f' is constant, s grows by (w B - R f')/r per radian up the wall: a ball that left the equator with s = 0 returns to
-      it like a point mass, with m rho B f'^2 instead of m rho B (7/5 f'^2 - 2/5 w f') per radian, with kappa in its inertia.
-      Real contacts lie between both
+    - A point contact exerts no moment about its normal. The ball's angular velocity about the normal therefore changes only
+      with the direction of the normal, s' = Omega . n' + (w cos a)'
+    - While f' is constant, s grows by (w B - R f')/r per radian up the wall. A ball that left the equator with s = 0 then
+      returns to it like a point mass, but with kappa in its inertia: the restoring torque is m rho B f'^2 per radian instead of
+      m rho B (7/5 f'^2 - 2/5 w f'). Real contacts lie between the two
 
-    The effect needs a drive of given speed; the acceleration of the wall when w changes is neglected, as in `TorusBalls`.
+    The effect needs an ideal drive; the acceleration of the wall when w changes is neglected, as in `TorusBalls`.
 
     **Raises** `InputError`, by the scene, for loads that are not coupled to such a spin, as on a plane track, and for a motor.
 
@@ -50,7 +50,7 @@ class FreeSpin(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Return the effect, which has no number."""
+        """Return the effect, which has no numbers."""
         return Typical(cls(), "no moment about the normal of a contact at a point")
 
     def terms(self) -> tuple[Term, ...]:
@@ -73,16 +73,17 @@ class Sliding(Effect):
     - F_r is the force that rolling would need
     - c is the velocity of the point of contact relative to the track along each coordinate of a load (`State.spin.slip`,
       default: 0 at the start; `with_spin(scene, state, "still")` for loads that do not rotate yet)
-    - A sliding load moves like a mass alone, and friction accelerates its rotation until it rolls, a ball from rest at 2/7 of
-      the track's speed
+    - A sliding load moves like a mass without rotation. Friction accelerates its rotation until it rolls; a ball from rest then
+      has 2/7 of the track's speed
     - Rolling is exact: below the limit there is no creep
 
     If |c| is below `width`, the force is the one within the limit that is nearest to
 
         F_t = F_r - mu N c/width
 
-    The rest of a slip then decays as exp(- kappa/(kappa-1) mu N t/(m width)), which steps must resolve: about kappa/(kappa-1)
-    mu R w^2/width of them per second. `RollingFriction` still acts against the motion of the centre of a sliding load.
+    The remaining slip then decays as exp(- kappa/(kappa-1) mu N t/(m width)). Steps must resolve this decay: about
+    kappa/(kappa-1) mu R w^2/width steps per second. `RollingFriction` still acts against the motion of the centre of a sliding
+    load.
 
     **Arguments** (SI or texts with a unit)
 
@@ -108,7 +109,7 @@ class Sliding(Effect):
         self.kind = "sliding"
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array:
-        """Return kappa/(kappa - 1) mu R w^2 / width, at which a slip dies out."""
+        """Return kappa/(kappa - 1) mu R w^2 / width, the rate at which a slip decays, 1/s."""
         kappa = loads.inertia_factor()
         return kappa / (kappa - 1.0) * self.coefficient * loads.arm()[0] * speed**2 / self.width
 
@@ -118,7 +119,7 @@ class Sliding(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Return the sliding with mu of oiled steel on steel."""
+        """Return sliding with the mu of oiled steel on steel."""
         return Typical(cls(0.1), "mu = 0.1, oiled steel on steel")
 
     def validate(self, machine: Machine, loads: Loads) -> None:

@@ -329,4 +329,4 @@ stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number if all r
 """
     + _ROTOR,
 }
-"""A commented scene file for each kind of rotor."""
+"""Scene files with comments, one for each kind of rotor."""
