@@ -1,1 +1,1 @@
-"""A local page on which a machine's numbers are moved by sliders, and its diagrams follow."""
+"""Local page with sliders for the numbers of a machine, and diagrams that follow them."""

@@ -1,4 +1,4 @@
-"""The Campbell diagram of a rotor as an SVG picture."""
+"""Campbell diagram of a rotor as an SVG picture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BACKWARD = {"color": COLORS[1], "lw": 1.5, "ls": "--"}
 _CRITICAL = {"fc": "white", "ec": "black", "lw": 1.2, "zorder": 4.0}
 _DROP = {"color": GUIDE, "lw": 0.7, "zorder": 1.2}
 _LETTER = 0.11
-"""A letter's width, with something to spare."""
+"""Upper bound of the width of a letter, in units of the drawing."""
 
 _LEGEND = {
     "forward whirl": _FORWARD,
@@ -31,9 +31,9 @@ _LEGEND = {
 
 
 def campbell(found: Whirl, at: float) -> str:
-    """Whirl speeds over the rotor's speed with the critical speeds, in rpm: what `Whirl.plot` draws.
+    """Draw the whirl speeds over the rotor speed with the critical speeds, in rpm, like `Whirl.plot`.
 
-    **Arguments**: `found` the whirls of one scene over rotor speeds; `at` the operating speed, rad/s.
+    **Arguments**: `found`, the whirls of one scene over rotor speeds; `at`, the operating speed, rad/s.
 
     **Returns** the text of an SVG file.
 
@@ -62,7 +62,7 @@ def campbell(found: Whirl, at: float) -> str:
         w = float(critical[k])
         look = {**_CRITICAL, "ec": COLORS[0] if ahead[k] else COLORS[1]}
         parts += [panel.line([w, w], [0.0, w], _DROP), dot(*panel.at(w, w), look, square=not ahead[k])]
-    ends: list[float] = []  # of the texts in each row, the lowest first
+    ends: list[float] = []  # right end of the texts in each row, from the lowest row upward
     for group, word in groups:
         x, _ = panel.at(float(critical[group[-1]]), 0.0)
         row = next((k for k, end in enumerate(ends) if end < x), len(ends))

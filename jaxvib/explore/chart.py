@@ -1,4 +1,4 @@
-"""The branch diagram and the force chart as an SVG picture."""
+"""Branch diagram and force chart as an SVG picture."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _LEGEND = {
 
 
 def chart(found: Branches, most: float) -> str:
-    """The loads' speed and the foundation force (zero to peak) over the rotor's speed, in rpm: what `Branches.plot` draws.
+    """Draw the load speed, rpm, and the foundation force (zero to peak) over the rotor speed, rpm, like `Branches.plot`.
 
-    **Arguments**: `found` the branches of one scene; `most` the greatest rotor speed shown, rad/s.
+    **Arguments**: `found`, the branches of one scene; `most`, the highest rotor speed in the diagram, rad/s.
 
     **Returns** the text of an SVG file.
 

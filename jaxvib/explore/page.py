@@ -1,4 +1,4 @@
-"""The page itself, a marimo app: it wires sliders to pictures, and nothing else. `serve` runs it and says which scene."""
+"""Page of the sliders, a marimo app. It only connects sliders to pictures; `serve` runs it and selects the scene."""
 
 import marimo
 
@@ -36,7 +36,7 @@ def _(load_scene, mo, served_path, sliders_of):
 
 @app.cell
 def _(controls, html, mo, path):
-    # Markdown and HTML in a file's name are text.
+    # The file name is escaped because it may contain HTML.
     mo.sidebar([mo.Html(f"<b>{html.escape(path.name)}</b>"), mo.vstack(list(controls.elements.values()))], width="22rem")
     return
 
@@ -49,7 +49,7 @@ def _(controls, pictures, scene, scene_at):
 
 @app.cell
 def _(machine, mode, pictures, scene):
-    # All before any is sent: a browser that draws the first would take the processor from the next.
+    # All pictures are computed before any is sent, because a browser that draws one would slow down the next computation.
     chart = pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.drive.speed)), machine)
     numbers = pictures.text(lambda: pictures.readings(machine.value), machine)
     film = pictures.image(lambda: pictures.machine(machine.value, mode.value), machine)
@@ -70,7 +70,7 @@ def _(mo, numbers):
 
 @app.cell
 def _(mo, pictures, scene):
-    # No other mode than those there are, and of a machine without jam modes no choice.
+    # The list has only the existing modes; a machine without jam modes has no list.
     found = pictures.modes_of(scene)
     modes = {str(k): k for k in sorted(found)}
     mode = mo.ui.dropdown(

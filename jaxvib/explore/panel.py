@@ -1,4 +1,4 @@
-"""A chart's axes, lines and legend as outlines and texts of an SVG picture, in a tenth of the time that matplotlib takes."""
+"""Axes, lines and legend of a chart as outlines and texts of an SVG picture, in a tenth of the time of matplotlib."""
 
 from __future__ import annotations
 
@@ -16,28 +16,32 @@ from jaxvib.draw.style import GUIDE, Look, log_places
 __all__ = ["APART", "FIRST", "LAST", "OPERATING", "ROTOR", "TALL", "WIDE", "Panel", "dot", "legend"]
 
 WIDE, TALL, FIRST, APART, LAST = 6.3, 3.6, 0.75, 1.1, 0.25
-"""A panel's width and height, what is left of the first, between two and right of the last, in units of the drawing."""
+"""Width and height of a panel, and the space left of the first, between two and right of the last panel, in units of the
+drawing."""
 
 ROTOR = {"color": GUIDE, "lw": 0.8}
 OPERATING = {"color": "black", "lw": 1.0, "ls": "-."}
-"""Style of the line at which a speed equals the rotor speed, and of the operating speed."""
+"""Styles of the line on which a speed is equal to the rotor speed, and of the operating speed."""
 
 _MAX_TICKS = 5
 """Maximum number of ticks of an axis."""
 
 _MIN_POINT_DISTANCE = 0.03
-"""Least distance of two points of a line, two dots; nearer ones are left out."""
+"""Minimum distance between two points of a line, in units of the drawing: about two pixels. Nearer points are omitted."""
 
 _COLUMNS = (0.05, 1.9, 4.6)
-"""Left ends of the columns of the legend."""
+"""Positions of the left ends of the columns of the legend."""
 
 _GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
 
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """A chart over the rotor's speed: where it begins at the left, what stands above it, the limits of its axes, whether its
-    height is logarithmic, and how wide it is."""
+    """Chart over the rotor speed.
+
+    **Attributes**: `left`, position of its left end; `title` above it; `x` and `y`, the limits of its axes; `log`: True for a
+    logarithmic vertical axis; `wide`, its width.
+    """
 
     left: float
     title: str
@@ -47,25 +51,25 @@ class Panel:
     wide: float = WIDE
 
     def place(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Places in the drawing."""
+        """Return the positions of points in the drawing."""
         x, y, (left, right), (low, high) = np.asarray(x, float), np.asarray(y, float), self.x, self.y
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.log(y / low) / math.log(high / low) if self.log else (y - low) / (high - low)
         return self.left + self.wide * (x - left) / (right - left), TALL * share
 
     def at(self, x: float, y: float) -> tuple[float, float]:
-        """One place in the drawing."""
+        """Return the position of one point in the drawing."""
         across, up = self.place(x, y)
         return float(across), float(up)
 
     def line(self, x: ArrayLike, y: ArrayLike, look: Look) -> Part:
-        """A line through points of which those below or above the chart are left out."""
+        """Return a line through points, without those below or above the chart."""
         points = np.stack(self.place(x, y), axis=1)
         inside = (points[:, 1] >= 0.0) & (points[:, 1] <= TALL)
         return Part(_thinned(np.where(inside[:, None], points, np.nan)), look)
 
     def frame(self) -> list[Part]:
-        """The axes and the lines at their ticks."""
+        """Return the axes and the grid lines at their ticks."""
         (left, right), (low, high) = self.x, self.y
         upright = [self.line([x, x], self.y, _GRID) for x, _ in self._ticks_across()]
         level = [self.line(self.x, [y, y], _GRID) for y, _ in self._ticks_up()]
@@ -73,7 +77,7 @@ class Panel:
         return [*upright, *level, Part(edge, {"color": "black", "lw": 0.8})]
 
     def texts(self) -> list[Text]:
-        """The numbers at the ticks and what they are of."""
+        """Return the numbers at the ticks and the names of the axes."""
         small = {"fontsize": "small"}
         across = [Text(self.at(x, self.y[0])[0], -0.18, text, {**small, "ha": "center"}) for x, text in self._ticks_across()]
         up = [Text(self.left - 0.08, self.at(self.x[0], y)[1], text, {**small, "ha": "right"}) for y, text in self._ticks_up()]
@@ -89,12 +93,12 @@ class Panel:
 
 
 def _ticks(places: ArrayLike, limits: tuple[float, float]) -> list[tuple[float, str]]:
-    """The ticks between the limits, with their numbers."""
+    """Return the ticks between the limits, with their numbers."""
     return [(x, f"{x:g}") for x in np.asarray(places, float).tolist() if limits[0] <= x <= limits[1]]
 
 
 def _thinned(points: np.ndarray) -> np.ndarray:
-    """A line (n, 2) without the points that are next to others; its ends and those beside a gap (NaN) stay."""
+    """Return a line (n, 2) without points that are too close to others; its ends and the points beside a gap (NaN) stay."""
     steps = np.hypot(*np.diff(points, axis=0).T)
     gone = np.floor(np.concatenate([[0.0], np.nancumsum(steps)]) / _MIN_POINT_DISTANCE)
     gap = np.isnan(np.concatenate([[np.nan], steps, [np.nan]]))
@@ -104,13 +108,16 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 
 def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
-    """A round dot, or a square one, of that look."""
+    """Return a round or a square dot with that style."""
     outline = box(x - 0.045, x + 0.045, y - 0.045, y + 0.045) if square else circle((x, y), 0.05, 13)
     return Part(outline, look, filled=True)
 
 
 def legend(looks: Mapping[str, Look]) -> tuple[list[Part], list[Text]]:
-    """Samples of lines and of dots (those that have a filling) with their names above the charts, two in a column."""
+    """Return the legend above the charts, with two entries in a column: samples of lines and dots with their names.
+
+    A style with a fill colour ("fc") is that of a dot.
+    """
     parts, texts = [], []
     for k, (name, look) in enumerate(looks.items()):
         x, y = _COLUMNS[k // 2], TALL + (0.95, 0.68)[k % 2]

@@ -1,4 +1,4 @@
-"""Contents of the page for a scene: diagram, moving machine, numbers, file."""
+"""Contents of the page for a scene: diagram, moving machine, results as text, scene file."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ Amplitudes and forces are zero to peak. What is seen here is the theory of light
 """Text below the sliders, as Markdown."""
 
 _SPEEDS = 81
-"""Rotor speeds of a Campbell diagram."""
+"""Number of rotor speeds of a Campbell diagram."""
 
 _PREPARED_COUNTS = 7
-"""Number of other numbers of loads that are compiled while the page is open."""
+"""Count of the other numbers of loads that are compiled while the page is open."""
 
 
 class SceneOrProblem(NamedTuple):
-    """Requested scene, or a sentence that says why there is none."""
+    """Scene at the values of the sliders, or the message of the error that it raised."""
 
     value: Scene | None
     problem: str
 
 
 def scene_or_problem(ask: Callable[[], Scene]) -> SceneOrProblem:
-    """The scene that `ask` gives, or what its `InputError` says: a slider may go where no machine is."""
+    """Return the scene from `ask`, or the message of its error: sliders may have values at which no machine is possible."""
     try:
         return SceneOrProblem(ask(), "")
     except (InputError, ComputationError) as error:
@@ -68,7 +68,7 @@ def scene_or_problem(ask: Callable[[], Scene]) -> SceneOrProblem:
 
 
 def image(draw: Callable[[], str], scene: SceneOrProblem) -> str:
-    """The text of an SVG file as an HTML image that holds its own data, or the sentence that says why there is none."""
+    """Return an SVG picture as an HTML image with embedded data, or the message of the error."""
 
     def made() -> str:
         data = base64.b64encode(draw().encode()).decode()
@@ -78,7 +78,7 @@ def image(draw: Callable[[], str], scene: SceneOrProblem) -> str:
 
 
 def text(read: Callable[[], str], scene: SceneOrProblem) -> str:
-    """Text as HTML, as it stands, or the sentence that says why there is none."""
+    """Return preformatted text as HTML, or the message of the error."""
     return _shown(lambda: f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>', scene)
 
 
@@ -93,26 +93,27 @@ def _shown(make: Callable[[], str], scene: SceneOrProblem) -> str:
 
 
 def toml(scene: SceneOrProblem) -> str:
-    """The scene file of what the sliders say; empty where they say no machine."""
+    """Return the scene file of the scene; an empty text if there is no scene."""
     return "" if scene.value is None else scene_to_toml(scene.value)
 
 
 def prepare(scene: Scene) -> None:
-    """Compiles and draws once what the page will ask for, so that its first slider moves as fast as the next."""
+    """Compile and draw the contents of the page, so that the first move of a slider is as fast as the next ones."""
     for slider in sliders_of(scene):
-        if slider.number is not None:  # another number of loads is another program
+        if slider.number is not None:  # another number of loads would need another program
             moved = {slider.name: slider.steps[slider.steps.index(slider.start) - 1]}
             scene_or_problem(functools.partial(scene_at, scene, moved))
     for _ in range(2):
         _draw_all(scene)
     gc.collect()
-    gc.freeze()  # programs and modules stay: to look through them all again takes longer than a picture
+    gc.freeze()  # a garbage collection of all programs and modules would take longer than a picture
 
 
 def prepare_counts(scene: Scene) -> None:
-    """Compiles what the page will ask for with other numbers of loads, the next ones first: each is a program of its own.
+    """Compile the contents of the page for other numbers of loads, the nearest first; each number is a separate program.
 
-    Meant for a thread beside the page. What cannot be computed is left to the page, which says why."""
+    Runs in a thread beside the page. Numbers of loads that are not possible are skipped; the page shows the error message.
+    """
     for slider in sliders_of(scene):
         if slider.number is None:
             others = sorted(slider.steps, key=lambda count: (abs(count - slider.start), -count))[1 : 1 + _PREPARED_COUNTS]
@@ -131,12 +132,12 @@ def _draw_all(scene: Scene) -> None:
 
 
 def has_branches(scene: Scene) -> bool:
-    """True if jams of the scene lie on branches over the rotor speed, that is if its machine moves up and down only."""
+    """True if the jams of the scene form branches over the rotor speed, that is, if its machine only moves up and down."""
     return scene.mounting().axes == (1,)
 
 
 def heading(scene: Scene) -> str:
-    """Heading of `diagram` for this scene, with a reference to other results."""
+    """Return the heading of `diagram` for this scene, with a reference to other results."""
     if has_branches(scene):
         return (
             "Where light loads jam: their speed and the foundation force over the rotor's speed. Solid: stable by slope, for "
@@ -151,11 +152,12 @@ def heading(scene: Scene) -> str:
 
 
 def diagram(scene: Scene, most: float) -> str:
-    """Branch diagram with the force chart for a machine that moves up and down; Campbell diagram for a rotor.
+    """Draw the branch diagram with the force chart for a machine that moves up and down, or the Campbell diagram of a rotor.
 
-    **Arguments**: `most` the greatest rotor speed shown, rad/s; more where the scene's own speed asks for it.
+    **Arguments**: `most`, the highest rotor speed in the diagram, rad/s; it is at least 1.15 times the scene's rotor speed.
 
-    **Returns** the text of an SVG file. **Raises** `InputError` for scenes that the theory leaves out; it says which part.
+    **Returns** the text of an SVG file. **Raises** `InputError` for scenes that the theory does not include; the message names
+    the part.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
@@ -173,13 +175,15 @@ def diagram(scene: Scene, most: float) -> str:
 
 
 def readings(scene: Scene) -> str:
-    """The jams at the rotor's speed, or a rotor's critical speeds, as text. **Raises** `InputError` as `diagram`."""
+    """Return the jams at the rotor speed, or a rotor's critical speeds, as text. **Raises** `InputError` like `diagram`."""
     return jax.device_get(jam_modes(scene) if has_branches(scene) else critical_speeds(scene)).summary()
 
 
 def modes_of(scene: Scene) -> list[int]:
-    """The jam modes that `machine` can show moving, stable by slope. First come those that exist at the scene's rotor speed, of
-    these the one at the highest resonance, last the one beyond all resonances. None of a machine that moves both ways.
+    """Return the jam modes in which `machine` can show the machine moving: those that are stable by slope.
+
+    Modes that exist at the scene's rotor speed come first. Among modes that exist, and among the others, the one at the highest
+    resonance is first and the one beyond all resonances last. The list is empty for a machine that moves across and up.
     """
     if not has_branches(scene):
         return []
@@ -192,7 +196,7 @@ def modes_of(scene: Scene) -> list[int]:
 
 
 def machine(scene: Scene, mode: int | None) -> str:
-    """The machine as an SVG picture, moving in the jam mode of that number; at rest where there is none."""
+    """Return the machine as an SVG picture, moving in the jam mode with that number, or at rest if `mode` is None."""
     from jaxvib.show.moving import moving, still  # slow import
 
     return still(scene) if mode is None else moving(scene, jax.device_get(jam_modes(scene)).select(mode))

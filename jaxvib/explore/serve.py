@@ -1,8 +1,7 @@
-"""Server of the page, on this computer only.
+"""Server of the page, which listens only on this computer.
 
-A browser lets every open web site send requests to servers of the same computer. The address of the page therefore begins
-with a random token, and a request is answered only if it has that token, names this computer as its host, and comes from the
-page itself.
+A browser lets every open web site send requests to servers on the same computer. The address of the page therefore contains a
+random token, and a request is answered only if it has that token, names this computer as its host, and comes from the page.
 """
 
 from __future__ import annotations
@@ -27,17 +26,17 @@ _Message: TypeAlias = "MutableMapping[str, Any]"
 _Send: TypeAlias = "Callable[[_Message], Awaitable[None]]"
 _Receive: TypeAlias = "Callable[[], Awaitable[_Message]]"
 _Page: TypeAlias = "Callable[[_Message, _Receive, _Send], Awaitable[None]]"
-"""An ASGI application."""
+"""Type of an ASGI application."""
 
 _VARIABLE = "JAXVIB_EXPLORE"
 """Environment variable with the path of the scene file."""
 
 _HOST = "127.0.0.1"
-"""Only this computer reaches the page."""
+"""Loopback address, which other computers cannot reach."""
 
 
 def served_path() -> Path:
-    """Return the scene file of the page that is being served. **Raises** `InputError` if there is none."""
+    """Return the path of the scene file of the page. **Raises** `InputError` if no page is being served."""
     path = os.environ.get(_VARIABLE)
     if not path:
         raise InputError(_VARIABLE, "is not set; start the page with: jaxvib explore machine.toml")
@@ -45,7 +44,7 @@ def served_path() -> Path:
 
 
 def require_marimo() -> None:
-    """**Raises** `InputError` if marimo, which shows the page, is not installed."""
+    """Require marimo, which shows the page. **Raises** `InputError` if it is not installed."""
     if importlib.util.find_spec("marimo") is None:
         raise InputError(
             "explore", "needs marimo; install it with: pip install '.[explore]' (in the folder of jaxvib's sources)"
@@ -53,9 +52,9 @@ def require_marimo() -> None:
 
 
 def require_free(port: int) -> None:
-    """**Raises** `InputError` if another program listens at that port of this computer, or if the port may not be used."""
+    """Require a usable port. **Raises** `InputError` if another program listens at it, or if it may not be used."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
-        # As the server does: a port that a page left a minute ago is free.
+        # The server sets this option too. With it, a port that another page has just released counts as free.
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(os.name == "posix"))
         try:
             listener.bind((_HOST, port))
@@ -68,8 +67,8 @@ def require_free(port: int) -> None:
 def guarded(page: _Page, token: str, port: int) -> _Page:
     """Return an ASGI application that passes on to `page` only requests of that page at `/token/`; others get an empty 404.
 
-    The header Host must be this computer's at `port`, which keeps out sites whose name was made to point here (DNS rebinding),
-    and Origin, which browsers add to requests of other sites and to all websockets, must be the same if there is one.
+    The header Host must be this computer with `port`; this rejects sites whose name was made to point here (DNS rebinding). The
+    header Origin, which browsers add to requests of other sites and to all websockets, must agree with Host if it is present.
     """
     hosts = [f"{name}:{port}".encode() for name in (_HOST, "localhost")]
 
@@ -100,7 +99,8 @@ def guarded(page: _Page, token: str, port: int) -> _Page:
 def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]) -> None:
     """Serve the page of a scene file until it is interrupted, and end the process.
 
-    **Arguments**: `scene` file; `port` of this computer; `browser`: True opens the page; `announce` is called with its address.
+    **Arguments**: `scene` file; `port` of this computer; `browser`: True to open the page; `announce`, a function that is
+    called with its address.
 
     **Raises** `InputError` if marimo is not installed or the port is taken.
     """
@@ -130,6 +130,6 @@ def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]
 
 
 def leave() -> None:
-    """Ends the process: marimo's threads would wait for pages that are still open."""
+    """End the process at once. An orderly exit would wait for marimo's threads, which wait for pages that are still open."""
     sys.stdout.flush()
     os._exit(0)

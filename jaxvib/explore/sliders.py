@@ -19,22 +19,26 @@ from jaxvib.units import shown_unit
 __all__ = ["COUNT", "Slider", "scene_at", "sliders_of"]
 
 COUNT = "loads.count"
-"""The name of the slider that changes the number of loads."""
+"""Name of the slider that changes the number of loads."""
 
 _MACHINE_NUMBERS = ("machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
 """Numbers of a machine that have sliders."""
 
 _MAX_SINGLE_SLIDERS = 12
-"""Maximum number of sliders for numbers of a machine one by one; for a larger machine one slider changes all of a kind."""
+"""Maximum number of sliders for single numbers of a machine; in a larger machine, one slider changes all of a kind."""
 
 _DECADES = tuple(np.geomspace(0.1, 10.0, 81).tolist())
 _SHARES = tuple((np.arange(1, 301) / 100.0).tolist())
 
 
 class Slider(NamedTuple):
-    """A number of a scene that is moved: its `name`, what a designer calls it (`label`), the `unit` in which it is shown, the
-    values that it takes (`steps`, ascending) with the scene's own among them (`start`), and the `number` of the scene, None for
-    the number of loads. The scene's number is multiplied by value / start, so that at `start` it is itself, bit for bit."""
+    """Slider for a number of a scene.
+
+    The number of the scene is multiplied by value / `start`; at `start` it therefore keeps its value bit for bit.
+
+    **Attributes**: `name` in the scene; `label`, the designer's name; `unit` on the slider; `steps`, the ascending values of
+    the slider; `start`, the scene's value, which is one of them; `number` of the scene, None for the number of loads.
+    """
 
     name: str
     label: str
@@ -50,10 +54,13 @@ class Slider(NamedTuple):
 
 
 def sliders_of(scene: Scene) -> list[Slider]:
-    """The sliders of a scene: springs and dampers, a tenth to ten times their values; mass and drag of the loads alike; the
-    rotor's speed, up to three times its own; the number of loads, where they share every number.
+    """Return the sliders of a scene, those of the drive and the loads first.
 
-    What is 0 has none, since no factor moves it. **Returns** `Slider`s, those of the drive and the loads first.
+    - springs and dampers, masses and drags of the loads: a tenth to ten times the scene's values
+    - rotor speed: up to three times the scene's value
+    - number of loads, if all loads have equal numbers
+
+    A number that is 0 has no slider, because no factor changes it.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
@@ -75,10 +82,9 @@ def sliders_of(scene: Scene) -> list[Slider]:
 
 
 def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
-    """The scene with its sliders at these values, in the units of the sliders, by their names; where one is not named, the
-    scene's own.
+    """Return the scene with its sliders at these values, by name and in the sliders' units; others keep the scene's values.
 
-    **Raises** `InputError` for a name that is no slider of the scene, and for a number of loads that have no room.
+    **Raises** `InputError` for a name that is not a slider of the scene, and for loads that do not fit into the rotor.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
@@ -106,7 +112,8 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
 
 
 def _has(scene: Scene, name: str) -> bool:
-    """True if the scene has that number, not 0, and no other number replaces it (as a rotor's `stiffness_terms` may)."""
+    """True if the scene has that number, it is not 0, and no other number replaces it, such as a rotor's
+    `stiffness_terms`."""
     part, _, field = name.partition(".")
     owner = getattr(scene, part)
     value = getattr(owner, field, None)
@@ -114,7 +121,7 @@ def _has(scene: Scene, name: str) -> bool:
 
 
 def _shared(scene: Scene) -> bool:
-    """True if an additional load is like the others: all share every number, and none has a station of its own."""
+    """True if all loads have equal numbers and no load has its own station; an additional load is then like the others."""
     return scene.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 
@@ -131,5 +138,5 @@ def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Sl
 
 @functools.lru_cache(maxsize=256)
 def _steps(start: float, factors: tuple[float, ...]) -> tuple[float, ...]:
-    """The values from `start` on and back, with four digits; kept, since every move asks for those of all sliders."""
+    """Return the values around `start`, with four digits. They are cached because every move needs those of all sliders."""
     return tuple(sorted({start, *(float(f"{f * start:.4g}") for f in factors if f != 1.0)}))
