@@ -1,1 +1,1 @@
-"""Results for people who were not there: one web page with all of it, and what the parts of a scene file take."""
+"""HTML reports of results, and descriptions of the arguments of parts of a scene file."""

@@ -19,12 +19,15 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
     "drives": SECTIONS["drive"],
     "effects": EFFECTS,
 }
-"""Parts that a scene file may name, by their word in the file."""
+"""Parts of a scene, by group and by their name in a scene file."""
 
 
 class Argument(NamedTuple):
-    """One argument of a part: its `name`; its `unit`, "" for none; whether it must be given, `needed`; its `default` as text,
-    None where there is none; the `allowed` texts, where it is one of several; the `bounds` of a number in words."""
+    """Argument of a part.
+
+    **Attributes**: `name`; `unit`, "" for none; `needed`: True if the argument has no default; `default` as text, or None;
+    `allowed` texts of an argument that is one of several; `bounds` of a number in words.
+    """
 
     name: str
     unit: str
@@ -61,7 +64,7 @@ def part_of(build: Callable[..., object]) -> type:
 
 
 def _choices(build: Callable[..., object], parameter: inspect.Parameter) -> tuple[str, ...]:
-    """The texts of a Literal, by its own name or written out."""
+    """Return the texts of an argument whose type is a Literal or the name of one; an empty tuple for other types."""
     annotation = str(parameter.annotation)
     home = inspect.getmodule(build)
     named = getattr(home, annotation, None) if annotation.isidentifier() else None
@@ -74,7 +77,7 @@ def _shown(value: object) -> str:
 
 
 def described(group: str, name: str) -> Callable[..., object]:
-    """Class or function that builds the part of that name. **Raises** `InputError` for a group or a name that there is not."""
+    """Return the class or function that builds the part with that name. **Raises** `InputError` for unknown names."""
     if group not in GROUPS:
         raise InputError("group", f"is {quoted(group)}; {suggest_name(group, list(GROUPS))}")
     if name not in GROUPS[group]:

@@ -1,4 +1,4 @@
-"""One web page with a result: what was asked, what came out, what it is worth, the machine, the figures."""
+"""Report of a result as one web page: command, accuracy, figures, numbers, machine, versions."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "nu
 class Report:
     """Contents of a page.
 
-    **Arguments**: `title`; the `document`, plain values as in JSON, and the `units` of its numbers by name; the `command` that
-    it came from; its `text` as a terminal shows it; the `scene` that it is about and a `sketch` of it; `figures` by name.
+    **Arguments**: `title`; `document`, plain values as in JSON; `units` of its numbers by name; `command` that computed the
+    result; `text` of the result on the terminal; `scene` of the result and a `sketch` of it; `figures` by name.
     """
 
     title: str
@@ -48,7 +48,7 @@ class Report:
     sketch: Figure | None = None
 
     def html(self) -> str:
-        """The page: HTML with its style and its figures in it, which asks no network for anything. All text is escaped."""
+        """Return the page as HTML with embedded style and figures; it loads nothing from a network. All text is escaped."""
         parts = [f"<h1>{escaped(self.title)}</h1>"]
         if self.command:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
@@ -76,17 +76,17 @@ def html_report(
 ) -> Path:
     """Write a result as one web page: numbers with units, figures, machine, accuracy of the result, versions.
 
-    The page loads nothing from a network; it reads on a phone and prints.
+    The page loads nothing from a network, and can be read on a phone and printed.
 
     **Arguments**
 
     - `result` of any kind
     - `path` of the file, which is overwritten
-    - `title`; default: the result's kind
-    - `scene` whose parameters are listed; default: that of the result if it has one
-    - `figures`: pairs of a name and a matplotlib figure; default: the result's own
+    - `title`; default: the name of the result's class
+    - `scene` whose parameters are listed; default: the scene of the result if it has one
+    - `figures`: pairs of a name and a matplotlib figure; default: the figure of the result's method `plot`
 
-    **Returns** the path. **Raises** `InputError` for something that is no result, and for a path that cannot be written to.
+    **Returns** the path. **Raises** `InputError` for an object that is not a result, and for a path that cannot be written to.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
@@ -109,7 +109,7 @@ def html_report(
 
 
 def units_of(result: eqx.Module) -> dict[str, str]:
-    """The units of a result's numbers by the names of its fields, those of its parts too."""
+    """Return the units of the numbers of a result and of its parts, by the names of their fields."""
     found: dict[str, str] = {}
     for each in dataclasses.fields(result):
         value = getattr(result, each.name)
@@ -122,7 +122,7 @@ def units_of(result: eqx.Module) -> dict[str, str]:
 
 
 def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
-    """Common unit of all coordinates of the scene's machine from a unit such as "m or rad", if they have one."""
+    """Replace a unit such as "m or rad" by the unit of the machine's coordinates if all of them have the same."""
     alike = set(scene.machine.structure().units)
     choice = 0 if alike == {"m"} else 1 if alike == {"rad"} else None
     return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}

@@ -1,4 +1,4 @@
-"""Plain values and scenes as tables of a web page; every text in them is escaped."""
+"""HTML tables of plain values and scenes; every text in them is escaped."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ WORTH = (
     "status", "message", "error", "reference_error", "uncertainty", "resolution", "residual", "drift", "ripple", "settled",
     "judged", "unverified", "converged", "starts", "steps", "rejected", "evaluations", "seconds",
 )  # fmt: skip
-"""Names of what says how good a result is and what it cost."""
+"""Names of the fields about the accuracy and the cost of a result."""
 
 _HIDDEN = ("scene", "toml")
-"""Texts that the page shows in another way."""
+"""Names of the fields that the page shows in another way."""
 
 _MAX_INLINE_ENTRIES = 12
-"""Maximum number of entries of a list that are shown one by one."""
+"""Maximum number of entries of a list that fits into one cell."""
 
 _MAX_CELL_CHARACTERS = 40
-"""Largest number of characters of a text within a row; a longer text stands below its row."""
+"""Maximum number of characters of a text within a row; a longer text is written below its row."""
 
 _MAX_ROWS = 200
 """Maximum number of rows of a table."""
 
 
 def escaped(text: object) -> str:
-    """Text as HTML shows it, whatever it holds."""
+    """Return a text in which the special characters of HTML are escaped."""
     return html.escape(str(text), quote=True)
 
 
 def worth(document: Mapping[str, Plain], units: Units) -> str:
-    """A table of what a document says about its own worth: status, error, cost."""
+    """Return a table of the fields of a document about accuracy and cost: status, error, steps, seconds."""
     return _pairs([(name, document[name]) for name in WORTH if name in document and _plain(document[name])], units)
 
 
 def results(document: Mapping[str, Plain], units: Units, inner: bool = False) -> str:
-    """A document as tables: single values in one, lists of like entries in a table each, all else below headings."""
+    """Return a document as tables: one for all single values, and one below its own heading for each list or mapping."""
     single, below = [], []
     for name, value in document.items():
         if name in _HIDDEN or (not inner and name in WORTH and _plain(value)):
@@ -65,7 +65,7 @@ def results(document: Mapping[str, Plain], units: Units, inner: bool = False) ->
 
 
 def parameters(scene: Scene) -> str:
-    """The numbers of a scene with their units, a table for each of its parts."""
+    """Return the numbers of a scene with their units, in a table for each of its parts."""
     tables = tomllib.loads(scene_to_toml(scene))
     parts = []
     owners = [("", tables, scene.exciters[0])]
@@ -120,7 +120,7 @@ def _pairs(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
 
 
 def _rows(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
-    """A row for each entry; what is long stands below it, over the whole width."""
+    """Return a table with a row for each entry; long texts are below their row, over the whole width."""
     every = list(dict.fromkeys(name for row in rows for name in row))
     long = [
         name for name in every if any(isinstance(x := row.get(name), str) and len(x) > _MAX_CELL_CHARACTERS for row in rows)
@@ -137,14 +137,14 @@ def _rows(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
 
 
 def _side(rows: Sequence[Mapping[str, Plain]], name: str) -> str:
-    """Numbers stand at the right."""
+    """Return the HTML class of a column: numbers are aligned to the right."""
     values = [row.get(name) for row in rows]
     numeric = all(v is None or (isinstance(v, (int, float)) and not isinstance(v, bool)) for v in values)
     return " class='n'" if numeric else ""
 
 
 def _grid(values: Sequence[Plain]) -> str:
-    """A long list, or one of lists."""
+    """Return a list of lists as a table, or the number of entries and the range of a long list."""
     rows = [x for x in values if isinstance(x, list) and _plain(x)]
     if len(rows) == len(values):
         body = "".join("<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>" for row in rows[:_MAX_ROWS])
