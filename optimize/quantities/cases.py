@@ -1,4 +1,4 @@
-"""One quantity at another operating point, under another load, over tolerances."""
+"""Quantities at other operating points, in other load cases and over tolerances."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["expected", "quantile", "under", "worst"]
 
 @dataclass(frozen=True)
 class Changed:
-    """A case: some numbers of the scene have other values."""
+    """Case in which some numbers of the scene have other values."""
 
     name: str
     values: tuple[tuple[str, float], ...]
@@ -34,7 +34,7 @@ class Changed:
     several = False
 
     def scenes(self, scene: Scene) -> Scene:
-        """The scene with these values."""
+        """Return the scene with these values."""
         for name, value in self.values:
             scene = put_present(scene, find_number(scene, name, "under"), value)
         return scene
@@ -42,7 +42,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class Sampled:
-    """A case: many scenes whose numbers are off by a relative error drawn at random, always the same draws."""
+    """Case of many scenes whose numbers have random relative errors, with fixed samples."""
 
     errors: tuple[tuple[str, float], ...]
     samples: int
@@ -51,8 +51,10 @@ class Sampled:
     several = True
 
     def factors(self, scene: Scene) -> list[tuple[NamedNumber, np.ndarray]]:
-        """Factors of each number (samples, entries), normal, within three deviations: a Latin hypercube, in which every
-        number's samples fill the distribution evenly, in an order of their own."""
+        """Return factors of each number (samples, entries) from a normal distribution within three standard deviations.
+
+        They are a Latin hypercube: the samples of each number cover its distribution evenly, in an independent order.
+        """
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
         for name, error in self.errors:
@@ -60,12 +62,12 @@ class Sampled:
             shares = (np.arange(self.samples) + 0.5) / self.samples
             deviations = np.clip([normal.inv_cdf(float(share)) for share in shares], -3.0, 3.0)
             drawn = np.stack([random.permutation(deviations) for _ in range(found.size)], axis=1)
-            # Half the width is two deviations: 95 of 100 machines are within the tolerance.
+            # The tolerance is two standard deviations: 95 of 100 machines are within it.
             out.append((found, np.maximum(1.0 + 0.5 * error * drawn, 0.05)))
         return out
 
     def scenes(self, scene: Scene) -> Scene:
-        """The scenes, every array with a leading axis."""
+        """Return the scenes; every array has a leading axis."""
         factors = [(found, jnp.asarray(f)) for found, f in self.factors(scene)]
 
         def one(*each: Array) -> Scene:
@@ -79,7 +81,7 @@ class Sampled:
 
 @dataclass(frozen=True)
 class _OfPart(Quantity):
-    """A quantity made of one other."""
+    """Quantity that is computed from one other quantity."""
 
     @property
     def words(self) -> str:
@@ -88,7 +90,7 @@ class _OfPart(Quantity):
 
 @dataclass(frozen=True)
 class Under(_OfPart):
-    """A quantity in a case."""
+    """Quantity in a case."""
 
     case: Changed = Changed("", ())
 
@@ -108,7 +110,7 @@ class Under(_OfPart):
 
 @dataclass(frozen=True)
 class Robust(_OfPart):
-    """A number of the distribution of a quantity over tolerances."""
+    """Statistic of a quantity over tolerances."""
 
     case: Sampled = Sampled((), 1, 0)
     statistic: str = "expected"
@@ -120,7 +122,7 @@ class Robust(_OfPart):
             return jnp.mean(values)
         if self.statistic == "worst":
             return greatest(values)
-        # The mean beyond the quantile would bend less; the quantile itself is what is asked, between two samples.
+        # The mean beyond the quantile would be smoother, but the requested number is the quantile, between two samples.
         return jnp.quantile(values, self.level)
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
@@ -129,7 +131,7 @@ class Robust(_OfPart):
         return self._sampled(evaluation, self.parts[0].pieces).reshape(-1)
 
     def _sampled(self, evaluation: Evaluation, question: Callable[[Evaluation], Array]) -> Array:
-        """Values of all samples, (samples, ...)."""
+        """Return the values of all samples, (samples, ...)."""
         scenes, path = evaluation.under(self.case)
         known, keys = evaluation.known, []
         near: tuple[Array, ...] | None = None

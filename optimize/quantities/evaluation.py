@@ -1,4 +1,4 @@
-"""Results that quantities need of a scene, each computed once; jams are followed from a similar machine."""
+"""Results of a scene that quantities need, each computed once; jams are followed from a similar machine."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ from jaxvib.units.known import is_known
 __all__ = ["Case", "Evaluation", "Key", "Target", "TargetRecorder", "guesses"]
 
 _NO_FOLD = 10.0
-"""Factor of the rotor speed that stands for the fold of a mode that no fold ends on the side of higher rotor speeds."""
+"""Factor on the rotor speed that replaces the upper fold of a mode if no fold ends it at higher rotor speeds."""
 
 _SAMPLES = 4000
-"""States of a run-up that are looked at."""
+"""Number of stored states of a run-up."""
 
 
 class Case(Protocol):
-    """Another scene made of a design's, or several of them: a load case, an operating point, samples of tolerances."""
+    """Scenes derived from the scene of a design: a load case, an operating point, samples of tolerances."""
 
     def scenes(self, scene: Scene) -> Scene:
-        """The scene in this case; where it stands for several, its arrays have a leading axis."""
+        """Return the scene in this case; if the case has several scenes, its arrays have a leading axis."""
         ...
 
     @property
     def several(self) -> bool:
-        """True if it stands for several scenes."""
+        """True if the case has several scenes."""
         ...
 
 
 Target = tuple[str, int]
-"""Followed jam or fold: ("jam", mode), or a fold beside it, ("below", mode) and ("above", mode)."""
+"""Followed jam or fold: ("jam", mode), or a fold at an end of the mode, ("below", mode) or ("above", mode)."""
 
 Key = tuple[tuple[Case, ...], Target]
-"""Scene (the cases that lead there from the design's own), and the followed jam or fold."""
+"""Scene, as the path of cases from the scene of the design, and the followed jam or fold."""
 
 
 class TargetRecorder:
-    """Evaluation that records the requested targets."""
+    """Substitute for an evaluation that records the requested targets."""
 
     def __init__(self) -> None:
         self.keys: list[Key] = []
@@ -65,11 +65,10 @@ class TargetRecorder:
 
 
 class Evaluation:
-    """Results of one scene. Questions are answered when they are first asked.
+    """Results of one scene, each computed when it is first requested.
 
-    **Attributes**: `scene`; `is_known`: true if its numbers have values; `known` load speeds (rad/s) near which jams and folds
-    are followed, by `Key`; without them the
-    whole branch is looked at; `found` the load speeds that came out.
+    **Attributes**: `scene`; `is_known`: true if its numbers have values; `known`: load speeds (rad/s) near which jams and folds
+    are followed, by `Key` (without them the whole branch is computed); `found`: the resulting load speeds.
     """
 
     def __init__(
@@ -92,12 +91,12 @@ class Evaluation:
 
     @cached_property
     def model(self) -> LinearModel:
-        """The scene's carrier with its loads."""
+        """Linear model of the carrier with its loads."""
         return linear_model(self.scene)
 
     @cached_property
     def jammed(self) -> JammedModel:
-        """The same with what jams of all speeds share."""
+        """Linear model with the quantities that jams of all speeds share."""
         return jammed_model(self.scene)
 
     @cached_property
@@ -106,7 +105,7 @@ class Evaluation:
         return jam_modes(self.scene)
 
     def jam(self, mode: int) -> Jam:
-        """The jam mode of that number, NaN where it does not exist."""
+        """Return the jam mode with a number, NaN if it does not exist."""
         most = 2 * self.scene.machine.structure().mass.shape[0] + 1
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
@@ -118,8 +117,8 @@ class Evaluation:
         return self._jams[key]
 
     def folds(self, mode: int) -> tuple[Array, Array]:
-        """Rotor speeds, rad/s, of the folds below and above a jam mode on the branch; where there is none, 0 or ten times the
-        scene's."""
+        """Return the rotor speeds, rad/s, of the folds below and above a jam mode on the branch; if a fold is absent, 0 or ten
+        times the rotor speed of the scene."""
         speeds = []
         for side in ("below", "above"):
             key: Key = (self.path, (side, mode))
@@ -132,7 +131,7 @@ class Evaluation:
         return speeds[0], speeds[1]
 
     def orbit(self, mode: int) -> Orbit:
-        """The exact motion that continues a jam mode, NaN where there is none."""
+        """Return the exact motion that continues a jam mode, NaN if there is none."""
         if mode not in self._orbits:
             jam = self.jam(mode)
             if self.known is None and self.is_known:
@@ -147,22 +146,22 @@ class Evaluation:
         return self._orbits[mode]
 
     def jam_run(self, mode: int) -> Run:
-        """The full equations, integrated from a jam mode for 60 periods of the lowest natural frequency."""
+        """Integrate the full equations from a jam mode for 60 periods of the lowest natural frequency."""
         frequencies = known(jax.lax.stop_gradient(natural_frequencies(self.scene)))
         until = 60.0 * 2.0 * np.pi / frequencies.min()
         return self._run(("jam", mode), partial(simulate, self.scene, until, start="jam", mode=mode, save="window"))
 
     def keep_run(self, mode: int, run: Run) -> None:
-        """Takes a run that has settled in a jam mode for `jam_run`."""
+        """Store a run that has settled in a jam mode as the result of `jam_run`."""
         self._runs["jam", mode] = run
 
     def start_up(self, until: float, spin_up: float) -> Run:
-        """The full equations from rest, the rotor brought up smoothly over the time `spin_up`, s, to the time `until`, s."""
+        """Integrate the full equations from rest to the time `until`, s; the rotor's speed rises over the time `spin_up`, s."""
         ask = partial(simulate, self.scene, until, start="spin_up", spin_up=spin_up, samples=_SAMPLES)
         return self._run(("start_up", until, spin_up), ask)
 
     def _run(self, key: Hashable, ask: Callable[..., Run]) -> Run:
-        """A run; derivatives in forward mode."""
+        """Return a run, whose derivatives are in forward mode."""
         import diffrax
 
         if key not in self._runs:
@@ -171,12 +170,12 @@ class Evaluation:
         return self._runs[key]
 
     def under(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:
-        """The scene, or scenes, of a case, and their path."""
+        """Return the scene or scenes of a case, and their path."""
         return case.scenes(self.scene), (*self.path, case)
 
 
 def guesses(modes: JamModes, target: Target) -> Array:
-    """The load speed, rad/s, of what is asked of the jam modes of a scene; NaN where there is none."""
+    """Return the load speed, rad/s, of a target from the jam modes of a scene; NaN if it does not exist."""
     what, mode = target
     omega = modes.select(mode, throw=False).omega
     if what == "jam":

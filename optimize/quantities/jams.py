@@ -34,12 +34,13 @@ __all__ = [
 ]
 
 _SLIP = 1e-4
-"""Slip n - Omega, per n, below which the torque is computed from what the carrier dissipates: 1e-12 of either is rounding."""
+"""Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both
+have a relative rounding error of 1e-12."""
 
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
-    """Platform, or pair of platforms, whose amplitude is meant: `of`, or, if it is None, platform 1 against 2, and the only
-    platform if there is one.
+    """Return the platform or pair of platforms of an amplitude: `of`, or if it is None, platform 1 relative to platform 2, or
+    the only platform.
 
     **Raises** `InputError` for a platform that is not there.
     """
@@ -79,7 +80,7 @@ def _whose(of: Pair) -> str:
 
 
 def _pair(of: Pair | list[int]) -> Pair:
-    """A platform or a pair of them, also as a list, as design files give it. **Raises** `InputError` for anything else."""
+    """Return a platform or a pair of platforms; a list from a design file becomes a pair. **Raises** `InputError` otherwise."""
     parts = of if isinstance(of, (list, tuple)) else (of,)
     whole = all(isinstance(part, (int, np.integer)) and not isinstance(part, bool) for part in parts)
     if of is not None and not (whole and len(parts) == (2 if parts is of else 1)):
@@ -150,7 +151,7 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
 
 
 def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
-    between(evaluation.scene, of)  # raises for platforms that are not there
+    between(evaluation.scene, of)  # raises an error for platforms that the scene does not have
     i, j = of
     if tier == "leading":
         first = evaluation.jam(mode).displacement
@@ -226,7 +227,7 @@ def _ratio(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
 
 
 def _peaks(evaluation: Evaluation, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
-    """The exact force's peaks in parts of the period: where its first harmonic is small, several are about as high."""
+    """Return peaks of the exact force in parts of the period; if its first harmonic is small, several are about as high."""
     if tier != "exact" or sign < 0.0:
         return sign * _force(evaluation, tier, mode, harmonic)[None]
     return evaluation.orbit(mode).force_peaks()
@@ -335,7 +336,8 @@ def _power(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     torque = loads.drag_sum() * (n - omega)
     if has_term(scene.all_effects, ContactFriction):
         torque = torque + light_friction(loads, scene.all_effects, omega, n)
-    # Strong drag leaves n - Omega few digits; what the carrier dissipates, which that torque equals, has all of them.
+    # With strong drag n - Omega has few correct digits. The torque then follows from the dissipation of the carrier, which has
+    # all digits.
     close = n - omega < _SLIP * n
     taken = evaluation.jammed.dissipated(omega * jnp.where(close, jam.displacement, 0.0))
     torque = jnp.where(close, taken / omega, torque)

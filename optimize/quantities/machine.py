@@ -62,7 +62,7 @@ def _budget(evaluation: Evaluation, tier: Tier) -> Array:
 
 
 def _entries(field: str) -> tuple[str, str, str, str]:
-    """Part, name and unit of an array of numbers of one unit, and words for its entries."""
+    """Return the part, name and unit of an array whose entries have one unit, and a text for its entries."""
     part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
     spec = spec_of(field) if part in ("machine", "loads") and "[" not in name else None
     if spec is None or len(spec.units) > 1:
@@ -71,7 +71,7 @@ def _entries(field: str) -> tuple[str, str, str, str]:
 
 
 def _leaf(scene: Scene, part: str, name: str) -> Array:
-    """The entries of an array of the scene; a number that all loads share counts once for each load."""
+    """Return the entries of an array of the scene; a number that all loads share is repeated for each load."""
     leaf = getattr(getattr(scene, part), name, None)
     if not isinstance(leaf, jax.Array):
         raise InputError("field", f"is '{part}.{name}', which this scene does not have")
@@ -166,7 +166,7 @@ def static_deflection(of: int | None = None) -> Quantity:
 def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
     machine = _platforms(evaluation.scene, "the deflection")
     model, carried = linear_model(evaluation.scene), _carried(machine)
-    # The stiffness matrix of platforms that nothing carries is singular up to rounding: they are held here, and told as NaN.
+    # The stiffness matrix of platforms without supports is singular up to rounding: they are fixed here, with the result NaN.
     held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
     sag = jnp.linalg.solve(model.carrier.stiffness + held, _GRAVITY * jnp.diagonal(model.mass))
     if of is not None and of > sag.shape[0]:
@@ -176,12 +176,12 @@ def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
 
 
 def _carried(machine: Platforms) -> Array:
-    """True (n,) for each platform that stands on a support or is joined, by links, to one that does."""
+    """Return True (n,) for each platform that has a support or is connected by links to a platform with one."""
     n = machine.mass.shape[0]
     joined = jnp.eye(n, dtype=bool)
     for (i, j), stiffness in zip(machine.links, machine.link_stiffness, strict=True):
         joined = joined.at[[i - 1, j - 1], [j - 1, i - 1]].max(stiffness > 0.0)
-    for _ in range(max(n - 1, 1).bit_length()):  # each product doubles the length of the paths that count
+    for _ in range(max(n - 1, 1).bit_length()):  # each product doubles the length of the included paths
         joined = jnp.any(joined[:, :, None] & joined[None], axis=1)
     return jnp.any(joined & (machine.stiffness > 0.0)[None], axis=1)
 
@@ -190,8 +190,8 @@ def _carried(machine: Platforms) -> Array:
 def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quantity:
     """Return the cost of the springs of supports and links, from a price list.
 
-    Prices between two entries are interpolated. Beyond an end of the list they go on as between its last two entries there, but
-    never below the price at that end. A spring of stiffness 0 costs nothing.
+    Prices between two entries are interpolated. Beyond an end of the list they are extrapolated from the last two entries
+    there, but not below the price at that end. A spring of stiffness 0 costs nothing.
 
     **Arguments**
 

@@ -88,7 +88,7 @@ def _settling(evaluation: Evaluation, tier: Tier, until: float, spin_up: float, 
     size = jnp.sqrt(y**2 + (v / run.omega) ** 2 + jnp.finfo(y.dtype).tiny)
     last = size.shape[0] // 20
     off = jnp.abs(size / jnp.mean(size[-last:]) - 1.0) - within
-    # The last sample that is off, and where the line from it to the next one is not any more.
+    # The last sample outside the range, and the time at which the line from it to the next sample enters the range.
     index = jnp.arange(off.shape[0])
     k = jax.lax.stop_gradient(jnp.clip(jnp.max(jnp.where(off > 0.0, index, 0)), 0, off.shape[0] - 2))
     share = jnp.clip(off[k] / (off[k] - off[k + 1]), 0.0, 1.0)

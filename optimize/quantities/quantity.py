@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 Pair = int | tuple[int, int] | None
-"""Platform whose amplitude is meant, or pair of platforms for a relative amplitude; None: see `between`."""
+"""Platform of an amplitude, or pair of platforms of a relative amplitude; None: see `between`."""
 
 Tier: TypeAlias = Literal["leading", "exact", "time"]
 """Method of a quantity: leading order of light loads, the exact periodic motion, or time integration."""
@@ -87,7 +87,7 @@ class Quantity:
 
     @validated
     def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
-        """The quantity's value for a scene, a scalar in `unit`; `modes` saves computing its jam modes once more."""
+        """Return the value for a scene, a scalar in `unit`; known jam `modes` save their computation."""
         return self.read(Evaluation(scene, modes=modes))
 
     def read(self, evaluation: Evaluation) -> Array:
@@ -124,9 +124,9 @@ class Quantity:
 
     @property
     def easy(self) -> Quantity:
-        """Quantity that is searched first in its place, because it takes less time and its best machines are near.
+        """Quantity to leading order and without tolerances, for a first search.
 
-        It is the leading order, without tolerances.
+        That search takes less time, and its best machines are near the final ones.
         """
         return replace(self, parts=tuple(part.easy for part in self.parts)) if self.parts else self
 
@@ -180,7 +180,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class BuiltinQuantity(Quantity):
-    """A quantity that knows what to ask: its function gets the `Evaluation`, the tier and the `settings`."""
+    """Quantity of this package, whose function takes an `Evaluation`, the tier and the `settings`."""
 
     tier: Tier = "leading"
     settings: tuple[object, ...] = ()
@@ -265,7 +265,7 @@ class Combined(Quantity):
         if self.operation in ("*", "/"):
             for part, other in (self.parts, self.parts[::-1])[: 1 if self.operation == "/" else 2]:
                 numbers = part.pieces(evaluation, sign)
-                if len(numbers) > 1:  # they are those of the product where the other one is positive
+                if len(numbers) > 1:  # they are the pieces of the product if the other factor is positive
                     by = other.read(evaluation)
                     many = numbers * by if self.operation == "*" else numbers / by
                     return jnp.where(by > 0.0, many, sign * self.read(evaluation))
@@ -318,7 +318,10 @@ class Demand:
         return limit.constant if isinstance(limit, Combined) and limit.operation == "constant" else None
 
     def form(self) -> Demand:
-        """Same demand without its words and, if that is a number, its limit: demands of one form share programs."""
+        """Return the demand without the text of its limit and without a limit that is a number.
+
+        Demands of one form share programs.
+        """
         limit = self.limit if self.constant is None else Combined("", "", operation="constant")
         return replace(self, limit=limit, shown="")
 
@@ -357,7 +360,7 @@ def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
 
 
 def _term(value: Operand, unit: str, name: str) -> Quantity:
-    """Return an operand of a sum as a quantity: a text is read in the unit of the quantity beside it, as a limit is."""
+    """Return an operand of a sum as a quantity; a text is converted to the unit of the other operand, as for a limit."""
     if isinstance(value, Quantity) or not isinstance(value, (str, UnitQuantity)):
         return _with_unit(value, name)
     return replace(_constant(number_in(value, unit, f"the value beside {name}"), unit), name=str(value).strip())
@@ -377,7 +380,7 @@ def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
 
 
 def _inside(quantity: Quantity) -> str:
-    """Its words, in brackets where they would be misread in a product."""
+    """Return the name of a quantity, in brackets if a product would be ambiguous without them."""
     plain = not (isinstance(quantity, Combined) and quantity.operation in "+-")
     return quantity.words if plain else f"({quantity.words})"
 
@@ -437,13 +440,13 @@ def least(*quantities: Quantity) -> Quantity:
 
 
 def require_quantity(value: object, field: str) -> None:
-    """**Raises** `InputError` for what is no quantity."""
+    """**Raises** `InputError` if a value is no quantity."""
     if not isinstance(value, Quantity):
         raise InputError(field, f"is {quoted(value)}; it must be a Quantity, for example foundation_force(mode=3)")
 
 
 def walk(quantity: Quantity) -> Iterator[Quantity]:
-    """The quantity and all that it is made of."""
+    """Yield the quantity and all quantities from which it is computed."""
     yield quantity
     for part in quantity.parts:
         yield from walk(part)

@@ -13,7 +13,7 @@ __all__ = ["arguments", "number_in", "same_unit"]
 
 
 def arguments(function: Callable[..., object]) -> int:
-    """Number of required arguments of a function; 1 if it is unknown."""
+    """Return the number of required arguments of a function; 1 if it is unknown."""
     try:
         given = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -24,7 +24,7 @@ def arguments(function: Callable[..., object]) -> int:
 
 @lru_cache(maxsize=256)
 def same_unit(one: str, other: str) -> bool:
-    """True if two units are the same, for example "N" and "kg m/s^2"; hertz and rad/s are not."""
+    """Return True if two units are the same, for example "N" and "kg m/s^2"; hertz and rad/s are not."""
     if one == other:
         return True
     ratio = unit_ratio(one, other)
