@@ -23,7 +23,7 @@ STRETCH = 25
 """Number of steps of the descent in one call of its program."""
 
 _ON_THE_WAY = 0.1
-"""Allowed violation of held quantities during the descent, in which every step corrects the violation of the one before."""
+"""Allowed violation of held quantities during the descent, in which every step corrects the violation of the previous step."""
 
 _UPDATE = 20
 """Number of steps between updates of the multipliers of demands."""
@@ -59,14 +59,14 @@ _ADAM = optax.scale_by_adam()
 
 
 def _least(rows: Array, right: Array) -> Array:
-    """Solution x (d,) of least norm of rows (m, d) x = right (m,)."""
+    """Return the solution x (d,) of least norm of rows (m, d) x = right (m,)."""
     gram = rows @ rows.T
     ridge = jnp.finfo(gram.dtype).eps * (1.0 + jnp.trace(gram))
     return rows.T @ small_solve(gram + ridge * jnp.eye(gram.shape[0]), right)
 
 
 def _along(vector: Array, held: Array, free: Array) -> Array:
-    """Projection of `vector` (d,) onto changes of free numbers that keep the held quantities."""
+    """Project `vector` (d,) onto changes of free numbers that keep the held quantities."""
     vector = vector * free
     if held.shape[0] == 0:
         return vector
@@ -167,7 +167,7 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
 
 
 def _point(lanes: _Lane) -> Point:
-    """Point of the searches, without pieces of the objective."""
+    """Return the point of the searches, without pieces of the objective."""
     z, values, slopes = (np.asarray(each) for each in lanes[:3])
     nothing = np.zeros((len(z), 0))
     return Point(z, values, slopes, lanes.known, lanes.known_slopes, nothing, np.zeros((*nothing.shape, z.shape[1])))

@@ -22,16 +22,16 @@ _PRICE = 10.0
 """Penalty of a demand that is violated by its own size, in typical values of the objective."""
 
 _LANES = 8
-"""Number of designs in a batch; populations are small, and few designs are lost at a time."""
+"""Number of designs in a batch. It is small, since populations are small and few designs lose their jam at a time."""
 
 _REMEMBERED = 200
-"""Number of last designs whose jams are stored."""
+"""Number of the latest designs whose jams are stored."""
 
 _KEPT = 8
 """Number of designs that are polished."""
 
 _APART = 1e-2
-"""Least distance of these in one free number, relative to its range."""
+"""Smallest distance between polished designs in one free number, relative to its range."""
 
 _NOWHERE = 1e12
 """Merit of a design without the objective."""
@@ -66,10 +66,10 @@ class Followed:
     def __init__(self, problem: Problem):
         self.problem = replace(problem, lanes=_LANES)
         self.remembered: tuple[np.ndarray, ...] | None = None
-        """The last designs, and the speeds that were followed there."""
+        """Latest designs, and their followed speeds."""
 
     def of(self, z: np.ndarray) -> np.ndarray:
-        """Values of the designs z (s, d), NaN if a quantity does not exist."""
+        """Return the values of the designs z (s, d), NaN if a quantity does not exist."""
         if self.remembered is None:
             values, known = self._at(z, looked_up(self.problem, z))
         else:
@@ -100,7 +100,7 @@ def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float,
     The merit is the scaled objective plus penalties of violated demands. `tell` is called with the progress (0 to 1) and the
     best objective. An interrupt (KeyboardInterrupt) ends the search with its present result.
     """
-    import cma  # an extra
+    import cma  # an optional dependency
 
     followed, m = Followed(problem), problem.equalities
     merits, designs, history = np.zeros(0), np.zeros((0, problem.space.size)), []
@@ -137,7 +137,7 @@ def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float,
 
 
 def _best(merits: np.ndarray, designs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Best distinct designs."""
+    """Return the merits of the best distinct designs, and these designs."""
     kept: list[int] = []
     for k in np.argsort(merits, kind="stable"):
         if all(np.max(np.abs(designs[k] - designs[j])) > _APART for j in kept):

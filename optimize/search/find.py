@@ -63,7 +63,7 @@ class Found(NamedTuple):
 
     @property
     def best(self) -> int:
-        """The number of the best design: the least objective of those that keep all demands, else the least violation."""
+        """Index of the best design: least objective of the designs that meet all demands, otherwise least violation."""
         kept = self.violation < 10.0 * FEASIBLE
         if np.any(kept):
             return int(np.argmin(np.where(kept, self.point.values[:, 0], np.inf)))
@@ -79,8 +79,11 @@ def require_searcher(searcher: object) -> None:
 
 
 def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
-    """Search from random starts. With expensive quantities (exact motions, integrations, tolerances) a first search is to
-    leading order and without tolerances; the second starts from its best different machines and some random ones."""
+    """Search from random starts.
+
+    If quantities are expensive (exact motions, integrations, tolerances), a first search is to leading order and without
+    tolerances; a second one starts from the best distinct machines of the first and some random ones.
+    """
     easy = None if options.begin is not None else problem.easy()
     if easy is None:
         return _find(problem, options, tell)
@@ -92,7 +95,7 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     if _spread(problem):
         random = np.random.default_rng(options.seed).uniform(size=(2 * _STARTS_PER_BOUND, problem.space.size))
         begin = np.concatenate([_few(first), random])[: 2 * _STARTS_PER_BOUND]
-    else:  # its best machines are near those to leading order
+    else:  # the best machines are near those of the first search
         begin, options = _few(first), replace(options, iterations=0, polishing=max(options.polishing, 20))
     narrow = _with_lanes(problem, problem.space)
     if len(begin) == 0:
@@ -102,12 +105,12 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
 
 def _with_lanes(problem: Problem, space: DesignSpace) -> Problem:
-    """Problem in another space, for few designs."""
+    """Return the problem in another space, in small batches for few designs."""
     return replace(problem, space=space, lanes=_STARTS_PER_BOUND)
 
 
 def _spread(problem: Problem) -> bool:
-    """True if tolerances count."""
+    """Return True if a quantity is taken over tolerances."""
     every = [problem.objective, *(q for d in problem.demands for q in (d.quantity, d.limit))]
     return any(isinstance(part, Robust) for q in every for part in walk(q))
 
@@ -167,14 +170,14 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         point = _of_their_mode(problem, begun).where(lost, point)
         broken, left, optimal = violation(problem, point), np.where(lost, np.inf, left), optimality(problem, point)
     bounds = np.asarray(problem.space.low), np.asarray(problem.space.high)
-    # An evolution has one value for each generation, before those of the starts.
+    # The history of an evolution has one value for each generation, followed by those of the polished starts.
     wide = max(part.shape[1] for part in history)
     whole = np.concatenate([np.broadcast_to(part, (len(part), wide)) for part in history])
     return Found(point, whole, left, broken, optimal, drawn, existing, interrupted, bounds)
 
 
 def _of_their_mode(problem: Problem, point: Point) -> Point:
-    """Designs, without values if a jam has another mode number than the requested one."""
+    """Return the designs, without values if the mode number of a jam is not the requested one."""
     if not problem.keys:
         return point
     same = np.ones(len(point.z), bool)
@@ -186,10 +189,10 @@ def _of_their_mode(problem: Problem, point: Point) -> Point:
 
 
 def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
-    """The best design whose chosen numbers have values of their catalogues: branch and bound on the continuous search.
+    """Find the best design whose numbers are in their catalogues by branch and bound on the continuous search.
 
     A bound is the best design with numbers free between two values of the catalogue. If it is not better than the best known
-    choice, all choices between these values are skipped. The search is local: its result is the best one from its starts.
+    choice, all choices between these values are skipped. Since each search is local, the global optimum is not guaranteed.
     """
     root = find(problem, options, lambda what, share: tell(what, 0.5 * share))
     choices = problem.space.choices
@@ -232,13 +235,13 @@ def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
 
 def _away(values: tuple[float, ...], x: float) -> float:
-    """Relative distance of a number from the nearest value of its catalogue."""
+    """Return the relative distance of a number from the nearest value of its catalogue."""
     nearest = min(values, key=lambda v: abs(v - x))
     return abs(x - nearest) / max(abs(nearest), 1e-300)
 
 
 def _few(found: Found) -> np.ndarray:
-    """Best distinct designs, (at most 7, d)."""
+    """Return the best distinct designs, (at most 7, d)."""
     order = np.argsort(np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf))
     kept: list[np.ndarray] = []
     for k in order:
@@ -249,7 +252,7 @@ def _few(found: Found) -> np.ndarray:
 
 
 def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, options: Options) -> Found | None:
-    """Problem with narrower bounds, from the designs with these numbers."""
+    """Solve the problem with narrower bounds, from the designs with these `numbers`."""
     space = problem.space.within(low, high)
     narrow = _with_lanes(problem, space)
     z = np.asarray(space.shares(np.clip(numbers, low, high)))

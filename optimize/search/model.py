@@ -25,7 +25,7 @@ _DIFFERENCE_STEP = 1e-5
 """Step of central differences, as a fraction of the range of a free number."""
 
 _MIN_SHARE_AT_KINK = 1e-4
-"""Smallest share of a piece of the objective that takes part in a kink."""
+"""Smallest share of a piece of the objective that belongs to a kink."""
 
 _SMALL_OBJECTIVE_SHARE = 1e-4
 """Smallest scale of the objective, as a fraction of its change over the bounds by its slope."""
@@ -45,12 +45,12 @@ class Step(NamedTuple):
 
 
 def transposed(a: np.ndarray) -> np.ndarray:
-    """Transpose of each matrix of (s, ...)."""
+    """Transpose each matrix of an array (s, ...)."""
     return np.swapaxes(a, 1, 2)
 
 
 def least_norm(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solution x (s, d) of least norm of rows (s, m, d) x = right (s, m)."""
+    """Return the solution x (s, d) of least norm of rows (s, m, d) x = right (s, m)."""
     gram = rows @ transposed(rows)
     ridge = np.finfo(float).eps * (1.0 + np.trace(gram, axis1=1, axis2=2))
     solved = np.linalg.solve(gram + ridge[:, None, None] * np.eye(gram.shape[1]), right[..., None])
@@ -58,15 +58,15 @@ def least_norm(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _pieces(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray]:
-    """Values (s, p) and derivatives (s, p, d) of the pieces whose maximum is the objective."""
+    """Return values (s, p) and derivatives (s, p, d) of the pieces whose maximum is the objective."""
     if problem.parts == 1:
         return point.values[:, :1], point.slopes[:, :1]
     return point.pieces, point.piece_gradients
 
 
 def kink_residuals(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Differences (s, k) between pieces of the objective with `shares` (s, parts) and the piece with the largest share, in
-    units of `size` (s,), and their derivatives (s, k, d); 0 for pieces without a share."""
+    """Return differences (s, k) between pieces of the objective with `shares` (s, parts) and the piece with the largest share,
+    in units of `size` (s,), and their derivatives (s, k, d); 0 for pieces without a share."""
     most = np.argsort(-shares, axis=1)[:, : point.z.shape[1] + 1]
     values, met = (np.take_along_axis(a, most, axis=1) for a in (point.pieces, shares > _MIN_SHARE_AT_KINK))
     piece_gradients = np.take_along_axis(point.piece_gradients, most[:, :, None], axis=1)
@@ -76,10 +76,11 @@ def kink_residuals(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[
 
 
 def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives at a kink of the objective.
+    """Return derivatives at a kink of the objective.
 
-    **Returns** the derivatives (s, d) of the largest piece; the differences (s, k, d) of the next ones from these; and True
-    (s, k) for pieces about as large: within `near`, relative to the objective or to its change over the bounds.
+    **Returns** the derivatives (s, d) of the largest piece; the differences (s, k, d) of the derivatives of the next largest
+    pieces from these; and True (s, k) for pieces that are as large within `near`, relative to the objective or to its change
+    over the bounds.
     """
     order = np.argsort(-point.pieces, axis=1)[:, : point.z.shape[1] + 1]
     values = np.take_along_axis(point.pieces, order, axis=1)
@@ -89,8 +90,8 @@ def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def second_derivatives(problem: Problem, point: Point) -> np.ndarray:
-    """Second derivatives (s, d, me + mi + parts + 1, d) of held quantities, demands, pieces of the objective, and half the
-    square of the objective, by central differences of the first ones."""
+    """Return second derivatives (s, d, me + mi + parts + 1, d) of held quantities, demands, pieces of the objective, and half
+    the square of the objective, by central differences of first derivatives."""
     s, d = point.z.shape
     moves = _DIFFERENCE_STEP * np.concatenate([np.eye(d), -np.eye(d)])
     # All points in one call, so that chunks are full and every core has work.
@@ -107,11 +108,12 @@ def second_derivatives(problem: Problem, point: Point) -> np.ndarray:
 def curvatures(
     problem: Problem, point: Point, second: np.ndarray, weights: np.ndarray, shares: np.ndarray, size: np.ndarray
 ) -> list[np.ndarray]:
-    """Second derivatives (s, d, d) of the Lagrangian, in units of the objective, made positive semidefinite.
+    """Return second derivatives (s, d, d) of the Lagrangian, in units of the objective, made positive semidefinite.
 
-    They are projected onto the directions that active constraints and pieces leave free; the linear model decides across these.
-    If the objective f is positive, a second set has (f^2/2)''/f in place of f''. For the modulus of an almost linear quantity,
-    such as a force that is to vanish, its step reaches the zero at once, the step of f'' only from nearby.
+    They are projected onto the directions that active constraints and pieces leave free; in the other directions the linear
+    model determines the step. If the objective f is positive, a second set has (f^2/2)''/f in place of f''. If f is the modulus
+    of an almost linear quantity, such as a force that is to vanish, the step of the second set reaches the zero at once, while
+    the step of f'' reaches it only from nearby.
 
     **Arguments**: `second`: see `second_derivatives`; multipliers `weights` (s, me + mi) in units of the objective's `size`
     (s,); `shares` (s, parts) of its pieces.
@@ -126,7 +128,7 @@ def curvatures(
     counts[:, m:] = weights[:, m:] > 1e-12
     free = 1.0 - (((point.z <= 0.0) | (point.z >= 1.0)) * 1.0)
     rows = np.where(np.isfinite(point.slopes), point.slopes, 0.0)[:, 1:] * counts[:, :, None]
-    if problem.parts > 1:  # the pieces that meet at a kink stay equal along it
+    if problem.parts > 1:  # pieces that are equal at a kink stay equal along it
         rows = np.concatenate([rows, kink_residuals(point, shares, size)[1]], axis=1)
     rows = rows * free[:, None, :]
     projector = np.eye(d) * np.ones((s, 1, 1))
@@ -154,7 +156,7 @@ def solve_model(
 ) -> Step:
     """Solve for the step to the minimum of the model within the bounds and the trust region of radius `trust_radius` (s,).
 
-    If the objective is the maximum of several pieces, the problem is that of the epigraph: the least t that none exceeds.
+    If the objective is the maximum of several pieces, the problem is that of the epigraph: the least t that no piece exceeds.
     """
     m, mi, d = problem.equalities, len(problem.demands), point.z.shape[1]
     box = np.maximum(-point.z, -trust_radius[:, None]), np.minimum(1.0 - point.z, trust_radius[:, None])
@@ -165,7 +167,7 @@ def solve_model(
         return Step(found.p, found.held, found.demands * _active(found, demands), np.ones((len(hessian), 1)))
     values = (point.pieces - point.values[:, :1]) / size[:, None]
     slopes = point.piece_gradients / size[:, None, None]
-    # Only pieces that could be the largest in the trust region, and not many more than can meet at one kink.
+    # Only pieces that can become the largest in the trust region count, and not many more than can meet at one kink.
     could = values + np.einsum("spd,sd->sp", np.abs(slopes), np.maximum(-box[0], box[1]))
     few = np.argsort(-could, axis=1)[:, : 3 * d + 8]
     values = np.take_along_axis(values, few, axis=1)
@@ -190,9 +192,9 @@ def solve_model(
 
 
 def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """True (s, mi) for demands (slopes, excess) that are active after the step.
+    """Return True (s, mi) for demands (slopes, excess) that are active after the step.
 
-    An interior-point method leaves small multipliers for inactive demands, which would be large beside an objective near 0.
+    An interior-point method leaves small multipliers of inactive demands, which are not small relative to an objective near 0.
     """
     slopes, excess = demands
     room = -excess - np.einsum("smd,sd->sm", slopes, found.p[:, : slopes.shape[2]])
@@ -200,14 +202,14 @@ def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray
 
 
 def predicted_decrease(problem: Problem, point: Point, hessian: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
-    """Decrease of the objective that the model predicts, relative to its value; for an objective of about 0, relative to its
+    """Return the decrease of the objective that the model predicts, relative to the objective or, if that is about 0, to its
     change over the bounds."""
     values, slopes = _pieces(problem, point)
     along = np.max(values - point.values[:, :1] + np.einsum("spd,sd->sp", slopes, model.p), axis=1)
     dual = np.concatenate([model.held, model.demands], axis=1) * size[:, None]
     constraint_change = np.einsum("sm,smd,sd->s", dual, point.slopes[:, 1:], model.p)
     curved = np.einsum("si,sij,sj->s", model.p, hessian, model.p) * size
-    # At the tip of a modulus that vanishes, slopes give no scale, but their change does.
+    # At the zero of a modulus slopes give no scale, but their change does.
     change = np.max(np.abs(slopes), axis=(1, 2)) + _DIFFERENCE_STEP * np.trace(hessian, axis1=1, axis2=2) * size
     least = np.maximum(np.abs(point.values[:, 0]), _SMALL_OBJECTIVE_SHARE * change)
     return np.abs(along + constraint_change + 0.5 * curved) / np.maximum(least, 1e-300)

@@ -27,19 +27,21 @@ FEASIBLE = 1e-8
 """Largest violation of held quantities and demands in the end, relative to their values."""
 
 _UNREACHABLE_DECREASE = 1e-10
-"""Predicted relative decrease that counts as zero if no step achieves it: the rounding of derivatives of exact motions."""
+"""Predicted relative decrease that counts as zero if no step achieves it. It is the rounding error of derivatives of exact
+motions."""
 
 _HIDDEN_DECREASE, _ROUNDING = 1e-13, 1e-15
-"""Relative decrease of the objective that rounding hides, and relative rounding of the objective."""
+"""Relative decrease of the objective that rounding can hide, and relative rounding error of the objective."""
 
 _KINK_STEPS = 4
 """Number of first-order steps back onto a kink."""
 
 _ACTIVE_DISTANCE = 1e-6
-"""Largest distance from its limit, relative to it, at which a demand or a free number counts as being at it."""
+"""Largest distance of a demand or a free number from its limit, relative to the limit, at which it counts as active."""
 
 _MAX_PENALTY = 1e9
-"""Largest penalty of a violated constraint, in units of the objective; a constraint violated at it is contradictory."""
+"""Largest penalty of a violated constraint, in units of the objective. A constraint that is still violated at this penalty
+contradicts the others."""
 
 
 class Optimality(NamedTuple):
@@ -70,7 +72,7 @@ class Polished(NamedTuple):
 
 
 def violation(problem: Problem, point: Point) -> np.ndarray:
-    """Largest relative violation (s,) of held quantities and demands; infinite for designs without values."""
+    """Return the largest relative violation (s,) of held quantities and demands; infinite for designs without values."""
     m = problem.equalities
     parts = np.concatenate([np.abs(point.values[:, 1 : 1 + m]), np.maximum(point.values[:, 1 + m :], 0.0)], axis=1)
     return np.where(point.exists(), np.max(parts, axis=1, initial=0.0), np.inf)
@@ -211,7 +213,7 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             decreases = [predicted_decrease(problem, here, b, m, size[index]) for b, m in zip(hessians, models, strict=True)]
             left[index] = np.minimum(decreases[0], decreases[-1])
             dual = np.concatenate([model.held, model.demands], axis=1)
-            # With a penalty below its multiplier, a constraint stays violated although it could be met.
+            # A constraint whose penalty is below its multiplier stays violated although it could be met.
             short = np.max(np.abs(dual), axis=1, initial=0.0) > 0.9 * penalty[index]
             penalty[index] = np.where(short, np.minimum(10.0 * penalty[index], _MAX_PENALTY), penalty[index])
             if k == steps:
@@ -257,7 +259,7 @@ def _initial_multipliers(problem: Problem, point: Point) -> np.ndarray:
 
 
 def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, penalty: np.ndarray) -> Point:
-    """Point after a step, and the same moved back onto the constraints and kinks that are active in the model; the better."""
+    """Return the point after a step, or that point moved back onto the active constraints and kinks if it is better."""
     z = np.clip(point.z + model.p, 0.0, 1.0)
     new = evaluate(problem, z, point.ahead(z))
     active = model.demands > 1e-6
@@ -278,7 +280,7 @@ def _merit(problem: Problem, point: Point, size: np.ndarray, penalty: np.ndarray
 
 
 def optimality(problem: Problem, point: Point) -> Optimality:
-    """Optimality of designs, with multipliers by least squares over the active constraints."""
+    """Return the optimality of designs, with multipliers by least squares over the active constraints."""
     m, mi = problem.equalities, len(problem.demands)
     s = len(point.z)
     slopes = np.where(np.isfinite(point.slopes), point.slopes, 0.0)

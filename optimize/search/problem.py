@@ -41,10 +41,9 @@ Known = tuple[Any, ...]
 class Problem(eqx.Module):
     """Design space with an objective and demands.
 
-    **Attributes**: `space`; `objective`; `demands`, their forms, and
-    `constants` (mi,), their limits where these are numbers; `keys` of what is followed; `scales` (mi,): the demands' units,
-    positive;
-    `lanes` designs are evaluated together; `parts`: of how many smooth pieces the objective is the largest.
+    **Attributes**: `space`; `objective`; `demands`: the forms of the demands; `constants` (mi,): their limits if these are
+    numbers; `keys` of the followed speeds; `scales` (mi,): the units of the demands, positive; `lanes`: the number of designs
+    in a batch; `parts`: the number of smooth pieces whose maximum is the objective.
     """
 
     space: DesignSpace
@@ -62,8 +61,8 @@ class Problem(eqx.Module):
         return len(self.space.held)
 
     def values(self, z: Array, near: Sequence[Array], pieces: bool = False) -> tuple[Array, tuple[Array, ...]]:
-        """Objective, deviations of held quantities and excess of demands, (1 + me + mi,), followed by the `pieces` of the
-        objective; and the followed speeds."""
+        """Return the objective, deviations of held quantities and excess of demands, (1 + me + mi,), followed by the `pieces`
+        of the objective if requested; and the followed speeds."""
         evaluation = Evaluation(self.space.at(z), dict(zip(self.keys, near, strict=True)))
         values = self.read(evaluation)
         if pieces:
@@ -71,15 +70,15 @@ class Problem(eqx.Module):
         return values, tuple(evaluation.found[key] for key in self.keys)
 
     def read(self, evaluation: Evaluation) -> Array:
-        """The same numbers from an evaluation of a scene."""
+        """Return the numbers of `values` from an evaluation of a scene."""
         objective = jnp.reshape(self.objective.read(evaluation), (1,))
         held = self.space.residuals(evaluation)
         excess = [demand.excess(evaluation, limit) for demand, limit in zip(self.demands, self.constants, strict=True)]
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
     def easy(self) -> Problem | None:
-        """First search: to leading order and without tolerances, without demands that have no leading order. None if this is
-        the same search, or if the objective has no leading order."""
+        """Problem of the first search: to leading order, without tolerances, and without demands that have no leading order.
+        None if it is the same problem, or if the objective has no leading order."""
         objective = self.objective.easy
         demands = [replace(d, quantity=d.quantity.easy, limit=d.limit.easy) for d in self.demands]
         held = tuple(Held(h.quantity.easy, h.value) for h in self.space.held)
@@ -102,20 +101,23 @@ class Problem(eqx.Module):
 
 
 def _followed(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
-    """Load speeds that a search follows, and the number of smooth pieces of which its objective is the largest."""
+    """Return the load speeds that a search follows, and the number of smooth pieces whose maximum is the objective."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     return _targets((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
 
 
 def _hard(quantity: Quantity) -> bool:
-    """True if part of the quantity is not computed to leading order."""
+    """Return True if part of the quantity is not computed to leading order."""
     return any(isinstance(q, BuiltinQuantity) and q.tier != "leading" for q in walk(quantity))
 
 
 class Point(NamedTuple):
-    """Designs z (s, d), their values (s, 1 + me + mi) and derivatives (s, 1 + me + mi, d), the speeds `known` of what is
-    followed and `known_slopes`, by how much these change with z (s, ..., d); the objective's `pieces` (s, p) and their
-    derivatives `piece_gradients` (s, p, d), none where it is one piece alone."""
+    """Designs with their values and derivatives.
+
+    **Attributes**: designs `z` (s, d); `values` (s, 1 + me + mi) and their derivatives `slopes` (s, 1 + me + mi, d); the
+    followed speeds `known` and their derivatives by z, `known_slopes` (s, ..., d); the objective's `pieces` (s, p) and their
+    derivatives `piece_gradients` (s, p, d), empty for an objective of one piece.
+    """
 
     z: np.ndarray
     values: np.ndarray
@@ -126,19 +128,19 @@ class Point(NamedTuple):
     piece_gradients: np.ndarray
 
     def exists(self) -> np.ndarray:
-        """True if everything has a value and derivatives there (s,)."""
+        """Return True (s,) for designs at which all values and derivatives exist."""
         return np.all(np.isfinite(self.values), axis=1) & np.all(np.isfinite(self.slopes), axis=(1, 2))
 
     def where(self, chosen: np.ndarray, other: Point) -> Point:
-        """Point with the designs of this one if `chosen`, otherwise those of the other."""
+        """Return a point with the designs of this one if `chosen`, otherwise those of the other."""
         return jax.tree.map(lambda a, b: np.where(chosen.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), self, other)
 
     def take(self, index: np.ndarray) -> Point:
-        """Point with the designs of these indices."""
+        """Return the point with the designs of these indices."""
         return jax.tree.map(lambda a: a[index], self)
 
     def put(self, index: np.ndarray, new: Point) -> Point:
-        """Copy with other designs at these indices."""
+        """Return a copy with the designs of `new` at these indices."""
 
         def one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             a = np.array(a)
@@ -148,7 +150,7 @@ class Point(NamedTuple):
         return jax.tree.map(one, self, new)
 
     def ahead(self, z: np.ndarray) -> Known:
-        """Approximate followed speeds at other designs."""
+        """Extrapolate the followed speeds to other designs."""
         step = z - self.z
         guess = []
         for k, r in zip(self.known, self.known_slopes, strict=True):
@@ -158,8 +160,10 @@ class Point(NamedTuple):
 
 
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
-    """Problem of a search with its followed speeds and the scale of each demand: its limit, or its value at the beginning; 1 if
-    both are 0 within rounding."""
+    """Return the problem of a search with its followed speeds and the scale of each demand.
+
+    The scale is the limit of the demand, or its value at the beginning; it is 1 if both are 0 within rounding.
+    """
     forms = tuple(demand.form() for demand in demands)
     keys, parts = _followed(space, objective, forms)
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
@@ -171,7 +175,7 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
 
 
 def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
-    """Modulus of each quantity (q,) at the beginning; 0 if it is negligible relative to its change over the bounds."""
+    """Return the modulus of each quantity (q,) at the beginning; 0 if it is negligible beside its change over the bounds."""
     z = np.random.default_rng(0).uniform(size=(7, space.size))
     scenes = _made(space, on_device(space.numbers(z)))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, scenes)
@@ -183,7 +187,7 @@ def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
 def derive(
     problem: Problem, z: Array, near: Sequence[Array], pieces: bool = False
 ) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
-    """Values, derivatives, followed speeds and their derivatives of one design; those of the `pieces` behind the others."""
+    """Return values, derivatives, followed speeds and their derivatives of one design, with its `pieces` last if requested."""
 
     def twice(x: Array) -> tuple[tuple[Array, tuple[Array, ...]], tuple[Array, tuple[Array, ...]]]:
         values, found = problem.values(x, near, pieces)
@@ -205,7 +209,7 @@ def _derived(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array
 
 @cached
 def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
-    """Load speed of each key for a batch of scenes, from whole branches."""
+    """Return the load speed of each key for a batch of scenes, from whole branches."""
 
     def one(scene: Scene) -> tuple[Array, ...]:
         paths: dict[tuple, JamModes] = {}
@@ -222,7 +226,7 @@ def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
 
         return tuple(guess(path, target) for path, target in keys)
 
-    # One after the other, which compiles in two thirds of the time and runs equally fast.
+    # One scene after the other, which compiles in two thirds of the time and runs equally fast.
     return jax.lax.map(one, scenes)
 
 
@@ -236,7 +240,7 @@ def _lanes(count: int) -> int:
 
 
 def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
-    """Values and derivatives of many designs whose jams are near these speeds."""
+    """Return values and derivatives of many designs whose jams are near these speeds."""
     if len(z) == 0:
         raise ValueError("no designs")
     values, slopes, found, known_slopes = in_chunks(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
@@ -245,7 +249,7 @@ def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
 
 
 def looked_up(problem: Problem, z: np.ndarray) -> Known:
-    """Followed speeds of many designs, from whole branches; NaN without a jam."""
+    """Return the followed speeds of many designs, from whole branches; NaN without a jam."""
     if not problem.keys:
         return ()
     numbers = problem.space.numbers(np.asarray(z))
@@ -253,7 +257,7 @@ def looked_up(problem: Problem, z: np.ndarray) -> Known:
 
 
 def made(problem: Problem, numbers: np.ndarray) -> Scene:
-    """Scenes with these free numbers (s, d), SI: NumPy arrays with a leading axis."""
+    """Return the scenes with these free numbers (s, d), SI, as NumPy arrays with a leading axis."""
     return in_chunks(problem.lanes, lambda x: _made(problem.space, x), numbers)
 
 
@@ -271,8 +275,8 @@ class _Shapes(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
-    """Load speeds that these quantities of a scene follow, and the number of smooth pieces of which the first one is the
-    largest."""
+    """Return the load speeds that these quantities of a scene follow, and the number of smooth pieces whose maximum is the
+    first one."""
     recorder = TargetRecorder()
 
     def ask(scene: Scene) -> tuple[Array, list[Array]]:
@@ -285,7 +289,7 @@ def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[K
 
 
 def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
-    """Load speeds that these quantities follow."""
+    """Return the load speeds that these quantities follow."""
     return _targets(tuple(quantities), _Shapes.of(scene))[0]
 
 
@@ -299,8 +303,10 @@ def _reported(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: S
 
 
 def reported(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | None = None) -> np.ndarray:
-    """Values of quantities (s, q) of some scenes (arrays with a leading axis), NaN if one does not exist; with a `problem`
-    the programs of its search are reused if possible."""
+    """Return the values (s, q) of quantities of some scenes (arrays with a leading axis), NaN if one does not exist.
+
+    With a `problem` the programs of its search are reused if possible.
+    """
     quantities, leaves = tuple(quantities), jax.tree.leaves(scenes)
     if not quantities:
         return np.zeros((leaves[0].shape[0], 0))

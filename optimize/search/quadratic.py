@@ -11,7 +11,8 @@ __all__ = ["Solved", "elastic"]
 _MAX_NEWTON_STEPS = 60
 
 _STEPS_WITHOUT_PROGRESS, _NEAR_OPTIMUM = 8, 1e-6
-"""Number of steps without halving the residual, and residual, at which a program ends: only rounding errors are left."""
+"""Number of steps in which the residual has not halved, and residual, at which the iteration ends because only rounding errors
+are left."""
 
 
 class Solved(NamedTuple):
@@ -25,7 +26,7 @@ class Solved(NamedTuple):
 
 
 def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Matrices (s, m, n) times vectors (s, n)."""
+    """Return the products of matrices (s, m, n) and vectors (s, n)."""
     return (matrix @ vector[..., None])[..., 0]
 
 
@@ -95,7 +96,7 @@ def _with_slacks(
     identity = np.broadcast_to(np.eye(d), (s, d, d))
 
     def row(of_p: np.ndarray, k: int, count: int) -> np.ndarray:
-        """Rows on p, with -1 on the violation of each constraint from the k-th on."""
+        """Return rows with the coefficients `of_p`, and -1 for the violation of each constraint from number `k`."""
         rows = np.zeros((s, of_p.shape[1], n))
         rows[:, :, :d] = of_p
         rows[:, np.arange(count), d + k + np.arange(count)] = -1.0
@@ -149,7 +150,7 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
 def _predicted_and_corrected(
     program: _Program, stationary: np.ndarray, primal: np.ndarray, gap: np.ndarray, slack: np.ndarray, dual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Mehrotra's step of x, slacks and duals: a predictor shows how far the products of slacks and duals can fall."""
+    """Return Mehrotra's step of x, slacks and duals; a predictor determines the possible decrease of slack-dual products."""
     rows, turned = program.rows, np.swapaxes(program.rows, 1, 2)
     (m, n), weight = rows.shape[1:], dual / slack
     matrix = program.quadratic + (turned * weight[:, None, :]) @ rows
@@ -157,7 +158,7 @@ def _predicted_and_corrected(
     matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] / n + 1e-300 * np.eye(n)
 
     def solved(target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Step that increases the products of slacks and duals by `target`."""
+        """Return the step that increases the products of slacks and duals by `target`."""
         rest = -stationary - _times(turned, weight * primal + target / slack)
         dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
         ds = -primal - _times(rows, dx)
@@ -171,6 +172,6 @@ def _predicted_and_corrected(
 
 
 def _longest(value: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Return the largest part of a step, 1 at most, that leaves all values positive."""
+    """Return the largest fraction of a step, at most 1, that leaves all values positive."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return np.minimum(1.0, np.where(step < 0.0, -value / step, np.inf).min(axis=1))

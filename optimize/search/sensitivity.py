@@ -16,12 +16,12 @@ from optimize.search.problem import Problem
 __all__ = ["influences_of", "limits_of", "machines_of", "neighbours"]
 
 _STEP = 0.01
-"""Relative change of the numbers in influences."""
+"""Relative change of a free number for its influence."""
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
-    """Limits of the best design: held quantities, demands and active bounds; `sides` (mi, 2): values of demands and of their
-    limits."""
+    """Return the limits of the best design: held quantities, demands and active bounds; `sides` (mi, 2): values of the demands
+    and of their limits."""
     best, m = found.best, problem.equalities
     values, duals = found.point.values[best], found.optimality
     objective = abs(values[0]) if np.isfinite(values[0]) else np.nan
@@ -65,14 +65,17 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
 
 
 def neighbours(problem: Problem, found: Found) -> np.ndarray:
-    """Free numbers (1 + 2 d, d), SI, of the best design and of its neighbours with one number 1 % smaller or larger."""
+    """Return the free numbers (1 + 2 d, d), SI, of the best design and of its neighbours.
+
+    A neighbour has one number that is 1 % smaller or larger.
+    """
     numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
     off = np.diag(_STEP * numbers)
     return numbers + np.concatenate([np.zeros((1, len(numbers))), -off, off])
 
 
 def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]:
-    """Influence of each free number, from the objective (1 + 2 d,) of the `neighbours`."""
+    """Return the influence of each free number, from the objective (1 + 2 d,) of the `neighbours`."""
     d = problem.space.size
     if not values[0]:
         return ()
@@ -81,7 +84,7 @@ def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]
 
 
 def machines_of(problem: Problem, found: Found, same: float) -> tuple[Machine, ...]:
-    """Distinct machines among the results of the searches, best first."""
+    """Return the distinct machines among the results of the searches, best first."""
     values = np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf)
     left = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
     space, machines = problem.space.within(*found.bounds), []
