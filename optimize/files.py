@@ -1,4 +1,4 @@
-"""Design files: what may change, what is held, what is wanted, in TOML."""
+"""Design files in TOML: free numbers, held quantities, demands and the objective."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _demands(table: object, section: str) -> list[Demand]:
 
 
 def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> tuple[Quantity, Tables]:
-    """A quantity from a table of a file, the part `section` of it, and the values of the fields `more` that are not its own.
+    """Return the quantity of a table in the `section` of a file, and the values of additional fields, whose names are `more`.
 
     **Raises** `InputError` for an unknown quantity, and for values that are not allowed.
     """
@@ -200,4 +200,4 @@ seed = 0
 # rate = 0.05                     # its first step, in parts of a free number's range
 # polishing = 12                  # steps of Newton's method at the end
 """
-"""A commented design file."""
+"""Commented example of a design file."""

@@ -31,10 +31,10 @@ __all__ = ["Front", "pareto"]
 
 
 _ALIKE = 1e-6
-"""Machines whose quantities differ by less, in parts of the range that the front covers, are one point."""
+"""Difference of quantities, relative to the range of the front, below which two machines count as one point."""
 
 _NO_LIMIT = 1e100
-"""A limit that no quantity reaches."""
+"""Limit that no quantity reaches."""
 
 
 class Front(Result):
@@ -71,7 +71,7 @@ class Front(Result):
         )
 
     def _shown(self) -> tuple[list[str], list[np.ndarray]]:
-        """The quantities with the units in which a designer reads them, and their values in these."""
+        """Return names of the quantities with practical units, and their values in these units."""
         labels, columns = [], []
         for name, unit, column in zip(self.names, self.units, self.values.T, strict=True):
             shown, factor = shown_unit(unit, float(np.max(np.abs(column), initial=0.0)))
@@ -141,15 +141,15 @@ def pareto(
         return float(first(found.scene)), float(second(found.scene))
 
     def searched(objective: Quantity, other: Quantity, limit: float) -> list[Synthesis]:
-        """The least of the objective where the other quantity keeps the limit; then the least of that quantity among the
-        machines whose objective is as small."""
+        """Search for the least objective with a limit on the other quantity, then for the least value of that quantity among
+        machines with the same objective."""
         best = synthesize(space, objective, subject_to=[*given, other < limit], starts=starts, seed=seed, verify=False)
-        # A flat objective is least at many machines, of which the first search ends at any.
+        # A flat objective has many minima; the first search ends at any of them.
         alike = [*given, objective < float(objective(best.scene))]
         then = synthesize(space, other, subject_to=alike, begin=best, seed=seed, verify=False, throw=False)
         return [best, then] if then.status_name != "contradictory" else [best]
 
-    # Limits that nothing reaches: machines without the other quantity are left out, and all searches share two programs.
+    # The limit has no effect, but excludes machines without the other quantity and lets all searches share two programs.
     lowest = searched(first, second, _NO_LIMIT)
     highest = searched(second, first, _NO_LIMIT)
     (_, worst), (_, least) = both(lowest[-1]), both(highest[-1])
@@ -168,10 +168,10 @@ def pareto(
 
 
 def not_dominated(values: np.ndarray) -> list[int]:
-    """Return the rows of `values` (n, q) that no other row equals or beats, by their first column; of rows that are alike, one.
+    """Return the indices of rows of `values` (n, q) that no other row dominates, ordered by their first column.
 
-    A row counts as no worse than another one if it exceeds it by less than 1e-6 of the range of each column, or 1e-7 of the
-    largest value where that is more: no search keeps its demands better.
+    Of equal rows one is returned. A row counts as no worse than another one if it exceeds it by less than 1e-6 of the range of
+    each column or 1e-7 of the largest value, whichever is more: searches keep their demands to this accuracy.
     """
     span = np.maximum(np.ptp(values, axis=0), 0.1 * np.max(np.abs(values), axis=0))
     scaled = values / np.where(span > 0.0, span, 1.0)

@@ -28,7 +28,7 @@ def _platforms(scene: Scene, least: int) -> Platforms:
 
 
 def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[str, tuple[Number, Number]]:
-    """Every spring there is, free within a factor of what it is."""
+    """Return bounds for every spring of the machine, within a factor of its stiffness."""
     found: dict[str, tuple[Number, Number]] = {}
     for kind in kinds:
         for k, value in enumerate(np.asarray(getattr(machine, kind))):
@@ -40,8 +40,10 @@ def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[
 
 
 def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
-    """The antiphase machine of two masses: least foundation force per relative amplitude, the jam's frequency and the stiffness
-    budget of the supports kept, all springs free within a factor `range_`.
+    """Return the design of an antiphase machine of two masses: least foundation force per relative amplitude.
+
+    The frequency of the jam and the stiffness budget of the supports keep their values; all springs are free within a factor
+    `range_`.
 
     **Returns** `Design`; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 
@@ -62,9 +64,10 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
 
 
 def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
-    """The anti-resonance machine of three masses: least amplitude of the middle platform (2) per amplitude of the outer ones (1
-    against 3), the links' springs free, the jam's frequency kept. Without damping the middle one rests at k12/M1 = k23/M3 =
-    w^2.
+    """Return the design of an anti-resonance machine of three masses: least middle amplitude per outer amplitude.
+
+    The springs of the links are free, and the frequency of the jam keeps its value. Without damping the middle platform (2) is
+    at rest if k12/M1 = k23/M3 = w^2; the amplitude of the outer ones is that of platform 1 relative to platform 3.
 
     **Returns** `Design`. **Raises** `InputError` for a machine of fewer platforms.
 
@@ -78,11 +81,12 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
 
 
 def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: int = 16) -> list[tuple[str, Synthesis]]:
-    """Find the one spring of an existing machine to exchange: for every spring the best machine that differs in it alone.
+    """Find the spring of an existing machine to exchange: search for the best machine that differs in one spring, for each.
 
-    **Arguments**: `objective` what shall be small; `range_` the factor by which a spring may differ; `starts` of each search.
+    **Arguments**: `objective`: the quantity to minimize; `range_`: the factor by which a spring may differ; `starts` of each
+    search.
 
-    **Returns** the springs' names with what was found, the best first. **Raises** as `synthesize`.
+    **Returns** the springs' names with their results, the best first. **Raises** as `synthesize`.
     """
     machine = _platforms(scene, 1)
     free = _springs(machine, range_, ("stiffness", "link_stiffness"))
@@ -94,8 +98,9 @@ def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: in
 
 
 def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[int, int] | None = None) -> Design:
-    """The lightest loads that shake a platform by the amplitude `least` (m or text): their mass is free, from a tenth to ten
-    times what it is; the track's radius stays.
+    """Return the design with the lightest loads that shake a platform by at least the amplitude `least` (m or text).
+
+    The mass of the loads is free, from a tenth to ten times its value; the radius of the track keeps its value.
 
     **Returns** `Design`.
     """
@@ -109,8 +114,9 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
 
 
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
-    """The springs with which a jam mode lasts over the widest range of rotor speeds about the present one: the greatest
-    distance to the fold, at a share `keep` of the present amplitude at least.
+    """Return the design with the springs for which a jam mode exists over the widest range of rotor speeds about the present.
+
+    The objective is the distance to the fold; the amplitude must be at least the share `keep` of the present one.
 
     **Returns** `Design`. **Raises** `InputError` for a share that is not between 0 and 1.
     """

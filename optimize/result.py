@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 _TELLING = 1000.0
-"""Largest change, per cent, that is shown in per cent; larger ones are shown in the unit of the objective."""
+"""Largest change that is shown in per cent; larger ones are shown in the unit of the objective."""
 
 
 _LINEAR = 10.0
@@ -84,8 +84,8 @@ class Outcome:
 
 
 class Row(NamedTuple):
-    """Row of the table: `what` in words, its SI `unit`; values `before` and `after`, of the exact motion `exact` and by time
-    integration `time`, NaN for an absent one."""
+    """Row of the table: `what`: its name, its SI `unit`; values `before` and `after`, of the exact motion (`exact`) and by time
+    integration (`time`), NaN for an absent one."""
 
     what: str
     unit: str
@@ -119,7 +119,7 @@ class Limit(NamedTuple):
     gain: float
 
     def shortfall(self) -> str:
-        """Distance of the machine from keeping a broken limit, in words."""
+        """Return the distance of the machine from a violated limit as text."""
         if not math.isfinite(self.broken):
             return "the nearest machine found has no such value"
         unit, factor = shown_unit(self.unit, max(abs(self.value), abs(self.limit)))
@@ -127,8 +127,8 @@ class Limit(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """Influence of a free number: `what` in words; the objective's change in per cent if the number alone is 1 % `less`, and 1
-    % `more`."""
+    """Influence of a free number: `what`: its name; the change of the objective in per cent if only this number is 1 % smaller
+    (`less`) and 1 % larger (`more`)."""
 
     what: str
     less: float
@@ -136,7 +136,8 @@ class Influence(NamedTuple):
 
 
 class Machine(NamedTuple):
-    """One of the different machines of a search: how `often` it was found, the objective's `value`, the free `numbers`, SI."""
+    """Distinct machine of a search: `often`, the number of starts that ended at it; the `value` of the objective; the free
+    `numbers`, SI."""
 
     often: int
     value: float
@@ -271,8 +272,10 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 
 
 def _if_moved(gain: float) -> str:
-    """Text on the change of the objective by a changed limit, from the `gain` for 1 %; the change is so small that the slope is
-    valid, at most a tenth of the objective."""
+    """Return text on the change of the objective by a change of a limit, from the `gain` for 1 %.
+
+    The change of the limit is so small that the slope is valid: the objective changes by at most a tenth.
+    """
     share = 1.0
     while abs(gain) * share > _LINEAR:
         share /= 10.0
@@ -282,13 +285,13 @@ def _if_moved(gain: float) -> str:
 
 
 def objective_text(objective: str) -> str:
-    """The objective in words."""
+    """Return the name of the objective for sentences."""
     words = objective.replace("_", " ")
     return f"greatest {words.removeprefix('negative ')}" if words.startswith("negative ") else f"least {words}"
 
 
 def amplitude_names(scene: Scene) -> list[str]:
-    """Names of the amplitudes of the coordinates; that of platform 1 belongs to the coordinate y1."""
+    """Return the names of the amplitudes of the coordinates; that of platform 1 belongs to the coordinate y1."""
     names = scene.machine.structure().coordinates
     if not isinstance(scene.machine, Platforms):
         return [f"amplitude of {name}" for name in names]

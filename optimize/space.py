@@ -189,7 +189,7 @@ class DesignSpace(eqx.Module):
         return sum(each.size for each in self.free)
 
     def _bounds(self, like: np.ndarray | Array) -> tuple[ModuleType, np.ndarray | Array, np.ndarray | Array]:
-        """NumPy or jax.numpy, by whose array `like` is, and the bounds as its arrays."""
+        """Return the module of the array `like`, NumPy or jax.numpy, and the bounds as arrays of that module."""
         xp = np if isinstance(like, np.ndarray) else jnp
         return xp, xp.asarray(self.low), xp.asarray(self.high)
 
@@ -242,7 +242,7 @@ class DesignSpace(eqx.Module):
         return {n.name: (n.leaf(scene) if n.entry is None else n.leaf(scene)[n.entry]).tolist() for n in self.free}
 
     def words(self) -> list[tuple[str, str]]:
-        """Name for a designer, and unit, of each free number."""
+        """Return the name for tables and the unit of each free number."""
         return [(word, each.unit) for each in self.free for word in each.words(self.scene)]
 
     @validated
@@ -260,7 +260,7 @@ class DesignSpace(eqx.Module):
 
 
 def _require_tables(scene: object, free: object, hold: object, ties: object, choices: object) -> None:
-    """**Raises** `InputError` for what is no scene, and for arguments that are no dictionaries or lists."""
+    """**Raises** `InputError` if `scene` is no scene, or another argument is no dictionary or list."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     require_known(scene, "scene", "DesignSpace", "make the space outside")
@@ -292,7 +292,7 @@ def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, float
 
 
 def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict[str, tuple[float, ...]], tuple[int, ...]]:
-    """Catalogues by name, ascending without doubles, and numbers of loads."""
+    """Return the catalogues by name, ascending without duplicates, and the numbers of loads."""
     found: dict[str, tuple[float, ...]] = {}
     counts: tuple[int, ...] = ()
     for name, values in choices.items():
@@ -325,13 +325,13 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
         if source.size not in (1, target.size):
             raise InputError(f"ties.{name}", f"has {target.size} entries and {source_name} {source.size}; name one of them")
         if factor == "keep":
-            with np.errstate(divide="ignore", invalid="ignore"):  # told below
+            with np.errstate(divide="ignore", invalid="ignore"):  # refused below
                 ratio = np.asarray(target.read(scene)) / np.asarray(source.read(scene))
         elif isinstance(factor, (int, float)) and not isinstance(factor, bool) and factor > 0.0:
             ratio = np.full(target.size, float(factor))
         else:
             raise InputError(f"ties.{name}", f"has the factor {quoted(factor)}; give a number greater than 0, or 'keep'")
-        if target.keeps_zeros(scene):  # what the machine does not have follows nothing
+        if target.keeps_zeros(scene):  # an absent part of the machine stays absent
             ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):
             raise InputError(f"ties.{name}", f"keeps its ratio to {source_name}, which is 0 in the scene; give a factor")

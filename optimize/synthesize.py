@@ -43,7 +43,7 @@ _SAME_DESIGN_DISTANCE = 1e-3
 """Largest distance of two designs that count as the same machine, relative to the ranges of the free numbers."""
 
 _SPREAD = 1e-3
-"""Largest angle by which loads start beside the exact motion, rad."""
+"""Largest initial angle of the loads from the exact motion, rad."""
 
 Tell = Callable[[str, float], None]
 
@@ -218,7 +218,7 @@ def _begun(space: DesignSpace, begin: Synthesis) -> np.ndarray:
 def _searched(
     space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options, tell: Tell
 ) -> tuple[DesignSpace, Problem, Found]:
-    """Best search over all allowed numbers of loads."""
+    """Return the best result over all allowed numbers of loads."""
     best: tuple[DesignSpace, Problem, Found] | None = None
     existing = drawn = 0
     for loads in space.counts or (space.scene.loads.count,):
@@ -243,7 +243,7 @@ def _searched(
 
 
 def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options) -> str:
-    """Text with the quantities of a search that no random design has."""
+    """Return text with the quantities of a search that no random design has."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     every = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
     z = np.random.default_rng(options.seed).uniform(size=(options.starts, space.size))
@@ -258,7 +258,7 @@ def _rank(found: Found) -> tuple[bool, float]:
 
 
 def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
-    """Design space with another number of loads. **Raises** `InputError` for loads with individual numbers."""
+    """Return the design space with another number of loads. **Raises** `InputError` for loads with individual numbers."""
     now = space.scene.loads
     if not getattr(now, "alike", False):
         raise InputError("choices.loads.count", "needs loads that share every number; give one mass, radius and drag for all")
@@ -267,12 +267,12 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
 
 
 def _mode_of(objective: Quantity, demands: Sequence[Demand]) -> int | None:
-    """The jam mode of a search: that of its objective or, for a lightest machine, of the first demand that has one."""
+    """Return the jam mode of a search: that of its objective or, for a lightest machine, of the first demand that has one."""
     return next((q.mode for q in (objective, *(d.quantity for d in demands)) if q.mode is not None), None)
 
 
 def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
-    """Run of the full equations of a machine until they have settled in a jam mode, or the reason why there is none."""
+    """Integrate the full equations until they have settled in a jam mode; return the run, or the reason why there is none."""
     if mode is None:
         return None, "the objective and the demands belong to no jam mode that could be integrated"
     if not verify:
@@ -292,7 +292,7 @@ def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]
 
 
 def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
-    """The exact motion of a jam mode; None if there is none, or for a scene that its theory cannot include."""
+    """Return the exact motion of a jam mode; None if there is none, or for a scene that its theory cannot include."""
     try:
         orbit = jam_orbit(scene, mode=mode, throw=False)
     except (InputError, ComputationError):
@@ -301,15 +301,17 @@ def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
 
 
 def _beside(orbit: Orbit) -> State:
-    """State of the exact motion with slightly separated loads, which leave the motion if it is unstable. From a start to
-    leading order, a machine with little damping takes thousands of periods to reach the same motion."""
+    """Return a state of the exact motion with slightly separated loads, which leave the motion if it is unstable.
+
+    From a start on the leading-order motion, a machine with little damping takes thousands of periods to reach the exact one.
+    """
     displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
     spread = _SPREAD * np.linspace(-1.0, 1.0, len(angle)) if len(angle) > 1 else np.zeros(1)
     return State(displacement, velocity, (angle + spread,), rate)
 
 
 def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quantity]]:
-    """Additional rows of a table of a machine in a jam mode."""
+    """Return the standard rows of the table of a machine in a jam mode."""
     if mode is None:
         return []
     rows = [("jam frequency", jam_frequency(mode=mode))]
@@ -321,7 +323,7 @@ def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quant
 def _named(
     space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand], mode: int | None
 ) -> list[tuple[str, Quantity]]:
-    """Quantities of the table: the standard ones of a jam, then the objective, held quantities and demands."""
+    """Return the quantities of the table: the standard ones of a jam, then the objective, held quantities and demands."""
     standard = _standard(scene, mode, objective.of)
     sought = objective.parts[0] if objective.name.startswith("negative ") and objective.parts else objective
     own = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
@@ -336,7 +338,7 @@ def _table(
     values: np.ndarray,
     other: tuple[list[float], list[float]],
 ) -> tuple[Row, ...]:
-    """Free numbers and quantities before and after."""
+    """Return the rows of free numbers and quantities before and after the search."""
     start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.free]) for s in (space.scene, scene))
     absent = [each.spec.zero_is_absent for each in space.free for _ in range(each.size)]
     numbers = zip(space.words(), absent & (start == 0.0) & (end != 0.0), start, end, strict=True)
@@ -354,7 +356,7 @@ def _table(
 def _other_tiers(
     scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, mode: int | None
 ) -> tuple[list[float], list[float]]:
-    """Values of the quantities by the exact motion and by the run of the verification; NaN if they have no such tier."""
+    """Return the quantities by the exact motion and by the run of the verification, NaN if they lack the tier."""
 
     def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
         other = quantity.at_tier(tier)
@@ -364,7 +366,7 @@ def _other_tiers(
             return math.nan
         try:
             return float(other.read(evaluation))
-        except (InputError, ComputationError):  # a theory that does not hold this scene
+        except (InputError, ComputationError):  # a theory that excludes this scene
             return math.nan
 
     evaluation = Evaluation(scene)
