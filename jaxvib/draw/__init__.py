@@ -1,1 +1,1 @@
-"""Plain arrays onto axes, one style; knows no machine."""
+"""Charts of plain arrays in a common style; this package does not depend on machines or results."""

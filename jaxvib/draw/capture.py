@@ -1,4 +1,4 @@
-"""Captures of balls: their paths on the unrolled torus, and shares of captured starts."""
+"""Charts of captures of balls: fractions of captured starts, thresholds, and paths on the unrolled torus."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["curve_chart", "threshold_chart", "torus_paths"]
 def threshold_chart(
     speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float, *, ax: Axes | None = None
 ) -> Drawn:
-    """The share of captured starts over the initial speed, with its standard error, and the threshold.
+    """Draw the fraction of captured starts over the initial speed, with its standard error, and the threshold.
 
     >>> import numpy as np
     >>> len(threshold_chart(np.array([-0.5, -0.1]), np.array([0.0, 1.0]), np.array([0.1, 0.1]), -0.3).axes)
@@ -37,7 +37,7 @@ def threshold_chart(
 def curve_chart(
     value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray, *, ax: Axes | None = None
 ) -> Drawn:
-    """Thresholds of capture over a number, with their uncertainty, and the least captured speeds.
+    """Draw thresholds of capture over the varied number, with their uncertainty, and the lowest captured speeds.
 
     >>> import numpy as np
     >>> len(curve_chart(np.arange(2.0), np.array([-0.5, np.nan]), np.array([0.1, np.nan]), np.array([-0.6, -0.2])).axes)
@@ -62,10 +62,14 @@ def curve_chart(
 
 
 def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: np.ndarray, *, ax: Onto = None) -> Drawn:
-    """Paths of balls on the unrolled torus, and their speeds.
+    """Draw paths of balls on the unrolled torus, and their speeds.
 
-    **Arguments** (T times, N balls): `around` (T, N) rad, the angle relative to the rotor; `across` (T, N) rad, in the tube's
-    cross-section, 0 the bottom, pi/2 the outer equator; `rate` (T, N), relative to the rotor, in its speed; `time` (T,) s.
+    **Arguments** (T times, N balls)
+
+    - `around` (T, N): angle about the axis, relative to the rotor, rad
+    - `across` (T, N): angle in the cross-section of the tube, rad; 0 is the bottom, pi/2 the outer equator
+    - `rate` (T, N): speed relative to the rotor, divided by the rotor speed
+    - `time` (T,): time, s
 
     >>> import numpy as np
     >>> len(torus_paths(*np.zeros((3, 4, 2)), np.arange(4.0)).axes)
@@ -76,7 +80,7 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     for j in range(around.shape[1]):
         colour = COLORS[j % len(COLORS)]
         x, y = _within(around[:, j], -np.pi), _within(across[:, j], -0.5 * np.pi)
-        # No line across the picture where a ball leaves it on one side and comes back on the other.
+        # The line is interrupted if a ball leaves the chart on one side and returns on the other.
         leaps = (np.abs(np.diff(x, prepend=x[:1])) > np.pi) | (np.abs(np.diff(y, prepend=y[:1])) > np.pi)
         broken = np.degrees(np.where(leaps, np.nan, x))
         paths.plot(broken, np.degrees(y), color=colour, lw=0.6, alpha=0.3)
@@ -99,5 +103,5 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
 
 
 def _within(angle: np.ndarray, least: float) -> np.ndarray:
-    """The angle in the turn that begins at `least`, rad."""
+    """Return the angle, rad, reduced to the turn that begins at `least`, rad."""
     return np.mod(angle - least, 2.0 * np.pi) + least

@@ -1,4 +1,4 @@
-"""Charts of plain arrays: branch diagrams, before and after, convergence."""
+"""Charts of plain arrays: branch diagrams, comparisons of two designs, convergence, Pareto fronts."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ __all__ = [
 
 
 PARTS = ("speed", "amplitude", "force")
-"""Panels of a branch diagram over the rotor speed."""
+"""Names of the panels of a branch diagram over the rotor speed."""
 
 
 def branch_diagram(
@@ -62,12 +62,23 @@ def branch_diagram(
     show: Sequence[str] = PARTS,
     ax: Onto = None,
 ) -> Drawn:
-    """Panels over the rotor's speed: load speed (np,), amplitudes (np, nd) mm, foundation force (np,) N, zero to peak.
+    """Draw load speed, amplitudes and foundation force, both zero to peak, over the rotor speed, a panel for each.
 
-    `amplitude` is in m, and in rad where `units` (nd,) say "rad", which is drawn in mrad; if None, all is in m. Of more than
-    two coordinates each has a panel of its own. Stable parts are solid, as `judged`, unstable ones dashed. `resonances` are
-    drawn as level lines, `marks` as points (label, rotor speed, load speed), `at` as an upright line at which the numbers of
-    the `modes` (np,) stand; speeds are given in rad/s and drawn in `unit`. `show` chooses panels of `PARTS`.
+    Stable parts are solid lines, unstable parts dashed. If there are more than two coordinates, each has a separate panel.
+
+    **Arguments** (np points, nd coordinates)
+
+    - `rotor_speed` (np,), `omega` (np,): rotor speed and load speed, rad/s, drawn in `unit`
+    - `stable` (np,): stability; `judged` states the criterion below the figure
+    - `amplitude` (np, nd): amplitudes, m, drawn in mm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units` None:
+      all m
+    - `force` (np,): foundation force, N
+    - `resonances`: resonances, rad/s, drawn as horizontal lines
+    - `modes` (np,): numbers of the jam modes, written at the line of `at`
+    - `marks`: points, each (label, rotor speeds, load speeds), rad/s
+    - `names` (nd,): names of the coordinates
+    - `at`: operating speed, rad/s, drawn as a vertical line
+    - `show`: panels to draw, some of `PARTS`
     """
     scale = speed_scale(unit)
     if not show or any(part not in PARTS for part in show):
@@ -137,8 +148,10 @@ def branch_diagram(
 def log_limits(
     curves: Sequence[np.ndarray], rotor_speed: np.ndarray, omega: np.ndarray, resonances: np.ndarray
 ) -> tuple[float, float]:
-    """The limits of a logarithmic axis: what the curves reach from half the lowest resonance on; below it, where loads run with
-    the rotor, they fall to nothing."""
+    """Return the limits of a logarithmic axis from the range of the curves above half the lowest resonance.
+
+    Below this speed the loads run with the rotor, and the curves approach zero.
+    """
     there = np.isfinite(rotor_speed)
     shown = np.stack([values[there] for values in curves])
     top = float(np.max(shown, initial=1e-300, where=np.isfinite(shown)))
@@ -151,7 +164,7 @@ def log_limits(
 def _speed_lines(
     axis: Axes, scale: float, resonances: np.ndarray, marks: Sequence[tuple[str, np.ndarray, np.ndarray]], high: float
 ) -> None:
-    """Resonances, the rotor's own speed, and marks, in the panel of the loads' speeds."""
+    """Draw resonances, the line of equal rotor and load speeds, and marks in the panel of load speeds."""
     for k, w in enumerate(resonances):
         axis.axhline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
     axis.plot([0.0, high], [0.0, high], color=GUIDE, lw=0.8, label="speed of the rotor", zorder=1.0)
@@ -163,8 +176,11 @@ def _speed_lines(
 def crossings(
     rotor_speed: np.ndarray, stable: np.ndarray, modes: np.ndarray | None, at: float | None
 ) -> list[tuple[int, float, str, bool]]:
-    """Intersections of a branch with the rotor speed `at`: the point before, the fraction of the way to the next, the number of
-    the mode, and True if it is stable."""
+    """Return the intersections of a branch with the rotor speed `at`.
+
+    Each is a tuple of the index of the point before it, the fraction of the distance to the next point, the number of the mode,
+    and True if it is stable.
+    """
     if at is None:
         return []
     gap = rotor_speed - at
@@ -189,14 +205,15 @@ def solid_and_dashed(
     widths: tuple[float, float] = (1.5, 1.2),
     marker: str = "",
 ) -> None:
-    """One line for each unbroken stretch, solid where `stable`; neighbouring stretches share a point so that no gap shows.
-    `widths` of the solid ones and of the dashed ones; with a `marker` the line has one here and there, to be known without
-    colour."""
+    """Draw a line as segments, solid where it is `stable` and dashed elsewhere; neighbouring segments share a point.
+
+    `widths` are those of solid and dashed segments. With a `marker`, a few markers distinguish the line without colour.
+    """
     sparse = {"marker": marker, "markevery": 0.11, "ms": 4.0, "mfc": "white"} if marker else {}
     labelled = False
     for along, solid in stretches(stable):
         if not np.any(np.isfinite(x[along]) & np.isfinite(y[along])):
-            continue  # matplotlib places no marks on a line without a point
+            continue  # matplotlib cannot distribute markers on a line without points
         name = label if solid and not labelled else None
         labelled = labelled or solid
         style, width = ("-", widths[0]) if solid else (UNSTABLE, widths[1])
@@ -204,7 +221,7 @@ def solid_and_dashed(
 
 
 def stretches(stable: np.ndarray) -> list[tuple[slice, bool]]:
-    """The unbroken stretches of a line, each with whether it is stable; neighbours share a point.
+    """Return the segments of a line with their stability (True if stable); neighbouring segments share a point.
 
     >>> stretches(np.array([True, True, False]))
     [(slice(0, 3, None), True), (slice(2, 3, None), False)]
@@ -215,13 +232,15 @@ def stretches(stable: np.ndarray) -> list[tuple[slice, bool]]:
 
 
 def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Drawn:
-    """A bar from 1 to after/before on a logarithmic axis for each (name, before, after), with the values beside it. What has no
-    ratio is written only."""
+    """Draw a bar from 1 to after/before on a logarithmic axis for each (name, before, after), with both values beside it.
+
+    A quantity without a finite, positive ratio has no bar, only its values.
+    """
     figure, (axis,) = panels(1, size=(9.0, 0.42 * len(rows) + 1.5), ax=ax)
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
     drawn = np.isfinite(ratios) & (ratios > 0.0)
     places = np.arange(len(rows))[::-1]
-    # What nearly vanishes leaves the axis: all others would be lines.
+    # Ratios beyond these limits leave the axis; otherwise all other bars would be as thin as lines.
     low, high = max(min([0.7, *ratios[drawn]]), 1e-4), min(max([1.4, *ratios[drawn]]), 1e4)
     for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
         look: Look = {"color": COLORS[0]} if ratio <= 1.0 else {"color": COLORS[3], "hatch": "///", "edgecolor": "white"}
@@ -248,7 +267,7 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
 
 
 def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None = None) -> Drawn:
-    """The objective of every start (iterations, starts) over the iterations, the one numbered `best` bold."""
+    """Draw the objective of every start (iterations, starts) over the iterations, with the start of index `best` in bold."""
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     axis.plot(history, color=GUIDE, lw=0.5, alpha=0.5)
     axis.plot([], [], color=GUIDE, lw=0.8, label="other starts")
@@ -263,7 +282,7 @@ def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None =
 
 
 def front_chart(x: np.ndarray, y: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Drawn:
-    """A front of points (P,), both small where they are good, each with its number.
+    """Draw a Pareto front of points `x` (P,), `y` (P,), both of which are minimized, each with its number.
 
     >>> figure = front_chart(np.array([2.0, 1.0]), np.array([1.0, 3.0]), across="power, W", up="force, N")
     >>> figure.axes[0].get_ylabel()

@@ -1,4 +1,4 @@
-"""Charts that set one way of computing against another."""
+"""Charts that compare methods of computation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 def tiers_chart(
     mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray, *, ax: Axes | None = None
 ) -> Drawn:
-    """Relative differences (n,) by name over the mass of a load (n,) kg; marks are hollow where `stable` (n,) is False."""
+    """Draw relative differences (n,) by name over the mass of a load (n,) kg; markers are hollow if `stable` (n,) is False."""
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     for color, mark, stroke, (name, values) in zip(
         COLORS, MARKERS, itertools.cycle(STROKES), differences.items(), strict=False
@@ -46,8 +46,13 @@ def tiers_chart(
 
 
 class CostPanel(NamedTuple):
-    """A panel of `cost_chart`: `lines` by name, (n, 2) seconds and relative errors each; `floor`, below which the reference
-    itself may be wrong; the `quantity`; `best` (m, 2), the points to ring."""
+    """Panel of `cost_chart`.
+
+    - `lines`: arrays (n, 2) of seconds and relative errors by name
+    - `floor`: relative error of the reference; smaller errors are not significant
+    - `quantity`: name of the quantity
+    - `best`: points (m, 2) that are marked by rings
+    """
 
     lines: Mapping[str, np.ndarray]
     floor: float
@@ -56,8 +61,9 @@ class CostPanel(NamedTuple):
 
 
 def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[float], *, ax: Onto = None) -> Drawn:
-    """Relative error over seconds, a panel for each title, two in a row; a name has one look in all of them, told in one
-    legend. Dotted lines at the errors that are `error_levels`.
+    """Draw the relative error over the time in seconds, a panel for each title, two in a row.
+
+    A name has the same colour and marker in all panels, which share a legend. Dotted lines mark the `error_levels`.
 
     >>> lines = {"exact": np.array([[1e-3, 1e-4], [2e-3, 1e-8]])}
     >>> figure = cost_chart({"": CostPanel(lines, 1e-9, "amplitude", lines["exact"][1:])}, [1e-6])
@@ -65,7 +71,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[
     'relative error of amplitude'
     """
     names = list(dict.fromkeys(name for panel in panels_by_title.values() for name in panel.lines))
-    # Colours repeat after 8 and marks after 7, so that no two lines look alike.
+    # Colours repeat after 8 lines and markers after 7; therefore no two of the first 56 lines look the same.
     looks = {name: (COLORS[k % len(COLORS)], "os^Dv*P"[k % 7]) for k, name in enumerate(names)}
     columns = len(panels_by_title) if ax is not None else min(2, len(panels_by_title))
     figure, cells = panels(-(-len(panels_by_title) // columns), columns, size=(6.6, 4.4), ax=ax)
@@ -116,7 +122,7 @@ def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], loo
 def convergence_chart(
     harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
 ) -> Drawn:
-    """Errors (n, w) over the highest harmonic (n,), log scale; their estimates `known` (n, w) dashed."""
+    """Draw errors (n, w) over the highest harmonic (n,) on a log scale, with their estimates `known` (n, w) as dashed lines."""
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     floor = np.finfo(float).eps
     for k, (color, name) in enumerate(zip(itertools.cycle(COLORS), names, strict=False)):
@@ -139,8 +145,9 @@ def stability_chart(
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw a band for each value (n,), shaded at the load speeds `omega` (n, P), rad/s, that are `stable` (n, P), with marks
-    (k, 2) by kind; speeds in `unit`.
+    """Draw a band for each value (n,), shaded at the load speeds `omega` (n, P) that are `stable` (n, P).
+
+    `marks` are points (k, 2) of load speed and value by kind. Speeds are in rad/s and drawn in `unit`.
     """
     figure, (axes,) = panels(1, size=(7.5, 5.0), ax=ax)
     logarithmic = value[0] > 0.0 and value[-1] > 3.0 * value[0]
@@ -161,7 +168,7 @@ def stability_chart(
 
 
 def _edges(places: np.ndarray) -> np.ndarray:
-    """Edges (n + 1,) of bands around ascending places (n,), in the middle between neighbours."""
+    """Return the edges (n + 1,) of bands around ascending positions (n,), midway between neighbours."""
     if places.size == 1:
         return places[0] + max(abs(float(places[0])), 1.0) * np.array([-0.1, 0.1])
     between = (places[:-1] + places[1:]) / 2.0
@@ -177,9 +184,10 @@ def audit_chart(
     *,
     ax: Onto = None,
 ) -> Drawn:
-    """The relative changes by effects (n, by their `labels`), a mark for each quantity, with the line of the `accuracy`;
-    changes below the `uncertainty` (n,) are grey. A second panel shows the operations that the effects add (n,), relative to
-    those of the scene.
+    """Draw the relative changes (n,) by n effects with these `labels`, a marker for each quantity, and the operations added.
+
+    A line marks the requested `accuracy`; the range below the `uncertainty` (n,) is grey. A second panel shows the operations
+    that the effects add, `added` (n,), relative to those of the scene.
 
     >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01, np.array([0.05]))
     >>> figure.axes[0].get_xlabel()
@@ -196,7 +204,7 @@ def audit_chart(
     for color, mark, (name, values) in zip(COLORS, "os^D", changes.items(), strict=False):
         if not np.any(np.isfinite(values)):
             continue
-        # What is too small to be drawn stands on the edge.
+        # Values below the axis are drawn on its edge.
         left.plot(np.maximum(100.0 * values, low), place, mark, color=color, ms=6, alpha=0.85, label=name)
     left.set_xscale("log")
     left.set_xlim(left=low)
@@ -224,8 +232,11 @@ def steps_chart(
     route: str,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Central differences against a derivative, relative, `off` (n, k) over their relative `steps` (k,), a line for each of n
-    names; rings where they are `best` (n,), extrapolated (`at_best`, (n,)); dotted the tolerance."""
+    """Draw relative differences `off` (n, k) between central differences and a derivative over the relative `steps` (k,).
+
+    Each of n `names` has a line. A ring marks its `best` step (n,) with the extrapolated difference `at_best` (n,), and a
+    dotted line marks the tolerance.
+    """
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
     floor = np.finfo(float).eps
     for color, name, line, x, y in zip(itertools.cycle(COLORS), names, off, best, at_best, strict=False):

@@ -30,8 +30,14 @@ def agreement_maps(
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
 ) -> Drawn:
-    """Planes of rotor speed (S,) rad/s, drawn in `unit`, and load mass (H,), log scale, a panel for each of `maps` (title,
-    exact (H, S)), coloured by whether the exact answer is as `predicted` (H, S).
+    """Draw maps over rotor speed and load mass, coloured by the agreement of predicted and exact balancing.
+
+    **Arguments**
+
+    - `speed` (S,): rotor speed, rad/s, drawn in `unit`
+    - `height` (H,): load mass relative to the scene's, on a log scale
+    - `predicted` (H, S): True if the criterion predicts balancing
+    - `maps`: a panel for each (title, exact), `exact` (H, S) True if the loads balance
 
     >>> import numpy as np
     >>> figure = agreement_maps(np.array([1.0, 2.0]), np.array([0.1, 1.0]), np.eye(2) > 0, [("", np.eye(2) > 0)])
@@ -66,10 +72,10 @@ def pull_chart(
     exact: list[list[float]] | None = None,
     unit: SpeedUnit = "rad/s",
 ) -> None:
-    """The criterion's functional (S,) over rotor speed (S,) rad/s, drawn in `unit`; balancing intervals shaded, exact ones a
-    bar below.
+    """Draw the functional of the criterion (S,), kg m^2, over rotor speed (S,), rad/s, drawn in `unit`.
 
-    The functional spans many decades near resonances, so its sign and size are drawn on a symmetric log scale.
+    Balancing intervals are shaded, and exact ones are bars at the bottom. The functional spans many decades near resonances;
+    therefore its sign and magnitude are drawn on a symmetric log scale.
 
     >>> import matplotlib.pyplot as plt, numpy as np
     >>> ax = plt.figure().subplots()

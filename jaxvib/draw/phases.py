@@ -1,4 +1,4 @@
-"""Jams of loads at unequal phases, over their drag."""
+"""Chart of jams of loads at unequal phases over their drag."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from jaxvib.draw.style import (
 __all__ = ["drag_diagram"]
 
 _WIDTHS = (2.2, 1.0)
-"""Widths of stable and unstable lines, so that overlapping dashes are not taken for a stable line."""
+"""Widths of stable and unstable lines, which differ because overlapping dashes could otherwise look like a stable line."""
 
 
 def drag_diagram(
@@ -40,11 +40,17 @@ def drag_diagram(
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Load speeds over the drag, log scale, of patterns (name, drag, speed, stable), (n,) each; the rotor's a level line.
+    """Draw load speeds over the drag, on a log scale; stable parts are solid, unstable ones dashed.
 
-    Patterns of one name have one colour; stable parts are solid, unstable ones dashed. `label` names the drag on its axis; `at`
-    is drawn as an upright line with the `jams` (speed, stable) on it, unstable ones hollow; with `within` the axis goes from
-    `at` / `within` to `at` x `within`. Speeds are given in rad/s and drawn in `unit`.
+    **Arguments**
+
+    - `branches`: patterns (name, drag, speed, stable), arrays (n,); patterns of the same name have the same colour
+    - `rotor_speed`: rotor speed, rad/s, drawn as a horizontal line
+    - `label`: label of the drag axis
+    - `at`: drag of the scene, drawn as a vertical line
+    - `jams`: jams (speed, stable) on this line; unstable ones are hollow
+    - `within`: factor of the range of the axis, from `at` / `within` to `at` x `within`; None: automatic range
+    - `unit`: unit in which speeds, rad/s, are drawn
 
     >>> import numpy as np
     >>> drag, speed = np.array([1.0, 2.0, 1.5]), np.array([5.0, 6.0, 7.0])

@@ -1,4 +1,4 @@
-"""A record and the model that was fitted to it."""
+"""Chart of a record and the model fitted to it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ __all__ = ["record_chart"]
 
 
 def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:
-    """Two panels over time (n,) s: recorded and fitted angle (n,) rad, in degrees, and fit minus record against 2 `noise`, rad.
+    """Draw the recorded and the fitted angle over time, and their difference in a second panel, in degrees.
+
+    `time` (n,) is in s, `angle` and `fitted` (n,) are in rad. The difference, fit minus record, is compared with twice the
+    `noise`, rad.
 
     >>> import numpy as np
     >>> len(record_chart(np.arange(3.0), np.zeros(3), np.ones(3), 0.1).axes)

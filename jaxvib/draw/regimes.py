@@ -1,4 +1,4 @@
-"""Chart of the kinds of motion that loads come to, over their drag."""
+"""Chart of the regimes of loads over their drag."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["regime_chart"]
 
 
 HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
-"""Hatches of neighbouring areas, which distinguish them in grey."""
+"""Hatches that distinguish neighbouring areas in greyscale."""
 
 
 def regime_chart(
@@ -24,8 +24,10 @@ def regime_chart(
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
 ) -> Drawn:
-    """Shares (nd,) of the kinds of motion as stacked areas, and speeds of the loads (nd, ns) rad/s, drawn in `unit`, over
-    drag (nd,) N s/m.
+    """Draw the fractions of regimes as stacked bars, and the speeds of the loads, over their drag.
+
+    `drag` (nd,) is in N s/m, `shares` are fractions (nd,) by regime, and `omega` (nd, ns) and `rotor_speed` are in rad/s, drawn
+    in `unit`.
 
     >>> import numpy as np
     >>> figure = regime_chart(np.array([1.0, 2.0]), {"jammed": np.array([1.0, 0.5])}, np.ones((2, 3)), 2.0)

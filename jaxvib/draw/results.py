@@ -1,4 +1,4 @@
-"""Small charts of plain arrays for results that need no other: modes, phases, speeds, signals, multipliers."""
+"""Small charts of plain arrays: modes, phases, speeds, signals, multipliers, growth rates."""
 
 from __future__ import annotations
 
@@ -45,8 +45,16 @@ def modes_chart(
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
 ) -> Drawn:
-    """Load speeds (k,) rad/s, drawn in `unit`, and amplitudes (k, nd) m, drawn in mm (tilts in mrad), over the numbers of modes
-    (k,); filled where stable, resonances level; `names` (nd,) of the coordinates, a mark and a colour each.
+    """Draw load speeds and amplitudes of jam modes over their numbers; markers are filled for stable modes.
+
+    **Arguments**
+
+    - `mode` (k,): numbers of the modes
+    - `omega` (k,): load speeds, rad/s, drawn in `unit`
+    - `stable` (k,): stability by slope
+    - `amplitude` (k, nd): amplitudes, m, drawn in mm (tilts: rad, drawn in mrad), with a marker and a colour per coordinate
+    - `resonances`: resonances, rad/s, drawn as horizontal lines
+    - `names` (nd,): names of the coordinates
 
     >>> import numpy as np
     >>> figure = modes_chart(np.array([1, 2]), np.array([3.0, 4.0]), np.array([True, False]), np.ones((2, 1)), names=["y"])
@@ -81,7 +89,9 @@ def modes_chart(
 def shapes_chart(
     frequency: np.ndarray, shape: np.ndarray, *, names: Sequence[str], unit: SpeedUnit = "rad/s", ax: Axes | None = None
 ) -> Drawn:
-    """Mode shapes (k, nd) as bars, a group for each mode with its frequency (k,) rad/s, drawn in `unit`; `names` (nd,).
+    """Draw mode shapes (k, nd) as bars, a group for each mode, labelled with its frequency (k,) rad/s, drawn in `unit`.
+
+    The coordinates have the `names` (nd,).
 
     >>> import numpy as np
     >>> shapes_chart(np.array([10.0]), np.ones((1, 2)), names=("y1", "y2")).axes[0].get_xticklabels()[0].get_text()
@@ -108,8 +118,10 @@ def shapes_chart(
 
 
 def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) -> Drawn:
-    """Angles of loads (count,) rad as points on a circle, and their mean as an arrow: 1 where all are together, 0 where they
-    cancel; one circle for each (title, angles), or one pair of `ax` each.
+    """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
+
+    An arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel. Given
+    axes `ax` must be as many as the circles.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
@@ -153,7 +165,7 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) ->
 
 
 def _loads_on_circle(axis: Axes, angles: np.ndarray) -> None:
-    """Points with the numbers of the loads, those at one angle named together."""
+    """Draw loads as points with their numbers; loads at the same angle share a label."""
     order = np.argsort(np.mod(angles + 1e-6, 2.0 * np.pi))
     groups: list[list[int]] = []
     for k in order:
@@ -179,8 +191,10 @@ def speeds_chart(
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Speeds (n,) rad/s as points with their values on a level line for each (label, speeds), then intervals (n, 2) as bars,
-    drawn in `unit`; what is no finite number is left out, an interval without an end goes to the edge.
+    """Draw speeds (n,) rad/s as labelled points, then intervals (n, 2) rad/s as bars, a row for each, in `unit`.
+
+    `rows` contains (label, speeds), `spans` (label, intervals). Speeds that are not finite are left out. An interval with an
+    infinite end extends to the edge.
 
     >>> import numpy as np
     >>> figure = speeds_chart([("resonances", np.array([1.0, np.nan]))], [("balancing", np.array([[1.0, np.inf]]))])
@@ -215,7 +229,7 @@ def speeds_chart(
 def signals_chart(
     x: np.ndarray, signals: Sequence[tuple[str, np.ndarray, Sequence[str]]], *, across: str, ax: Onto = None
 ) -> Drawn:
-    """One panel for each (label with unit, values (n, k), k names), over x (n,), which `across` labels.
+    """Draw a panel for each (label with unit, values (n, k), k names) over `x` (n,), whose label is `across`.
 
     >>> import numpy as np
     >>> len(signals_chart(np.arange(3.0), [("angle, rad", np.ones((3, 1)), ["load"])], across="time, s").axes)
@@ -233,7 +247,7 @@ def signals_chart(
 
 
 def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Drawn:
-    """Values (n, k) as points over 1 .. n.
+    """Draw values (n, k) as points over 1 to n.
 
     >>> import numpy as np
     >>> points_chart(np.ones((3, 2)), across="run", up="speed, rad/s").axes[0].get_xlabel()
@@ -249,7 +263,7 @@ def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = 
 
 
 def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Drawn:
-    """Floquet multipliers (n,) in the complex plane, and the unit circle.
+    """Draw Floquet multipliers (n,) in the complex plane with the unit circle.
 
     >>> import numpy as np
     >>> multiplier_chart(np.array([0.5 + 0.1j])).axes[0].get_xlabel()
@@ -274,7 +288,7 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Draw
 
 
 def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertainty: float, *, ax: Axes | None = None) -> Drawn:
-    """Rates of growth (n,) 1/s of stretches that end at `time` (n,) s; the exponent with its standard error."""
+    """Draw growth rates (n,) 1/s of intervals that end at `time` (n,) s, and the exponent 1/s with its standard error."""
     figure, (axes,) = panels(1, ax=ax)
     axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each stretch")
     half = time[time.size // 2 :]

@@ -1,4 +1,4 @@
-"""One style for every figure."""
+"""Common style and helpers of all figures."""
 
 from __future__ import annotations
 
@@ -38,33 +38,33 @@ __all__ = [
 ]
 
 SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
-"""Units in which speeds are drawn."""
+"""Unit in which speeds are drawn."""
 
 Onto: TypeAlias = "Axes | Sequence[Axes] | None"
-"""The axes that a figure goes onto: one, or as many as it has panels; None for a figure of its own."""
+"""Axes onto which a chart is drawn: one, or as many as it has panels; None for a new figure."""
 
 Drawn: TypeAlias = "Figure | Any"
-"""Result of a plot: its figure, or the given axes, whose type the caller knows (`Any`)."""
+"""Result of a plot: the new figure, or the axes of the argument `ax`, which are of the caller's type (`Any`)."""
 
 Look: TypeAlias = dict[str, Any]
-"""Drawing style: matplotlib's options, each of its own type."""
+"""Drawing style: options of matplotlib, which have various types."""
 
 COLORS = ("#004488", "#d55e00", "#44aa99", "#e69f00", "#882255", "#88ccee", "#000000", "#b3b3b3")
-"""Colours that readers with any colour vision tell apart, and of unlike greys where they follow each other; further series
-start over."""
+"""Colours that readers with any colour vision can distinguish, with different grey levels of neighbours; further series start
+again with the first."""
 
 MARKERS = "osD^vPX*"
 STROKES = ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
-"""Marks and strokes of series, which distinguish them without colours, too."""
+"""Line styles of series; with `MARKERS` they distinguish series without colours."""
 
 UNSTABLE = (0, (3, 2))
-"""The dashes of what is not stable."""
+"""Dash pattern of unstable parts."""
 
 GUIDE = "#8a8a8a"
-"""The colour of lines that are no data: resonances, limits, the speed of the rotor."""
+"""Colour of reference lines: resonances, limits, the rotor speed."""
 
 OPERATING: Look = {"color": "black", "lw": 1.0, "ls": (0, (8, 2, 2, 2)), "zorder": 1.5}
-"""The line of the speed at which the machine runs."""
+"""Style of the line of the operating speed."""
 
 _STYLE: Any = {
     "font.size": 10.0,
@@ -83,7 +83,7 @@ _SCALES = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
 
 
 def speed_scale(unit: str) -> float:
-    """Factor from rad/s to `unit`. **Raises** `InputError` but for "rad/s", "rpm" and "Hz".
+    """Return the factor from rad/s to `unit`. **Raises** `InputError` for a unit other than "rad/s", "rpm" and "Hz".
 
     >>> round(speed_scale("rpm"), 3)
     9.549
@@ -103,10 +103,12 @@ def panels(
     polar: bool = False,
     ax: Onto = None,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with `rows` x `columns` axes in the house's style, `size` inches each, columns as wide as `widths` say; with
-    `ax` those axes and their figure.
+    """Create a figure with `rows` x `columns` axes in the common style, or use the axes `ax` and their figure.
 
-    **Returns** the figure and its axes. **Raises** `InputError` for `ax` that are no axes, or not as many as there are panels.
+    Axes have the `size` (width, height) in inches; `widths` are relative widths of the columns.
+
+    **Returns** the figure and its axes. **Raises** `InputError` if `ax` are not matplotlib's axes, or if their number differs
+    from that of the panels.
 
     >>> figure, axes = panels(2)
     >>> len(axes)
@@ -114,7 +116,7 @@ def panels(
     """
     if ax is not None:
         given = [ax] if isinstance(ax, Axes) else ax
-        if isinstance(given, (list, tuple, np.ndarray)):  # a long range would fill the memory
+        if isinstance(given, (list, tuple, np.ndarray)):  # not any sequence: a long `range` would fill the memory
             given = list(np.ravel(np.asarray(given, dtype=object)))
         if not isinstance(given, list) or not all(isinstance(each, Axes) for each in given):
             raise InputError("ax", f"is {quoted(ax)}; give matplotlib's Axes, such as those of matplotlib.pyplot.subplots()")
@@ -132,7 +134,9 @@ def panels(
 
 
 def log_places(low: float, high: float, most: int = 9) -> LogLocator:
-    """Ticks of a logarithmic axis: powers of ten over three decades or more, at most `most`, otherwise also between them.
+    """Return the tick positions of a logarithmic axis.
+
+    They are powers of ten, at most `most`, over three decades or more, and also values between them over a smaller range.
 
     >>> [float(x) for x in log_places(0.4, 3.0).tick_values(0.4, 3.0) if 0.4 < x < 3.0]
     [0.5, 1.0, 2.0]
@@ -145,8 +149,9 @@ def log_places(low: float, high: float, most: int = 9) -> LogLocator:
 
 
 def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
-    """Ticks of a logarithmic axis, call it when its limits are set: powers of ten over three decades or more, else plain
-    numbers, with as many between as there is room for.
+    """Set the ticks of a logarithmic axis, whose limits must already be set.
+
+    The labels are powers of ten over three decades or more, otherwise plain numbers; see `log_places` for the positions.
 
     >>> figure, (axis,) = panels(1)
     >>> _ = axis.set_yscale("log"), axis.set_ylim(0.4, 3.0)
@@ -162,7 +167,7 @@ def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
 
 
 def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:
-    """The legend of a panel above it, where it covers no data; none where nothing has a label."""
+    """Draw the legend of a panel above it, where it covers no data; draw nothing if no series has a label."""
     _, names = axis.get_legend_handles_labels()
     if not names and "handles" not in options:
         return
@@ -171,16 +176,16 @@ def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:
 
 
 def load_names(count: int) -> list[str | None]:
-    """Names for the legend of as many loads; of more than eight, whose colours start over, the first alone speaks for all."""
+    """Return the names of loads for a legend; more than eight loads, whose colours repeat, share the label of the first."""
     if count == 1:
         return ["load"]
     return [f"load {k + 1}" for k in range(count)] if count <= len(COLORS) else [f"{count} loads", *[None] * (count - 1)]
 
 
 def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str], filled: Sequence[bool]) -> None:
-    """Points at one `x` with their names to the right, those in one text whose points nearly touch; filled or hollow.
+    """Draw filled or hollow points at one `x` with their names to the right; names of nearly touching points share a text.
 
-    Call it when the limits of the axes are set: what lies outside of them is left out.
+    The limits of the axes must already be set, because points outside of them are left out.
     """
     low, high = axis.get_ylim()
     inside = sorted((k for k, y in enumerate(heights) if np.isfinite(y) and low <= y <= high), key=lambda k: heights[k])
@@ -202,14 +207,16 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
 
 
 def together(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
-    """Names at heights, ascending, as shares of the panel's: what would cover each other as one text between.
+    """Join names that would overlap; their heights, in ascending order, are fractions of the height of the panel.
+
+    A joined text is placed at the mean height of its names.
 
     >>> together([(0.1, "1"), (0.5, "4"), (0.52, "3")])
     [(0.1, '1'), (0.51, '3, 4')]
     """
     groups: list[list[tuple[float, str]]] = []
     for share, name in named:
-        # Near the last of a group, whose text shall not be far from its first.
+        # Near the last name of a group, but not far from its first, because the text stands between both.
         first, last = (groups[-1][0][0], groups[-1][-1][0]) if groups else (-1.0, -1.0)
         near = share - last < 0.045 and share - first < 0.09
         groups = [*groups[:-1], [*groups[-1], (share, name)]] if near else [*groups, [(share, name)]]
@@ -217,7 +224,7 @@ def together(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
 
 
 def legend_outside(figure: Figure, axes: Sequence[Axes], columns: int, **options: Any) -> None:
-    """One legend for several panels of a figure, above all of them; each name once."""
+    """Draw a common legend of several panels above the figure, with each name once."""
     named = {name: handle for axis in axes for handle, name in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(
         [*named.values()], [*named], loc="outside upper left", ncols=columns, frameon=False, fontsize="small", **options

@@ -1,4 +1,4 @@
-"""Many cases: maps of labels and of values, shares with their uncertainty, distributions, sensitivities."""
+"""Charts of many cases: maps of labels and of values, fractions with uncertainty, distributions, sensitivities."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxvib.draw.style import COLORS, Drawn, log_ticks, panels
 __all__ = ["distribution_chart", "label_map", "points_over", "shares_chart", "tornado_chart", "value_map"]
 
 _NO_ANSWER_COLOR = "#f4f4f4"
-"""Colour of cases without an answer."""
+"""Colour of cases without a result."""
 
 _DASHES = {"fold": "-", "torus": "--", "period doubling": "-.", "symmetry": ":"}
 
@@ -32,7 +32,9 @@ def label_map(
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
 ) -> Drawn:
-    """The plane of x (n,) and y (m,) coloured by labels, codes (m, n) of `names`, -1 for none; over it lines by their kind.
+    """Draw a map over x (n,) and y (m,), coloured by labels, with lines over it.
+
+    The labels are codes (m, n), which are indices into `names`, or -1 for no label. `lines` are pairs of x and y by kind.
 
     >>> import numpy as np
     >>> figure = label_map(np.arange(2.0), np.arange(3.0), np.eye(3, 2, dtype=int), ["a", "b"], across="x", up="y")
@@ -65,7 +67,7 @@ def label_map(
 
 
 def _light(colour: str) -> tuple[float, float, float]:
-    """The colour mixed with white, so that black lines are seen on it."""
+    """Return the colour mixed with white, which makes black lines on it visible."""
     red, green, blue = (int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
     return 0.55 * red + 0.45, 0.55 * green + 0.45, 0.55 * blue + 0.45
 
@@ -92,7 +94,7 @@ def value_map(
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
 ) -> Drawn:
-    """The plane of x (n,) and y (m,) coloured by values (m, n), grey where they are NaN.
+    """Draw a map over x (n,) and y (m,), coloured by values (m, n); NaN is grey.
 
     >>> import numpy as np
     >>> len(value_map(np.arange(2.0), np.arange(3.0), np.ones((3, 2)), across="x", up="y", label="z").axes)
@@ -108,7 +110,7 @@ def value_map(
 
 
 def points_over(x: np.ndarray, values: np.ndarray, *, across: str, up: str, log: bool = False, ax: Axes | None = None) -> Drawn:
-    """Values (n, k) as points over x (n,).
+    """Draw values (n, k) as points over x (n,).
 
     >>> import numpy as np
     >>> points_over(np.arange(3.0), np.ones((3, 2)), across="x", up="y").axes[0].get_ylabel()
@@ -130,7 +132,9 @@ def shares_chart(
     level: str = "95 %",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Shares (n,) over x (n,), each with the lower and the upper end of its interval as a band.
+    """Draw fractions (n,) over x (n,) by name, each with its confidence interval as a band.
+
+    `shares` contains the fraction, the lower end and the upper end of its interval, of the confidence `level`.
 
     >>> import numpy as np
     >>> share = np.array([0.1, 0.5])
@@ -149,7 +153,7 @@ def shares_chart(
 
 
 def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax: Axes | None = None) -> Drawn:
-    """Histogram of cases (n,) between edges (n + 1,), and their cumulative share on an axis of its own.
+    """Draw a histogram of `counts` (n,) between edges (n + 1,), and the cumulative fraction on a second axis.
 
     >>> import numpy as np
     >>> distribution_chart(np.arange(4.0), np.ones(3), across="force, N").axes[0].get_xlabel()
@@ -170,7 +174,9 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax
 def tornado_chart(
     names: list[str], low: np.ndarray, high: np.ndarray, middle: float, *, across: str, ax: Axes | None = None
 ) -> Drawn:
-    """Bars from `low` to `high` (n,) about a middle, the longest on top: what a quantity is where a number is small and large.
+    """Draw bars from `low` (n,) to `high` (n,) about `middle`, the longest at the top.
+
+    They are values of a quantity for the lowest and the highest fifth of each number in `names`.
 
     >>> import numpy as np
     >>> figure = tornado_chart(["a", "b"], np.array([1.0, 0.0]), np.array([3.0, 9.0]), 2.0, across="force, N")

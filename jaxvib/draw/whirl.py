@@ -1,4 +1,4 @@
-"""Campbell diagrams."""
+"""Campbell diagrams of rotors."""
 
 from __future__ import annotations
 
@@ -20,8 +20,14 @@ def campbell_diagram(
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Whirl speeds (ns, nd) rad/s over rotor speed (ns,) rad/s, drawn in `unit`: forward ones solid, backward ones dashed; the
-    line w = n with the `critical` speeds (k,), forward or not (k,), written beside it; `at` the operating speed.
+    """Draw whirl speeds over the rotor speed: forward whirls as solid lines, backward whirls dashed.
+
+    **Arguments**
+
+    - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl speeds, rad/s, drawn in `unit`
+    - `forward` (ns, nd): True for forward whirls
+    - `critical`: critical speeds (k,), rad/s, and True for forward ones (k,), marked on the line w = n with their values
+    - `at`: operating speed, rad/s
 
     >>> import numpy as np
     >>> n = np.linspace(0.0, 2.0, 5)
@@ -53,7 +59,10 @@ def campbell_diagram(
 
 
 def _critical_marks(axis: Axes, speed: np.ndarray, forward: np.ndarray, right: float, top: float) -> None:
-    """Points on the synchronous line, and their speeds beside lines that drop to the axis; close ones in one text."""
+    """Draw critical speeds as points on the line w = n, with their values beside vertical lines to the axis.
+
+    Close critical speeds share a text.
+    """
     for group, word in critical_groups(speed, forward, right):
         for k in group:
             look = {"mfc": "white", "mec": COLORS[0] if forward[k] else COLORS[1], "mew": 1.4, "zorder": 4}
@@ -64,8 +73,10 @@ def _critical_marks(axis: Axes, speed: np.ndarray, forward: np.ndarray, right: f
 
 
 def whirl_lines(speed: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """The lines (k, ns) of whirls of one sense, of speeds (ns, nd) those that are its `own` (ns, nd): the k-th keeps its place
-    among its kind while speeds of different sense cross; NaN where there are fewer.
+    """Return the lines (k, ns) of whirls of one sense from all speeds (ns, nd); `own` (ns, nd) is True for this sense.
+
+    Each line is the k-th speed of its sense in ascending order, and therefore continuous if speeds of different sense cross. It
+    is NaN where fewer speeds have this sense.
 
     >>> import numpy as np
     >>> whirl_lines(np.array([[1.0, 2.0], [1.5, 1.4]]), np.array([[True, False], [False, True]])).tolist()
@@ -76,7 +87,7 @@ def whirl_lines(speed: np.ndarray, own: np.ndarray) -> np.ndarray:
 
 
 def critical_groups(speed: np.ndarray, forward: np.ndarray, right: float) -> list[tuple[list[int], str]]:
-    """The critical speeds (k,) up to `right`, ascending, close ones together, and what is written beside each group.
+    """Return groups of close critical speeds (k,) up to `right`, in ascending order, as indices and a text for each group.
 
     >>> import numpy as np
     >>> critical_groups(np.array([1.0, 10.0, 10.1]), np.array([True, True, False]), right=20.0)
