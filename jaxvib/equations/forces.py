@@ -143,7 +143,7 @@ def _load_energies(
 
 @validated
 def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
-    """Return the power that the rotor puts in, and the power that dampers, drag and friction dissipate, W.
+    """Return the power input by the rotor, and the power that dampers, drag and friction dissipate, W.
 
         P_in = speed T,    T = sum_j M_j + d'(theta).P q''  (ideal drive),    the motor's torque otherwise
         P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of supports and contacts
@@ -157,7 +157,7 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     - `scene` and a `state` of it
     - `t`, s: the time, which determines the angle of an ideal drive's rotor; typical: 0 without an imbalance
 
-    **Returns** two scalars, W: the power put in and the power dissipated; typical: 10 to 5000 W.
+    **Returns** two scalars, W: the power input and the dissipated power; typical: 10 to 5000 W.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

@@ -75,7 +75,7 @@ class Loads(Part):
     Arrays have one entry per load, or are scalars shared by all loads; functions act elementwise on (count,) arrays.
 
     A load has one or several coordinates u. The first is its angle about the rotor's axis, rad; its generalised force is the
-    torque that the load takes off the rotor.
+    torque that the load takes from the rotor.
 
     **Attributes**
 

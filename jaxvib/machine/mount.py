@@ -26,12 +26,13 @@ class Mount(eqx.Module):
     - `rows`: arrays (np, nd). The first is a point of the rotor's axis. The second is the tilt of the axis, in 1/m times the
       unit of a displacement. Machines that do not tilt have the first only
     - `axes` (np,): the direction of a load's plane (0 across, 1 up) of each row
-    - `levers`: a lever (count,) for each entry of `rows`; None is 1, an absent entry is 0. (None,) if all loads run at the
-      first point, (None, distances from it in m) if each has a station of its own
+    - `levers`: a lever (count,) for each entry of `rows`; None is 1, an absent entry is 0. It is (None,) if all loads run at
+      the first point, and (None, distances from it in m) if each load has its own station
     - `rotor_levers`: the same for the rotor's mass centre, scalars
     - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one.
       typical: 0.01 to 0.5 kg m^2, the polar inertia of the rotor
-    - `turn` c (nd,): the exciter's housing turns by c q, and the torque of the drive reacts on it; None if it does not turn
+    - `turn` c (nd,): the exciter's housing turns by c q, and the reaction torque of the drive acts on it; None if it does not
+      turn
 
     >>> import jaxvib as jv
     >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),

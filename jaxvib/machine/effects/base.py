@@ -108,7 +108,7 @@ class Effect(Part):
     kind: eqx.AbstractVar[str]
 
     repeatable: ClassVar[bool] = False
-    """True if a scene may hold several of them (supports at several places)."""
+    """True if a scene may contain several such effects, for example supports at several places."""
 
     @abc.abstractmethod
     def terms(self) -> tuple[Term, ...]:

@@ -49,7 +49,7 @@ class LoadContact(Effect):
     - `damping` c, N s/m, at least 0 (the default); typical: 2 to 200
     - `restitution` e in place of the damping, above 0, up to 1; typical: 0.3 to 0.9
 
-    **Raises** `InputError` for values that are not allowed and for damping beside a restitution. A scene raises it for loads
+    **Raises** `InputError` for values that are not allowed, and for both damping and restitution. A scene raises it for loads
     without a ball radius, and for loads that differ if there is a restitution.
 
     >>> import jaxvib as jv

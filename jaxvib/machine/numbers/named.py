@@ -57,7 +57,7 @@ class NamedNumber(NamedTuple):
 
     @property
     def entries(self) -> set[tuple[_Path, int]]:
-        """Path and index of each single number, by which numbers that two names share are found."""
+        """Path and index of each single number. They show which numbers two names share."""
         return {(self.path, k) for k in (range(self.size) if self.entry is None else (self.entry,))}
 
     def leaf(self, scene: Scene) -> Array:
@@ -80,7 +80,7 @@ class NamedNumber(NamedTuple):
         return float(number(given, self.unit, field, **self.spec.bounds._asdict()))
 
     def single(self, scene: Scene) -> tuple[NamedNumber, ...]:
-        """Return the numbers of an array, each with its own name; for a single number, the number alone."""
+        """Return the numbers of an array, each with its own name, or a tuple of the number if it is a single one."""
         if self.entry is not None or not np.ndim(self.leaf(scene)):
             return (self,)
         return tuple(self._replace(name=f"{self.name}[{k}]", entry=k, size=1) for k in range(self.size))
@@ -139,7 +139,7 @@ def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
     for prefix, path, part in _parts(scene):
         for steps, leaf in jax.tree_util.tree_leaves_with_path(part):
             if not _is_continuous(leaf) or not np.size(leaf) or (isinstance(part, Exciter) and len(steps) > 1):
-                continue  # loads, drive and effects of an exciter are parts of their own
+                continue  # loads, drive and effects of an exciter are separate parts
             inner, spec = _steps(part, steps)
             whole = NamedNumber(prefix + jax.tree_util.keystr(steps), (*path, *inner), None, np.size(leaf), spec)
             found |= {each.name: each for each in (whole.single(scene) if len(spec.units) > 1 else (whole,))}

@@ -62,13 +62,13 @@ def support(
 
 
 class PlaneBody(Machine):
-    """Rigid body with the coordinates q = (x, y, psi): its centre of mass across and up, and its turn anticlockwise.
+    """Rigid body with the coordinates q = (x, y, psi): its centre of mass across and up, and its anticlockwise rotation.
 
         m x'' = f_x,    m y'' = f_y,    J psi'' = moment of the forces
         a point at (a, b) moves by B q,    B = [[1, 0, -b], [0, 1, a]]
 
-    The torque of a drive acts between its rotor and the body. A motor has its torque at the speed relative to the body. An
-    ideal drive turns its rotor in the fixed frame.
+    The torque of a drive acts between its rotor and the body. The torque of a motor depends on its speed relative to the body.
+    An ideal drive prescribes the speed of its rotor in the fixed frame.
 
     **Attributes**
 
@@ -129,8 +129,8 @@ def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport
 
         m x'' = f_x,    m y'' = f_y,    J psi'' = moment of the forces
 
-    Displacements are from static equilibrium, x to the right, y up, psi anticlockwise. The turn is small: kinematics are linear
-    in q.
+    Displacements are measured from static equilibrium, x to the right, y up, psi anticlockwise. The rotation is assumed to be
+    small: kinematics are linear in q.
 
     **Arguments** (SI or texts with a unit)
 
