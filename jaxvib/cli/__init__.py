@@ -14,7 +14,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """The command `jaxvib`; exit code 0 done, 1 the computation failed, 2 bad input."""
+    """Run the command `jaxvib`. The exit code is 0 for success, 1 for a failed computation, 2 for bad input."""
     gc.disable()
     interrupts: list[int] = []
 
@@ -28,10 +28,10 @@ def main() -> None:
             prepare()
         from jaxvib.cli.app import run
 
-        gc.freeze()  # modules stay: looking through them again and again, and at the end, takes a fifth of a short command
+        gc.freeze()  # garbage collection of the modules would take a fifth of the time of a short command
         gc.enable()
         code = run(sys.argv[1:])
-    except KeyboardInterrupt:  # before the command began, or a second one while the first was answered
+    except KeyboardInterrupt:  # before the command began, or a second one during the handling of the first
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
@@ -41,8 +41,11 @@ def main() -> None:
 
 
 def _exit_at_once(code: int) -> None:
-    """Leave the process to the system. Threads may still compile, and an orderly exit would destroy XLA under their feet: it
-    does not wait for them, since CPython before 3.13 takes a thread for finished if joining it was interrupted."""
+    """Exit without cleanup of the interpreter.
+
+    Threads may still be compiling. An orderly exit would destroy XLA while they use it, because CPython before 3.13 takes a
+    thread for finished, and does not wait for it, if an earlier join was interrupted.
+    """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
@@ -50,7 +53,7 @@ def _exit_at_once(code: int) -> None:
 
 
 def prepare() -> None:
-    """Float64, and compiled programs cached on disk, so that the second call of a command answers at once."""
+    """Enable double precision and the cache of compiled programs on disk, which makes the second call of a command fast."""
     from jaxvib.runtime.startup import start
 
     with warnings.catch_warnings(record=True) as found:
@@ -60,5 +63,5 @@ def prepare() -> None:
     jax.config.update("jax_enable_x64", True)
     for warning in found:
         print(f"jaxvib: {warning.message}", file=sys.stderr)
-    if found:  # nor in a folder that was refused
+    if found:  # a folder that was refused must not become JAX's cache either
         jax.config.update("jax_compilation_cache_dir", None)

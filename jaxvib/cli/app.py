@@ -1,4 +1,4 @@
-"""The commands, and what they have in common: JSON, files, exit codes."""
+"""Group of the commands, and their common parts: scenes, JSON, files, exit codes."""
 
 from __future__ import annotations
 
@@ -24,9 +24,13 @@ __all__ = ["SPEED", "UNIT", "WITHOUT", "Output", "app", "loaded_scene", "run", "
 
 
 def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
-    """The scene of a file, the effects of the kinds `without` left out, at a constant `speed` of the rotor where one is given;
-    where it shall be `constant`, at the speed that a run-up ends at, which is then said. **Raises** `InputError` for an effect
-    that the scene has not, and for what is no speed."""
+    """Load the scene of a file, and change its effects and its drive.
+
+    **Arguments**: `path` of the file; `without`, kinds of effects to leave out; `speed`, constant rotor speed in place of the
+    drive; `constant`: True to replace a run-up by its final speed, with a message on stderr.
+
+    **Raises** `InputError` for an effect that the scene does not have, and for a text that is not a speed.
+    """
     from jaxvib.machine.drive import ConstantSpeed  # slow to import, as what follows, and --help needs none of it
     from jaxvib.machine.files import load_scene
 
@@ -46,23 +50,24 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
 
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
-"""The option of commands whose theories do not know every effect."""
+"""Option of commands whose theories do not include every effect."""
 
 
 SPEED = click.option("--speed", help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
-"""The option of commands that ask what a machine does at a constant speed."""
+"""Option of commands about motions at a constant rotor speed."""
 
 
 UNIT = click.option(
     "--unit", type=click.Choice(["rad/s", "rpm", "Hz"]), default="rpm", show_default=True, help="Of speeds in figures."
 )
-"""The option of commands that draw speeds."""
+"""Option of commands that plot speeds."""
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
-    """Rows of text under a title and column heads, drawn with lines; the first column to the left, numbers to the right.
+    """Return a table with a title, column heads and lines; the first column is aligned to the left, the others to the right.
 
-    Columns without a word in them are left out."""
+    Empty columns are omitted.
+    """
     from rich.console import Console  # slow to import, and --json needs none of it
     from rich.table import Table
 
@@ -105,7 +110,7 @@ _GROUPS = {
     "What an answer is worth": {"cost": "study.cost", "audit": "study.audit"},
     "Other tools": {"export": "export"},
 }
-"""The commands by what they are for, each with the module of `jaxvib.cli` that holds it."""
+"""Commands by purpose, each with the module of `jaxvib.cli` that contains it."""
 
 _HOMES = {name: home for group in _GROUPS.values() for name, home in group.items()}
 
@@ -125,7 +130,7 @@ class _Lazy(click.Group):
         return sorted(_HOMES)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands with their summaries, read from the text of their modules: importing all would take a second."""
+        """List the commands with their summaries, which are read from the source files: importing all would take a second."""
         widest = max(map(len, _HOMES))
         for title, group in _GROUPS.items():
             with formatter.section(title):
@@ -138,7 +143,7 @@ class _Lazy(click.Group):
 
 
 def _first_line(name: str) -> str:
-    """First line of a command's docstring."""
+    """Return the first sentence of a command's docstring, up to a full stop or semicolon."""
     source = Path(__file__).parent.joinpath(*_HOMES[name].split(".")).with_suffix(".py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef) and any(_is_command(decorator, name) for decorator in node.decorator_list):
@@ -160,14 +165,14 @@ def app() -> None:
 
 
 def shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Adds --json, --out and --report to a command; it gets them as one `Output`."""
+    """Add the options --json, --out and --report to a command, which gets them as one `Output`."""
 
     @click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout, nothing else.")
     @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write pictures and data into this folder.")
     @click.option(
         "--report", type=click.Path(path_type=Path, dir_okay=False), help="Write one web page with all of it (.html)."
     )
-    @functools.wraps(command)  # click keeps a command's own options on the function itself
+    @functools.wraps(command)  # also copies the command's own options, which click stores on the function
     def wrapped(as_json: bool, out: Path | None, report: Path | None, **rest: Any) -> None:
         command(output=Output(as_json, out, report, rest.get("scene")), **rest)
 
@@ -179,10 +184,10 @@ _NO_ARGUMENTS: type[click.UsageError] | tuple[()] = getattr(click.exceptions, "N
 
 
 def run(arguments: list[str]) -> int:
-    """Runs a command line and gives its exit code: 0 done, 1 the computation failed, 2 bad input."""
+    """Run a command line and return its exit code: 0 for success, 1 for a failed computation, 2 for bad input."""
     wants_json = "--json" in arguments
     try:
-        # a command that computed all it was asked, and found a failure, exits by itself with its code
+        # a command whose result is a failure exits with its own code
         return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False, obj=tuple(arguments)) or 0
     except InputError as error:
         message = f"{error}{_way_out(arguments, error)}"
@@ -215,7 +220,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _way_out(arguments: list[str], error: InputError) -> str:
-    """The option of a command that leaves out the effect, or replaces the drive, that it refuses; nothing of other errors."""
+    """Return a hint at the option that removes a refused effect or replaces a refused drive; an empty text for other errors."""
     table, _, name = error.field.partition(".")
     command = app.commands.get(arguments[0]) if arguments else None
     options = [] if command is None else [option.name for option in command.params]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus")
-"""The names of `jaxvib.machine.files.TEMPLATES`, whose import is slow."""
+"""Names of `jaxvib.machine.files.TEMPLATES`, repeated here because that import is slow."""
 
 
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
@@ -105,7 +105,7 @@ def simulate(
 
 
 def _long(scene: jv.Scene, until: str) -> bool:
-    """True if a run takes so long that a progress bar is worth more than a cached program, which cannot have one."""
+    """True if a run is so long that a progress bar is more useful than a cached program, which cannot have one."""
     from jaxvib.units import number
 
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)

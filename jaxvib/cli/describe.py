@@ -53,5 +53,5 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
 
 
 def _manual(build: object) -> str:
-    """The docstring up to its example."""
+    """Return the docstring up to its example."""
     return (inspect.getdoc(build) or "").split(">>>")[0].rstrip()

@@ -17,7 +17,7 @@ SEPARATION = click.option(
 
 
 def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:
-    """Step-size controller from the options. **Raises** `InputError` where both options are given."""
+    """Return the step-size controller of the options. **Raises** `InputError` if both options are present."""
     if tolerance is not None and accuracy is not None:
         raise InputError("accuracy", "is given together with tolerance; give one of them")
     if accuracy is not None:
@@ -26,7 +26,7 @@ def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Toleranc
 
 
 def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, object]:
-    """End of a motion, and values measured over its last turns."""
+    """Return the final values of a motion, and the values measured over its last turns."""
     structure = scene.machine.structure()
     rotors = (run.window.rotor_speed,) if isinstance(run, jv.Envelope) else run.window.rotor_speeds
     speeds = [speed[-1] for speed in rotors]
@@ -43,7 +43,7 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
 
 
 def run_document(run: jv.Run) -> dict[str, object]:
-    """A run's quantities over its last turns, its error and its cost."""
+    """Return a run's quantities over its last turns, its error and its cost."""
     return {
         **measured_document(run, run.scene),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
@@ -52,7 +52,7 @@ def run_document(run: jv.Run) -> dict[str, object]:
 
 
 def _regime(found: jv.Regime) -> dict[str, object]:
-    """The regime and its evidence; names as in `RegimeName` and `PhasePattern`."""
+    """Return the regime and its evidence, with the names of `RegimeName` and `PhasePattern`."""
     return {
         "name": found.label,
         "pattern": found.pattern_label,

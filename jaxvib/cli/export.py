@@ -12,7 +12,7 @@ from jaxvib.errors import InputError
 
 _KINDS = ("fmu", "state-space", "uff")
 _ONLY = {"fmi": "fmu", "drive": "fmu", "source_only": "fmu", "mode": "state-space", "quantity": "uff", "rotor_speed": None}
-"""Options that go with one kind of file; None: with all but fmu."""
+"""Options that apply to one kind of file only; None: to all kinds except fmu."""
 
 
 @app.command("export")

@@ -59,7 +59,7 @@ def modes(
             raise InputError("--csv", "writes branches over the load speed; jams at any phases have none, see --json")
         _phases(loaded, unit, output)
         return
-    found = jax.device_get(jv.jam_modes(loaded))  # in NumPy's hands: reading it compiles nothing
+    found = jax.device_get(jv.jam_modes(loaded))  # NumPy arrays, because indexing JAX arrays would compile programs
     output.picture("branches.png", lambda: jv.branches(loaded).plot(unit=unit))
     if csv is not None:
         output.csv(csv, jv.branches(loaded), "point")
@@ -125,12 +125,12 @@ def modes(
 
 
 def _stability_text(growth: float) -> str:
-    """Text on the stability of a jam whose loads can separate."""
+    """Return a text about the stability of a jam whose loads can separate."""
     return "unknown" if math.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
-    """A line on the effects that a table of light loads' jams leaves out; none where the rotor is balanced."""
+    """Return a line about the effects that a table of jams of light loads ignores; an empty list for a balanced rotor."""
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import RotorImbalance
 
@@ -139,7 +139,7 @@ def _left_out(scene: jv.Scene) -> list[str]:
 
 
 def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
-    """The jams of light loads at any phases."""
+    """Print the jams of light loads at any phases."""
     from jaxvib.results.status import sentence
     from jaxvib.steady.jams.phases import degrees
 
@@ -184,7 +184,7 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
 
 
 def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -> None:
-    """The exact jams, those that light loads have and those that only the full equations have, and the special points."""
+    """Print the exact jams, with those that do not exist for light loads, and the special points."""
     from jaxvib.steady.orbits.search import exact_mode_speeds  # slow import: it needs the time integrator
 
     light = jv.jam_modes(scene)

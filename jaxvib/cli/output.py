@@ -21,18 +21,19 @@ if TYPE_CHECKING:
 __all__ = ["CSV", "Output", "fields_of"]
 
 CSV = click.option("--csv", type=click.Path(path_type=Path, dir_okay=False), help="Write the curves into this CSV file.")
-"""The option of commands that have curves."""
+"""Option of commands that have curves."""
 
 
 def fields_of(result: object, *names: str) -> dict[str, object]:
-    """Numbers of a result by their names, for a document."""
+    """Return fields of a result by their names, for a document."""
     return {name: getattr(result, name) for name in names}
 
 
 class Output:
     """Destination of the results of a command: a JSON document or text on stdout, files in a folder, a report of one HTML page.
 
-    **Arguments**: `as_json`; the `folder` of `--out`; the `report` file; the `scene` file that the command is about.
+    **Arguments**: `as_json`: True for JSON on stdout; `folder` of `--out`; `report`, the file of `--report`; `scene`, the scene
+    file of the command.
     """
 
     def __init__(self, as_json: bool, folder: Path | None, report: Path | None = None, scene: Path | None = None):
@@ -51,33 +52,33 @@ class Output:
 
     @staticmethod
     def _make(folder: Path, option: str) -> None:
-        """Before anything is computed: a result that has nowhere to go is lost."""
+        """Create a folder before anything is computed, because a result that cannot be written would be lost."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(option, f"is {quoted(str(folder))}, which cannot be made a folder ({error.strerror})") from error
 
     def file(self, name: str) -> Path | None:
-        """Path of a result file; None without --out."""
+        """Return the path of a result file; None without --out."""
         if self.folder is None:
             return None
         self.files.append(str(self.folder / name))
         return self.folder / name
 
     def keep(self, name: str, result: Result) -> None:
-        """Save a result to a file with that name, with --out."""
+        """Save a result to a file with that name if --out is used."""
         path = self.file(name)
         if path is not None:
             result.save(path)
 
     def made(self, name: str) -> Path:
-        """Path of the main file of a command: in the folder --out, by default in the current folder."""
+        """Return the path of the main file of a command, in the folder of --out or in the current folder."""
         path = (self.folder or Path()) / name
         self.files.append(str(path))
         return path
 
     def picture(self, name: str, draw: Callable[[], Figure]) -> None:
-        """Draw a figure into the file with that name and onto the report, with --out or --report."""
+        """Draw a figure and save it to the file with that name (--out) and to the report (--report)."""
         path = self.file(name)
         if path is None and self.report is None:
             return
@@ -88,7 +89,7 @@ class Output:
             self.figures.append((Path(name).stem.replace("_", " "), figure))
 
     def csv(self, path: Path | None, result: Result, axis: str) -> None:
-        """Write the values of a result along an axis into a CSV file, with --csv."""
+        """Write the values of a result along an axis to the CSV file of --csv, if there is one."""
         if path is None:
             return
         from jaxvib.results.csv import write_csv  # slow to import, and --help needs none of it
@@ -97,9 +98,10 @@ class Output:
         self.files.append(str(path))
 
     def done(self, document: Mapping[str, object], text: Callable[[], str], name: str, result: Result | None = None) -> None:
-        """Prints the document or the text, and writes the document to NAME.json in the folder and the report.
+        """Print the document or the text, and write the document to NAME.json in the folder, and the report.
 
-        The units of the document's numbers in the report are those of the `result` that they are from."""
+        `result` is the source of the document's numbers; its fields determine their units in the report.
+        """
         path = self.file(f"{name}.json")
         from jaxvib.results.fields import plain  # slow to import, and --help needs none of it
 

@@ -1,1 +1,1 @@
-"""Commands about motion in time, and about what becomes of it as a number of the machine grows."""
+"""Commands about motion in time, and about the stability of motions as a number of the machine varies."""

@@ -97,7 +97,7 @@ def onset(
 
 
 def _varied(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable[[str, str], float]]:
-    """Function that makes the scene at a value of the number of that name, and function that reads such a value."""
+    """Return a function from a value of the named number to the scene, and a function that reads such a value from text."""
     import jax.numpy as jnp
 
     from jaxvib.machine.numbers.named import find_number, put_numbers

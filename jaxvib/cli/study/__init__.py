@@ -1,1 +1,1 @@
-"""Commands of the studies: many questions about one scene, a record, or a catalogue."""
+"""Commands for studies of a scene, of many cases, or of a record."""

@@ -80,7 +80,7 @@ def audit(
 
 
 def audit_text(found: jv.Audit) -> str:
-    """An `Audit` as a person reads it."""
+    """Return an `Audit` as text."""
     took = "" if math.isnan(found.seconds) else f", a run of 100 turns {found.seconds:.2g} s, compiled in {found.compile:.2g} s"
     lines = [f"{found.motion}: {found.kind}; {found.message}", f"equations of motion: {found.operations} operations{took}"]
     head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by", "operations", "run", "compile"]

@@ -60,7 +60,7 @@ def capture(
         from jaxvib.draw.capture import torus_paths
         from jaxvib.study.capture.capture import thrown_state
 
-        # One run just above the threshold, or from the highest speed where none was found.
+        # One run starts just above the threshold, or at the highest speed if no threshold was found.
         speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high
         until = 2.0 * math.pi * min(turns, 400) / float(loaded.drive.speed)
         run = jv.simulate(loaded, until, start=jv.with_spin(loaded, thrown_state(loaded, speed), turning), estimate=False)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
 _SOLVERS = ("default", "Tsit5", "Dopri8")
-"""The names of `jaxvib.study.accuracy.work_precision`, whose import is slow."""
+"""Names of `jaxvib.study.accuracy.work_precision`, repeated here because that import is slow."""
 
 
 @app.command("cost")
@@ -52,7 +52,7 @@ def cost(
 
 
 def cost_document(cost: Cost) -> dict[str, object]:
-    """All of a `Cost` as JSON has it."""
+    """Return the contents of a `Cost` for JSON."""
     from jaxvib.study.accuracy.cost import WANTED
 
     return {
@@ -62,7 +62,7 @@ def cost_document(cost: Cost) -> dict[str, object]:
 
 
 def cost_table(cost: Cost) -> str:
-    """A `Cost` as a person reads it."""
+    """Return a `Cost` as text."""
     from jaxvib.study.accuracy.cost import WANTED
 
     head = ["tier", "method", "precision", "setting", "error", "seconds", "first call, s"]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxvib.sweeps.sweep import Sweep
 
 _QUIET = 10.0
-"""Time between lines of progress, s, if the output is no terminal."""
+"""Time between lines of progress, s, if the output is not a terminal."""
 
 
 @app.command("sweep")
@@ -84,7 +84,7 @@ def _tell(found: Sweep, output: Output, name: str) -> None:
 
 
 class _Lines:
-    """Progress on the terminal's last line, or where there is none as a line from time to time."""
+    """Progress on the last line of the terminal, or, if the output is not a terminal, as a new line at intervals."""
 
     def __init__(self) -> None:
         self.last = time.monotonic()
@@ -101,7 +101,7 @@ class _Lines:
             click.echo(text, err=True)
 
     def end(self) -> None:
-        """Leaves the line."""
+        """End the line of progress."""
         if self.open:
             click.echo(err=True)
 
