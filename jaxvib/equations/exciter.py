@@ -4,7 +4,7 @@ With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, a
 the acceleration of the point that carries the load, and E is m J^T minus the part of a friction that is proportional to the
 normal force of the load. The load exerts the force -(W a + g) on that point, with W = m 1 - m J H^-1 E and
 g = m (J H^-1 r + c). The unbalanced rotor of a motor is one more such body. The added mass and the reaction of the exciter
-are the sums over all loads, with their levers on the rows of the mount. The exciter acts on the machine through nothing else.
+are the sums over all loads, with their levers on the rows of the mount. They contain its whole effect on the machine.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Axes = dict[int, Array]
 
 
 class Motion(NamedTuple):
-    """State of an exciter and the quantities that follow from it without the accelerations.
+    """State of an exciter, and quantities that follow from it without the accelerations.
 
     **Attributes**
 
@@ -60,7 +60,7 @@ class Motion(NamedTuple):
     - `imbalance` of the rotor, see `RotorDynamics._imbalance`
     - `kinematics` of the loads
     - `drag` (count,): torque of the rotor on the loads
-    - `weight`: torque of gravity on the unbalance; None without an unbalance
+    - `weight`: torque of gravity on the unbalance, see `RotorDynamics.weight`
     - `rolling`: forces on the loads if all of them roll
     - `housing`: speed at which the housing turns with the machine; None if it does not turn
     """
@@ -76,7 +76,7 @@ class Motion(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """Exciter whose own accelerations are expressed by a, the accelerations of the mount's rows.
+    """Exciter whose own accelerations are expressed in terms of a, the accelerations of the mount's rows.
 
     **Attributes**
 
@@ -132,7 +132,10 @@ class RotorDynamics(eqx.Module):
         return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact, housing)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
-        """Express the exciter's own accelerations by those of the mount. `contact` has friction linear in the accelerations."""
+        """Express the exciter's own accelerations in terms of those of the mount.
+
+        The friction of `contact` is linear in the accelerations.
+        """
         n = self.row_count * len(self.axes)
         added_mass: list[list[Array | float]] = [[0.0] * n for _ in range(n)]
         rotor = self._add_rotor(motion, added_mass, [0.0] * n, motion.drag, {})
@@ -248,7 +251,10 @@ class RotorDynamics(eqx.Module):
         return list(along), push
 
     def weight(self, t: Array, state: ExciterState) -> Array | None:
-        """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's rotation; None without either."""
+        """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's rotation.
+
+        None without an unbalance or without gravity in the rotor's plane.
+        """
         g = total_gravity(self.effects)
         if self.unbalance is None or 1 not in g:
             return None
@@ -282,7 +288,7 @@ class ExciterDynamics(RotorDynamics):
         return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact, housing)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
-        """Express the accelerations of loads and rotor by those of the mount.
+        """Express the accelerations of loads and rotor in terms of those of the mount.
 
         The friction of `contact` is linear in the accelerations.
         """

@@ -124,9 +124,9 @@ class LinearModel(Model):
         return jnp.vdot(velocity, self.carrier.damping @ velocity).real / 2.0
 
     def modes(self) -> tuple[Array, Array]:
-        """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mode shapes (nd, nd).
+        """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mass-normalised mode shapes (nd, nd).
 
-        Each column is one mode, normalised by the mass matrix.
+        Each column is the shape of one mode.
         """
         square, inverse = relative_to(self.mass, self.carrier.stiffness)
         values, vectors = hermitian_modes(square)
@@ -216,7 +216,7 @@ class JammedModel(LinearModel):
 
 
 def _real_times(matrix: Array, vector: Array) -> Array:
-    """Return the product of a real matrix and a complex vector, at half the cost of that with a complex matrix."""
+    """Return the product of a real matrix and a complex vector, at half the cost of a complex matrix."""
     return jax.lax.complex(matrix @ vector.real, matrix @ vector.imag)
 
 

@@ -65,8 +65,8 @@ def modal_response(
     q are the coordinates of the undamped modes X with the frequencies Omega. Proportional damping does not couple the modes:
     each mode is then a separate block, which is solved to rounding, and needs no separate case.
 
-    **Arguments**: undamped `frequencies` (nd,) rad/s and `shapes` (nd, nd), normalised by the mass matrix; `stiffness` K,
-    `damping` C and `mass` M (nd, nd); `direction` B^T e (nd,).
+    **Arguments**: undamped `frequencies` (nd,) rad/s and mass-normalised `shapes` (nd, nd); `stiffness` K, `damping` C
+    and `mass` M (nd, nd); `direction` B^T e (nd,).
     """
     n, eps = frequencies.shape[0], jnp.finfo(frequencies.dtype).eps
     positive = jnp.where(frequencies > 0.0, frequencies, jnp.inf)

@@ -18,7 +18,7 @@ __all__ = ["ContactSolution", "Kinematics", "contact_force", "dot", "kinematics"
 
 
 class Kinematics(NamedTuple):
-    """`columns` of J = dp/du of the loads, and `curvature` c = (dJ/dt) u'.
+    """Kinematics of loads: `columns` of J = dp/du, and `curvature` c = (dJ/dt) u'.
 
     Each is (x, y), or (x, y, z) if the loads move along the axis. `lengths` contains the lengths of the columns if they are
     constant along the track, see `Loads.tangent_lengths`; otherwise it is None.

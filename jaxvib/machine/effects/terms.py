@@ -78,8 +78,10 @@ class LoadPotential:
 class LoadResistance:
     """Force on each load that dissipates energy of its motion, such as air drag.
 
-    **Attributes**: `resistance`, function of the loads, `u` and the rates of `u`, returns the generalised force on each
-    coordinate; `is_smooth`: True if the force has all derivatives.
+    **Attributes**
+
+    - `resistance`: function of the loads, `u` and the rates of `u`; it returns the generalised force on each coordinate
+    - `is_smooth`: True if the force has all derivatives
     """
 
     resistance: Resistance
@@ -93,7 +95,7 @@ class LoadResistance:
 @final
 @dataclass(frozen=True)
 class LoadInteraction:
-    """Forces between loads. They cancel in the torque on coincident loads. With them the order of the loads matters.
+    """Forces between loads, which cancel in the torque on coincident loads. With them the order of the loads matters.
 
     **Attributes**
 
