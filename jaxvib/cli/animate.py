@@ -42,10 +42,10 @@ def animate(
     kind: str,
     output: Output,
 ) -> None:
-    """A film of the machine as it moves, in slow motion: animation.gif and animation.html, in --out or here.
+    """Make a film of the moving machine in slow motion: animation.gif and animation.html, in --out or the current folder.
 
-    SOURCE is a run.npz that `jaxvib simulate` kept, or its folder, or a scene file: with --until it is simulated first, with
-    --mode its exact jam is shown."""
+    SOURCE is a run.npz of `jaxvib simulate`, or its folder, or a scene file. With --until the scene is simulated first; with
+    --mode the film shows its exact jam."""
     if source.is_dir():
         source = source / "run.npz"
     if source.suffix == ".npz":
@@ -73,6 +73,6 @@ def animate(
 @click.argument("scene", type=click.Path(path_type=Path))
 @shared
 def sketch(scene: Path, output: Output) -> None:
-    """A drawing of SCENE with its numbers: sketch.png, in --out or here."""
+    """Draw SCENE with its numbers: sketch.png, in --out or the current folder."""
     jv.sketch(jv.load_scene(scene)).savefig(output.made("sketch.png"))
     output.done({"status": "done"}, lambda: "a sketch of the machine", "sketch")

@@ -80,7 +80,7 @@ def simulate(
     unit: SpeedUnit,
     output: Output,
 ) -> None:
-    """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
+    """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its picture."""
     from jaxvib.ode.progress import ProgressBar  # slow to import, and --help needs none of it
 
     if csv is not None and window:

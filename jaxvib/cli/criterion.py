@@ -27,8 +27,8 @@ _RPM = 30.0 / math.pi
 @WITHOUT
 @shared
 def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...], output: Output) -> None:
-    """Speeds at which coincident loads of SCENE stay together, and at which they spread and balance the rotor, by the empirical
-    criterion."""
+    """List the speeds at which coincident loads of SCENE stay together, and at which they spread and balance the rotor, by the
+    empirical criterion."""
     from jaxvib.steady.balance.criterion import criterion_table  # slow to import, and --help needs none of it
     from jaxvib.steady.balance.states import balanced_intervals
 

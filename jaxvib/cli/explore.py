@@ -16,10 +16,10 @@ from jaxvib.cli.app import app
 @click.option("--port", type=click.IntRange(1, 65535), default=2718, show_default=True, help="Of this computer.")
 @click.option("--no-browser", is_flag=True, help="Open no browser; only say where the page is.")
 def explore(scene: Path, port: int, no_browser: bool) -> None:
-    """A local page with sliders for SCENE; its diagrams follow, and the machine is saved as TOML.
+    """Open a local page with sliders for SCENE; the diagrams follow the sliders, and the machine can be saved as TOML.
 
-    Runs until it is interrupted (Ctrl-C). Only this computer reaches the page, at an address with a random token, which
-    is printed; other sites in your browser cannot. Needs: pip install '.[explore]' in the folder of jaxvib's sources"""
+    The page runs until it is interrupted (Ctrl-C). Its address, which is printed, contains a random token; other computers, and
+    other sites in your browser, cannot reach it. Needs: pip install '.[explore]' in the folder of jaxvib's sources"""
     from jaxvib.explore.pictures import prepare, prepare_counts
     from jaxvib.explore.serve import require_free, require_marimo, serve  # slow import
 

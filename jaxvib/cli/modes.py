@@ -38,10 +38,11 @@ def modes(
     csv: Path | None,
     output: Output,
 ) -> None:
-    """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
+    """List every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
 
-    Of a rotor, and with --phases: every jam of light loads at any phases; --out draws them over the loads' drag. --exact goes
-    with platforms and with a rotor that does not tilt, where no load has a station of its own and nothing is out of balance."""
+    For a rotor, or with --phases, the list has the jams of light loads at any phases, and --out plots them over the drag of the
+    loads. --exact is available for platforms and for rotors without tilt, if no load has its own station and the rotor is
+    balanced."""
     import jax  # slow to import, as what follows, and --help needs none of it
     import numpy as np
 

@@ -33,8 +33,8 @@ def optimize(
     no_verify: bool,
     output: Output,
 ) -> None:
-    """Search the machine that DESIGN asks for; --out keeps its scene file, the search, the pictures and the motion it was
-    checked by. Ctrl-C ends the search with the best machine so far; --resume goes on from there."""
+    """Search for the machine that DESIGN describes; --out saves its scene file, the search, the pictures and the motion of the
+    verification. Ctrl-C ends the search with the best machine so far; --resume continues it."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 

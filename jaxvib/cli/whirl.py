@@ -30,7 +30,8 @@ _RPM = 30.0 / math.pi
 def whirl(
     scene: Path, speed: str | None, loads: Literal["fixed", "none"], unit: SpeedUnit, csv: Path | None, output: Output
 ) -> None:
-    """Whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out draws the Campbell diagram."""
+    """List the whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out adds the Campbell
+    diagram."""
     import numpy as np  # slow to import, as what follows, and --help needs none of it
 
     from jaxvib.units import number

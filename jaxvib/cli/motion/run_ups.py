@@ -32,7 +32,7 @@ def run_ups(
     batch: int,
     output: Output,
 ) -> None:
-    """Run SCENE up from rest, at each drag from each of many initial angles, and name where the loads end."""
+    """Run SCENE up from rest at each drag with each set of initial angles, and report the final regimes of the loads."""
     from jaxvib.units import number
 
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None

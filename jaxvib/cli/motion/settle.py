@@ -45,7 +45,7 @@ def settle(
 ) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change, or change without a trend.
 
-    --out keeps the last stretch. With --drift the motion has to repeat itself that well.
+    --out saves the last stretch. With --drift, the motion must repeat itself with at most this relative change.
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
     steps = chosen_steps(tolerance, None)
@@ -80,7 +80,7 @@ def envelope(
     csv: Path | None,
     output: Output,
 ) -> None:
-    """Integrate the averaged equations of SCENE: long run-ups in steps of many turns; --out keeps them (envelope.npz)."""
+    """Integrate the averaged equations of SCENE, for long run-ups in steps of many turns; --out saves them (envelope.npz)."""
     loaded = loaded_scene(scene, without)
     begin = ("rest" if mode is None else "jam") if start is None else start
     steps = None if tolerance is None else jv.Tolerance(tolerance)
@@ -111,7 +111,8 @@ def growth(
     stretches: int,
     output: Output,
 ) -> None:
-    """Growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and after which time derivatives fail."""
+    """Measure the growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and the time after which
+    derivatives fail."""
     if start == "spin_up":
         raise InputError(
             "--start", "is 'spin_up'; the growth of disturbances needs a constant speed, start from rest or in a jam"

@@ -49,7 +49,7 @@ def audit(
     """Report the change and the cost of each effect and each tier of SCENE: negligible effects, and effects that may be
     missing.
 
-    Each effect of the scene is removed in turn, and each effect that it lacks is added with usual numbers. --out adds the
+    Each effect of the scene is removed in turn, and each effect that it lacks is added with typical numbers. --out adds the
     figure."""
     if count_operations:
         from jaxvib.study.audit.operation_counts import operation_counts  # slow to import, not needed for --help

@@ -44,8 +44,9 @@ def _named(command: Command) -> Command:
 @click.option("--dry/--no-dry", "identify__dry", default=None, help="Identify mu2 of dry friction as well as mu1.")
 @shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
-    """Friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a measurement
-    file (TOML) that names one; options replace what the file says. --out adds the picture and the fit (fit.csv)."""
+    """Identify the friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a
+    measurement file (TOML) that names one; options replace the values in the file. --out adds the picture and the fit
+    (fit.csv)."""
     import numpy as np  # slow to import, as what follows, and --help needs none of it
 
     from jaxvib.machine.files import read_toml

@@ -31,7 +31,7 @@ _QUIET = 10.0
 def sweep(
     study: Path, store: Path | None, resume: bool, workers: int | None, scheduler: str | None, timeout: str, output: Output
 ) -> None:
-    """Compute all cases of STUDY, a study file, into a store on disk; interrupted, the same command goes on where it stopped.
+    """Compute all cases of STUDY, a study file, into a store on disk; after an interruption, the same command continues.
 
     --out adds the figure that fits the study (sweep.png).
     """
@@ -60,8 +60,8 @@ def sweep(
 @click.option("--theory/--no-theory", default=True, show_default=True, help="Draw folds and torus points of exact jams.")
 @shared
 def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory: bool, output: Output) -> None:
-    """Say what is in STORE, which `jaxvib sweep` wrote; --out adds its figures: map.png, shares.png, distribution.png,
-    tornado.png; only those that fit the study."""
+    """Summarize a STORE of `jaxvib sweep`; --out adds the figures that fit the study: map.png, shares.png, distribution.png,
+    tornado.png."""
     from jaxvib.sweeps.sweep import open_sweep
 
     found = open_sweep(store)
