@@ -73,7 +73,10 @@ _COLLECTED: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar(
 
 @contextlib.contextmanager
 def bounds_of_unknowns() -> Iterator[list[Array]]:
-    """Yield a list to which each traced number adds a Boolean array while parts of a scene are built: True if it is allowed."""
+    """Collect the conditions of traced numbers while parts of a scene are built.
+
+    The yielded list receives, for each traced number, a traced Boolean that is True if the number is allowed.
+    """
     found: list[Array] = []
     token = _COLLECTED.set(found)
     try:

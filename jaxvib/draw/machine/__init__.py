@@ -1,1 +1,1 @@
-"""Parts of a machine as shapes, and films of them; plain numbers, no machine."""
+"""Shapes of parts of a machine, and films of them, from plain numbers."""

@@ -1,4 +1,4 @@
-"""Films: pictures one after the other, as GIF or as one HTML page that asks nothing of a network."""
+"""Films as GIF files or as single HTML pages, which need no network."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from jaxvib.errors import written
 __all__ = ["Film"]
 
 _COLORS = 64
-"""Colours of a film."""
+"""Maximum number of colours of a film."""
 
 _MIN_COLOR_DIFFERENCE = 10
-"""Least difference of two colours of the palette, in levels of 255."""
+"""Smallest difference of two colours of the palette, in levels of 255."""
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -51,19 +51,19 @@ show(0); timer = setTimeout(step, {pause});
 
 
 class Film(FuncAnimation):
-    """matplotlib's animation of a figure of which only some artists move, with a `save` that draws nothing else again.
+    """Animation of matplotlib in which only some artists move; its method `save` draws the other artists only once.
 
-    **Arguments**: `figure`; `update(k)` puts the artists `moving` where they are in picture k, of `count`; `fps` pictures a
-    second.
+    **Arguments**: `figure`; `update`: function that moves the artists to their positions in picture k; `moving`: these artists;
+    `count`: number of pictures; `fps`: pictures per second.
     """
 
     def __init__(self, figure: Figure, update: Callable[[int], object], moving: Sequence[Artist], count: int, fps: float):
         super().__init__(figure, lambda k: [update(k), moving][1], frames=count, interval=1000.0 / fps, blit=False)
-        self._draw_was_started = True  # what was never shown need not be warned of
+        self._draw_was_started = True  # suppresses matplotlib's warning about an animation that was never shown
         self.figure, self._update, self._moving, self.count, self.fps = figure, update, list(moving), count, fps
 
     def pictures(self) -> Iterator[Image.Image]:
-        """Every picture: what does not move is drawn once."""
+        """Yield every picture; artists that do not move are drawn once."""
         canvas = self.figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
         for artist in self._moving:
@@ -81,10 +81,11 @@ class Film(FuncAnimation):
             artist.set_animated(False)
 
     def save(self, filename: str | Path, *rest: Any, **options: Any) -> None:
-        """Writes a GIF, or for a name that ends so one HTML page with its pictures inside; every other format by matplotlib's
-        own `save`, which takes the further arguments.
+        """Write a GIF file (".gif") or a single HTML page that contains the pictures (".html", ".htm").
 
-        **Raises** `InputError` where the file cannot be written.
+        Other formats, and calls with further arguments, are passed to matplotlib's `FuncAnimation.save`.
+
+        **Raises** `InputError` if the file cannot be written.
         """
         path = Path(filename)
         if path.suffix.lower() not in (".gif", ".html", ".htm") or rest or options:
@@ -98,22 +99,25 @@ class Film(FuncAnimation):
 
     def _gif(self, path: Path) -> None:
         first, *others = self._few_colours()
-        # Hundredths of a second are all that a GIF knows.
+        # The unit of pauses in a GIF is a hundredth of a second.
         pause = max(20, round(100.0 / self.fps) * 10)
         first.save(path, save_all=True, append_images=others, duration=pause, loop=0, optimize=True, disposal=1)
 
     def _few_colours(self) -> list[Image.Image]:
-        """All pictures in the colours of a few of them, without speckles, so that what stands still stays the same."""
+        """Return all pictures with a common palette from a few of them, without dithering.
+
+        Parts that do not move are therefore identical in all pictures.
+        """
         every = list(self.pictures())
         some = every[:: max(1, len(every) // 4)]
         strip = Image.new("RGB", (some[0].width, some[0].height * len(some)))
         for k, each in enumerate(some):
             strip.paste(each, (0, k * each.height))
-        # The colours that most points have, such as white, are kept as they are.
+        # The most frequent colours, such as white, come first and are not changed.
         colours, often = np.unique(np.asarray(strip).reshape(-1, 3), axis=0, return_counts=True)
         chosen: list[np.ndarray] = []
         for colour in colours[np.argsort(-often, kind="stable")].astype(int):
-            # Those next to a colour that is there would only take another's place.
+            # Colours close to one in the palette would only displace other colours.
             if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _MIN_COLOR_DIFFERENCE for other in chosen):
                 chosen.append(colour)
         palette = Image.new("P", (1, 1))

@@ -1,4 +1,4 @@
-"""Springs, dampers, slabs, discs and arrows as outlines, arrays of points (n, 2), NaN where the pen is lifted; and texts."""
+"""Outlines of springs, dampers, boxes, circles and arrows as arrays of points (n, 2), NaN between separate lines; texts."""
 
 from __future__ import annotations
 
@@ -18,8 +18,13 @@ Point = tuple[float, float]
 
 
 class Part(NamedTuple):
-    """An outline to be drawn: its `points` (n, 2), how it looks (matplotlib's options), and whether it is `filled`; the
-    point of the rotor's `axis`, where it turns with the rotor."""
+    """Outline of a part of a drawing.
+
+    - `points` (n, 2): points of the outline
+    - `look`: options of matplotlib
+    - `filled`: True for a filled outline
+    - `axis`: the rotor's axis, for a part that turns with the rotor
+    """
 
     points: np.ndarray
     look: Look
@@ -28,7 +33,7 @@ class Part(NamedTuple):
 
 
 class Text(NamedTuple):
-    """A text at a place of the drawing; `look` matplotlib's options."""
+    """Text at the point x, y of a drawing; `look` contains options of matplotlib."""
 
     x: float
     y: float
@@ -37,7 +42,7 @@ class Text(NamedTuple):
 
 
 def _along(start: Point, end: Point, forward: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Points at the shares `forward` of the way from `start` to `end`, `side` to its left."""
+    """Return points at the fractions `forward` of the line from `start` to `end`, at the distances `side` to its left."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     way = b - a
     length = np.hypot(*way)
@@ -46,7 +51,7 @@ def _along(start: Point, end: Point, forward: np.ndarray, side: np.ndarray) -> n
 
 
 def spring(start: Point, end: Point, width: float = 0.2, coils: int = 6) -> np.ndarray:
-    """A zigzag line from one point to another.
+    """Return a zigzag line from one point to another.
 
     >>> spring((0.0, 0.0), (0.0, 1.0)).shape
     (16, 2)
@@ -57,7 +62,7 @@ def spring(start: Point, end: Point, width: float = 0.2, coils: int = 6) -> np.n
 
 @functools.cache
 def _zigzag(coils: int) -> tuple[np.ndarray, np.ndarray]:
-    """A spring's points along its axis, as shares, and to the side, in widths."""
+    """Return the points of a spring: fractions of its length along its axis, and fractions of its width to the side."""
     side = np.where(np.arange(2 * coils + 1) % 2, 0.5, -0.5)
     side[[0, -1]] = 0.0
     zigzag = np.linspace(0.15, 0.85, 2 * coils + 1)
@@ -65,7 +70,7 @@ def _zigzag(coils: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damper(start: Point, end: Point, width: float = 0.2, cup: float = 0.4) -> np.ndarray:
-    """A dashpot from one point to another: a cup on the first, a share `cup` of the whole, a piston on the second."""
+    """Return a dashpot from one point to another: a cup at the first, with the length fraction `cup`, and a piston."""
     pen, low, high = np.nan, 0.5 - 0.5 * cup, 0.5 + 0.5 * cup
     forward = np.array([0.0, low, pen, high, low, low, high, pen, 1.0, 0.52, pen, 0.52, 0.52])
     side = np.array([0.0, 0.0, pen, 0.5, 0.5, -0.5, -0.5, pen, 0.0, 0.0, pen, 0.36, -0.36]) * width
@@ -73,12 +78,12 @@ def damper(start: Point, end: Point, width: float = 0.2, cup: float = 0.4) -> np
 
 
 def box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
-    """A rectangle."""
+    """Return a rectangle."""
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
 
 
 def circle(centre: Point, radius: float, points: int = 61) -> np.ndarray:
-    """A circle."""
+    """Return a circle as a polygon."""
     return np.asarray(centre) + radius * _unit_circle(points)
 
 
@@ -89,7 +94,7 @@ def _unit_circle(points: int) -> np.ndarray:
 
 
 def arrow(start: Point, way: Point, width: float = 0.09) -> np.ndarray:
-    """The outline of an arrow; a short one has a short head, one of no length is a point."""
+    """Return the outline of an arrow; a short arrow has a shorter head, and an arrow of zero length is a point."""
     length = float(np.hypot(*way))
     head = min(0.28, 0.6 * length)
     shaft = (length - head) / length if length > 0.0 else 0.0
@@ -100,7 +105,7 @@ def arrow(start: Point, way: Point, width: float = 0.09) -> np.ndarray:
 
 
 def ground(start: Point, end: Point, step: float = 0.22) -> np.ndarray:
-    """A line with short strokes on its right side: what does not move."""
+    """Return the symbol of a fixed body: a line with short strokes on its right side."""
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     many = max(2, int(length / step))
     forward, side = [0.0, 1.0], [0.0, 0.0]
@@ -111,7 +116,7 @@ def ground(start: Point, end: Point, step: float = 0.22) -> np.ndarray:
 
 
 def put(axis: Axes, part: Part) -> Line2D | Polygon:
-    """Draws a part. **Returns** its artist, whose points `set_data` (a line) or `set_xy` (a filled one) moves."""
+    """Draw a part. **Returns** its artist, whose points are changed by `set_data` (line) or `set_xy` (filled outline)."""
     if part.filled:
         outline = Polygon(part.points, closed=True, **part.look)
         axis.add_patch(outline)

@@ -1,4 +1,4 @@
-"""Drawings of a machine as SVG pictures that move in every browser, without a script."""
+"""Animated SVG drawings of a machine, which move in every browser without a script."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from jaxvib.draw.machine.parts import Part, Text
 __all__ = ["svg"]
 
 _DOTS = 62.0
-"""Dots a unit of the drawing has."""
+"""SVG units per unit of the drawing."""
 
 _POINT = 100.0 / 72.0
-"""Dots a typographic point has."""
+"""SVG units per typographic point."""
 
 _SIZES = {"small": 8.3, "x-small": 7.0}
 _ANCHORS = {"left": "start", "center": "middle", "right": "end"}
@@ -31,15 +31,17 @@ def svg(
     seconds: float,
     turns: float,
 ) -> str:
-    """A moving picture that repeats itself; of one frame, a still one.
+    """Return an animated picture that repeats periodically, or a still picture if there is only one frame.
 
     **Arguments**
 
-    - `limits` (left, right, bottom, top) of the drawing
-    - `frames`: the parts at equal distances in time over one period, the same parts in each; the rotor's angle in all of them
-      is that of the first
-    - `texts` at the same times; `head` lines above the drawing
-    - `seconds` that a period lasts; `turns` of the rotor in it, which need not be whole
+    - `limits`: (left, right, bottom, top) of the drawing
+    - `frames`: the parts at equal time steps over one period, the same parts in each frame. The rotor's angle is that of the
+      first frame in all of them
+    - `texts`: texts at the same times
+    - `head`: lines of text above the drawing
+    - `seconds`: duration of a period, s
+    - `turns`: revolutions of the rotor in a period, not necessarily a whole number
 
     **Returns** the text of an SVG file.
 
@@ -69,7 +71,10 @@ def svg(
 
 
 def _part(frames: Sequence[Part], place: Callable[[np.ndarray], np.ndarray], seconds: float, turns: float) -> str:
-    """A part with its motion: a shift of the whole where it keeps its shape, else from outline to outline."""
+    """Return a part with its motion.
+
+    The motion is a rotation with the rotor, a translation if the shape is constant, otherwise a sequence of outlines.
+    """
     first = frames[0]
     outlines = place(np.array([frame.points for frame in frames]))
     shift = np.array([outline[0] for outline in outlines]) - outlines[0, 0]
@@ -91,7 +96,7 @@ def _part(frames: Sequence[Part], place: Callable[[np.ndarray], np.ndarray], sec
 
 
 def _shifted(drawn: str, moved: np.ndarray, seconds: float) -> str:
-    """Something drawn that is shifted by `moved` (n, 2), one place after the other and back to the first."""
+    """Return an SVG element that is translated by `moved` (n, 2), one position after the other and back to the first."""
     if np.max(np.abs(moved)) < 0.05:
         return drawn
     values = ";".join(f"{x:.1f} {y:.1f}" for x, y in [*moved.tolist(), moved[0].tolist()])
@@ -106,7 +111,7 @@ def _for_ever(seconds: float) -> str:
 def _path(points: np.ndarray, closed: bool) -> str:
     pen, found = "M", []
     for x, y in points.tolist():
-        if x != x:  # the pen is lifted
+        if x != x:  # NaN: begin a new line
             pen = "M"
         else:
             found.append(f"{pen}{x:.1f} {y:.1f}")
@@ -128,12 +133,12 @@ def _text(x: float, y: float, text: str, look: dict[str, object]) -> str:
     size = _SIZES[str(look.get("fontsize", "small"))] * _POINT
     lines = text.split("\n")
     step = 1.25 * size
-    # Where the first line's base stands, by where the whole of the lines is held.
+    # Offset of the baseline of the first line, by the vertical alignment of the whole text.
     first = {"center": 0.35 * size - 0.5 * step * (len(lines) - 1), "bottom": -step * (len(lines) - 1), "top": 0.8 * size}
     base = y + first[str(look.get("va", "center"))]
     anchor = _ANCHORS[str(look.get("ha", "left"))]
     spans = "".join(f'<tspan x="{x:.1f}" y="{base + k * step:.1f}">{html.escape(line)}</tspan>' for k, line in enumerate(lines))
     style = f' font-weight="{look["fontweight"]}"' if "fontweight" in look else ""
-    if "bbox" in look:  # what lies behind the letters is covered
+    if "bbox" in look:  # a white outline covers the drawing behind the letters
         style += ' stroke="white" stroke-width="4" paint-order="stroke"'
     return f'<text font-family="sans-serif" font-size="{size:.1f}"{style} text-anchor="{anchor}">{spans}</text>'

@@ -1,1 +1,1 @@
-"""Motions in time as figures: histories, spectra, paths; plain arrays, no machine."""
+"""Charts of motions in time from plain arrays: histories, spectra, paths."""

@@ -1,4 +1,4 @@
-"""Histories over time: whole runs as bands between their peaks, and the last few periods as they are."""
+"""Charts of histories over time: whole runs as bands between their peaks, and the last periods as curves."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, SpeedUnit, legend_ab
 __all__ = ["amplitude_histories", "band", "last_periods", "period_of", "time_histories"]
 
 _BINS = 300
-"""Maximum number of pieces of a run that are drawn as a band between the least and the greatest value of each."""
+"""Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
 
 _MAX_PLAIN_PERIODS = 40
-"""Number of periods up to which a run is drawn without bands."""
+"""Maximum number of periods of a run that is drawn without bands."""
 
 _SHOWN = 3
-"""Periods at the end that are drawn as they are."""
+"""Number of periods at the end that are drawn as curves."""
 
 
 def band(time: np.ndarray, values: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middle times, least and greatest of a signal (nt,) in so many equal pieces of it; the signal itself, twice, where it is
-    short.
+    """Return the middle times, minima and maxima (bins,) of a signal (nt,) in `bins` intervals of equal length.
+
+    If the signal has fewer than 2 samples per interval, return all times and the signal itself as minimum and maximum.
 
     >>> import numpy as np
     >>> t, low, high = band(np.arange(4.0), np.array([0.0, 2.0, -1.0, 1.0]), 2)
@@ -38,8 +39,9 @@ def band(time: np.ndarray, values: np.ndarray, bins: int) -> tuple[np.ndarray, n
 
 
 def period_of(time: np.ndarray, values: np.ndarray) -> float:
-    """The mean period of the widest of signals (nt, k), by its crossings of its middle upward; all of the time where there are
-    none.
+    """Return the mean period of the signal with the largest range among `values` (nt, k), s.
+
+    It is the mean time between upward crossings of the middle of the range, or the whole time if there are fewer than two.
 
     >>> import numpy as np
     >>> t = np.linspace(0.0, 1.0, 1000)
@@ -53,7 +55,7 @@ def period_of(time: np.ndarray, values: np.ndarray) -> float:
 
 
 def last_periods(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Mask (nt,) of the samples in the last periods of signals (nt, k)."""
+    """Return a mask (nt,) that is True for the samples in the last periods of signals (nt, k)."""
     return time >= time[-1] - _SHOWN * period_of(time, values)
 
 
@@ -67,11 +69,17 @@ def time_histories(
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
 ) -> Drawn:
-    """Two columns over time: the `whole` run as bands between its peaks, and the last periods of its `end` as they are. Rows:
-    displacements mm, tilts mrad where there are any, speeds of the loads and the rotor in `unit`, force on the foundation N.
+    """Draw the histories of a run in two columns: the `whole` run as bands between its peaks, and its last periods as curves.
 
-    `whole` and `end` hold time (nt,) s, displacement (nt, nd), speeds of the loads (nt, count) and of the rotor (nt,) rad/s,
-    force (nt, nb) N; `displacement` is in m, and in rad where `units` (nd,) say "rad"; if None, all is in m.
+    The rows are displacements in mm, tilts in mrad if there are any, speeds of loads and rotor in `unit`, and the foundation
+    force in N.
+
+    **Arguments**
+
+    - `whole`, `end`: tuples of time (nt,), s; displacement (nt, nd), m or rad; load speeds (nt, count) and rotor speed (nt,),
+      rad/s; force (nt, nb), N. The last periods are those of `end`
+    - `names`, `units` (nd,): names of the coordinates and their units, "m" or "rad"; `units` None: all m
+    - `directions` (nb,): names of the directions of the force
 
     >>> import numpy as np
     >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
@@ -84,11 +92,11 @@ def time_histories(
     kinds = [(kind, label) for kind, label in (("m", "displacement, mm"), ("rad", "tilt, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, 2, size=(5.4, 2.3), widths=(1.7, 1.0), share_x="col", ax=ax)
     period = period_of(end[0], end[1])
-    # A piece holds a whole period, or the band would follow the vibration.
+    # Each interval is longer than a period; otherwise the band would follow the vibration.
     periods = (whole[0][-1] - whole[0][0]) / period
     bins = min(_BINS, int(periods / 1.25)) if periods > _MAX_PLAIN_PERIODS else whole[0].size
     part = [values[last_periods(end[0], end[1])] for values in end]
-    depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # the widest lowest, so that none hides another
+    depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # signals of larger range are drawn first, below smaller ones
     for row, (kind, label) in enumerate(kinds):
         own = [k for k in range(len(names)) if units[k] == kind]
         left, right = axes[2 * row : 2 * row + 2]
@@ -143,8 +151,11 @@ def amplitude_histories(
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
 ) -> Drawn:
-    """Panels over time (nt,) s of an averaged run: amplitudes (nt, nd) mm and mrad, speeds of the loads (nt, count) and of the
-    rotor (nt,), amplitude of the force on the foundation (nt, nb) N; zero to peak."""
+    """Draw the histories of an averaged run, a panel for each quantity; amplitudes are zero to peak.
+
+    `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
+    (nt, count) and `rotor_speed` (nt,) are in rad/s, drawn in `unit`, and the foundation force `force` (nt, nb) is in N.
+    """
     scale = speed_scale(unit)
     kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)

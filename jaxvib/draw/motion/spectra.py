@@ -1,4 +1,4 @@
-"""Spectra over frequency, as lines and as waterfalls; paths of a point across a rotor's axis."""
+"""Charts of spectra, as lines and as waterfalls, and of paths of points in the plane across a rotor's axis."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, SpeedUnit, legend_a
 __all__ = ["path_chart", "spectrum_chart", "waterfall_chart"]
 
 _DECADES = 1e-4
-"""Lower end of the scale relative to the strongest component."""
+"""Lower end of the amplitude scale, relative to the largest amplitude."""
 
 
 def spectrum_chart(
@@ -26,8 +26,11 @@ def spectrum_chart(
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Amplitudes (nf,) by name with unit, log scale, over frequency (nf,) rad/s, drawn in `unit`; speeds (1,) of rotor and
-    loads and resonances as upright lines."""
+    """Draw amplitudes (nf,) by name with unit, on a log scale, over frequency (nf,), with reference lines.
+
+    Vertical lines are the rotor speed (1,), the mean load speed and the resonances. Frequencies and speeds are in rad/s, drawn
+    in `unit`.
+    """
     scale = speed_scale(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
     top = max(float(np.max(values)) for values in series.values())
@@ -59,8 +62,11 @@ def waterfall_chart(
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Amplitudes (P, nf), `name` with unit, as darkness over time (P,) s and frequency (nf,) rad/s; the rotor's and the
-    loads' speed (P,) as lines, resonances level."""
+    """Draw amplitudes (P, nf) as shades of grey over time (P,), s, and frequency (nf,); `name` includes their unit.
+
+    The rotor speed and the load speed (P,) are drawn as lines, resonances as horizontal lines. Frequencies and speeds are in
+    rad/s, drawn in `unit`.
+    """
     scale = speed_scale(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.4), ax=ax)
     top = max(float(np.max(values)), 1e-300)
@@ -87,7 +93,7 @@ def waterfall_chart(
 
 
 def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None) -> Drawn:
-    """Paths of points by name: across and up (nt,) m, drawn in mm; a mark where each ends.
+    """Draw paths of points by name: horizontal and vertical coordinates (nt,), m, drawn in mm, with a marker at each end point.
 
     >>> import numpy as np
     >>> t = np.linspace(0.0, 6.0, 50)
