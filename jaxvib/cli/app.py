@@ -31,7 +31,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
 
     **Raises** `InputError` for an effect that the scene does not have, and for a text that is not a speed.
     """
-    from jaxvib.machine.drive import ConstantSpeed  # slow to import, as what follows, and --help needs none of it
+    from jaxvib.machine.drive import ConstantSpeed  # slow imports, which --help does not need
     from jaxvib.machine.files import load_scene
 
     scene = load_scene(path)
@@ -68,7 +68,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
     Empty columns are omitted.
     """
-    from rich.console import Console  # slow to import, and --json needs none of it
+    from rich.console import Console  # slow import, which --json does not need
     from rich.table import Table
 
     drawn = Table(title=title, title_justify="left")

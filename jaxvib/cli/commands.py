@@ -29,8 +29,8 @@ _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "r
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep` or `identify`.
 
-    KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus for a machine; design for `optimize`; sweep, a
-    study, for `sweep`; measurement, a recorded swing, for `identify`."""
+    KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor or torus for a machine; design for `optimize`; sweep (a
+    study) for `sweep`; measurement (a recorded swing) for `identify`."""
     from jaxvib.machine.files import TEMPLATES
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
@@ -81,7 +81,7 @@ def simulate(
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its picture."""
-    from jaxvib.ode.progress import ProgressBar  # slow to import, and --help needs none of it
+    from jaxvib.ode.progress import ProgressBar  # slow import, which --help does not need
 
     if csv is not None and window:
         raise InputError("--csv", "needs a trajectory, which --window does not keep; leave one of them out")

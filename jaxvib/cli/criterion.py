@@ -29,7 +29,7 @@ _RPM = 30.0 / math.pi
 def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...], output: Output) -> None:
     """List the speeds at which coincident loads of SCENE stay together, and at which they spread and balance the rotor, by the
     empirical criterion."""
-    from jaxvib.steady.balance.criterion import criterion_table  # slow to import, and --help needs none of it
+    from jaxvib.steady.balance.criterion import criterion_table  # slow import, which --help does not need
     from jaxvib.steady.balance.states import balanced_intervals
 
     loaded = loaded_scene(scene, without)

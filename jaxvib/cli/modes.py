@@ -43,7 +43,7 @@ def modes(
     For a rotor, or with --phases, the list has the jams of light loads at any phases, and --out plots them over the drag of the
     loads. --exact is available for platforms and for rotors without tilt, if no load has its own station and the rotor is
     balanced."""
-    import jax  # slow to import, as what follows, and --help needs none of it
+    import jax  # slow imports, which --help does not need
     import numpy as np
 
     from jaxvib.steady.jams.jam import STABILITY_CRITERION

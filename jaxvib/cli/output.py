@@ -92,7 +92,7 @@ class Output:
         """Write the values of a result along an axis to the CSV file of --csv, if there is one."""
         if path is None:
             return
-        from jaxvib.results.csv import write_csv  # slow to import, and --help needs none of it
+        from jaxvib.results.csv import write_csv  # slow import, which --help does not need
 
         write_csv(result, axis, path)
         self.files.append(str(path))
@@ -103,7 +103,7 @@ class Output:
         `result` is the source of the document's numbers; its fields determine their units in the report.
         """
         path = self.file(f"{name}.json")
-        from jaxvib.results.fields import plain  # slow to import, and --help needs none of it
+        from jaxvib.results.fields import plain  # slow import, which --help does not need
 
         values = {key: plain(value) for key, value in document.items()}
         body = json.dumps(values, indent=2, allow_nan=False)

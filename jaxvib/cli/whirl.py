@@ -32,7 +32,7 @@ def whirl(
 ) -> None:
     """List the whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out adds the Campbell
     diagram."""
-    import numpy as np  # slow to import, as what follows, and --help needs none of it
+    import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.units import number
 

@@ -52,7 +52,7 @@ def audit(
     Each effect of the scene is removed in turn, and each effect that it lacks is added with typical numbers. --out adds the
     figure."""
     if count_operations:
-        from jaxvib.study.audit.operation_counts import operation_counts  # slow to import, not needed for --help
+        from jaxvib.study.audit.operation_counts import operation_counts  # slow import, which --help does not need
 
         if scene is not None:
             raise InputError("--operations", "was given with a scene; leave one of them out")

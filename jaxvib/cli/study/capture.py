@@ -46,7 +46,7 @@ def capture(
     output: Output,
 ) -> None:
     """Find the initial speeds from which the balls in a torus of SCENE reach the rotor speed; --out adds pictures."""
-    import numpy as np  # slow to import, and --help needs none of it
+    import numpy as np  # slow import, which --help does not need
 
     if not -1.0 <= low < high <= 0.0:
         raise jv.InputError("--from", f"is {low:g} with --to {high:g}; speeds go up from -1 at least to 0 at most")

@@ -47,7 +47,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify the friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a
     measurement file (TOML) that names one; options replace the values in the file. --out adds the picture and the fit
     (fit.csv)."""
-    import numpy as np  # slow to import, as what follows, and --help needs none of it
+    import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml
     from jaxvib.study.bearing.measurement import measurement_from_tables

@@ -35,7 +35,7 @@ def sweep(
 
     --out adds the figure that fits the study (sweep.png).
     """
-    from jaxvib.sweeps.study import load_study  # slow to import, as what follows, and --help needs none of it
+    from jaxvib.sweeps.study import load_study  # slow imports, which --help does not need
     from jaxvib.sweeps.sweep import run_study
 
     path = store or study.with_suffix(".zarr")
