@@ -102,7 +102,8 @@ class States(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs beside states and rates: `foundation_force` (nb,) N; `rotor`, its angle and speed, None if they are states."""
+    """Outputs that are not states or rates: `foundation_force` (nb,) N; `rotor`, its angle and speed, None if they are states
+    or inputs."""
 
     foundation_force: Any
     rotor: Any = None

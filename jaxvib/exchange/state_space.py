@@ -74,7 +74,7 @@ class StateSpace(NamedTuple):
     about: str
 
     def poles(self) -> np.ndarray:
-        """Eigenvalues of A, (nx,) complex, 1/s."""
+        """Return the eigenvalues of A, (nx,) complex, 1/s."""
         return np.linalg.eigvals(self.A)
 
     def frequency_response(self, omega: Any) -> np.ndarray:

@@ -106,7 +106,7 @@ def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]
     """
     require_marimo()
     require_free(port)
-    import marimo  # an extra, and slow to import
+    import marimo  # optional and slow import
     import uvicorn  # marimo's own server
 
     os.environ[_VARIABLE] = str(scene.resolve())

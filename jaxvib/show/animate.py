@@ -64,7 +64,7 @@ def animate(
     **Arguments**
 
     - `motion`: a `Run`, or an `Orbit` with the `scene` that it belongs to
-    - `path` of the file, as GIF (".gif") or as one HTML page with its pictures inside (".html"); None writes nothing
+    - `path` of the file: a GIF (".gif") or one HTML page with embedded pictures (".html"); None writes no file
     - `begin`, `end`: the part that is shown, s or text; default: the last four periods of a run, or four periods of an orbit
     - `seconds`: duration of the film; typical: 5 to 10; default: the rotor turns by about a tenth of a turn between pictures
     - `fps`: pictures per second; typical: 20 (the default)
@@ -77,10 +77,10 @@ def animate(
 
     **Raises** `InputError` for
 
-    - a part that the run does not keep, or too few samples in it
+    - a part of the run that is not stored, or that has too few samples
     - a film in which loads or rotor would turn by nearly half a turn from one picture to the next
     - an orbit without its scene
-    - a file that is no GIF or HTML or cannot be written
+    - a path whose ending is not that of a GIF or HTML file, or that cannot be written to
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -88,7 +88,7 @@ class Study:
 
     @property
     def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None, str]:
-        """Static arguments of the compiled program, beside the scene and the cases.
+        """Static arguments of the compiled program, in addition to the scene and the cases.
 
         They include the digest of the measures' identities, because a function compares equal to itself after its global
         numbers have changed, and would otherwise get the previous program.

@@ -75,9 +75,9 @@ class Sweep(Result):
 
     @property
     def data(self) -> xarray.Dataset:
-        """Labelled numbers, an xarray dataset that reads from disk on demand; `xarray.open_zarr(found.store)` gives them too.
+        """Labelled results, an xarray dataset that reads from disk on demand, as `xarray.open_zarr(found.store)` does.
 
-        **Raises** `InputError` if xarray is not installed, or a chunk of the store is damaged.
+        **Raises** `InputError` if xarray is not installed or a chunk of the store is damaged.
         """
         try:
             import xarray
@@ -92,7 +92,7 @@ class Sweep(Result):
         return scene_from_toml(Store(Path(self.store)).record["scene"])
 
     def summary(self) -> str:
-        """Text of the progress of the study, the outcome of its cases and its duration."""
+        """Return a text about the progress of the study, the outcomes of its cases and its duration."""
         lines = [f"{self.message}: {self.cases} cases in {self.store}"]
         for name, cases in self.counts:
             lines.append(f"  {cases} {name}: {sentence(member(CaseStatus, name))}")
