@@ -91,7 +91,7 @@ def shapes_chart(
 ) -> Drawn:
     """Draw mode shapes (k, nd) as bars, a group for each mode, labelled with its frequency (k,) rad/s, drawn in `unit`.
 
-    The coordinates have the `names` (nd,).
+    `names` (nd,) are those of the coordinates.
 
     >>> import numpy as np
     >>> shapes_chart(np.array([10.0]), np.ones((1, 2)), names=("y1", "y2")).axes[0].get_xticklabels()[0].get_text()
@@ -120,8 +120,8 @@ def shapes_chart(
 def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
 
-    An arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel. Given
-    axes `ax` must be as many as the circles.
+    An arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel. `ax`
+    must contain one axes object for each circle.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)

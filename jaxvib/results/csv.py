@@ -21,14 +21,14 @@ __all__ = ["main_axis", "table_along", "write_csv"]
 def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
     """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
-    The head of a column is the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9 digits,
-    complex ones a column each for the real and the imaginary part.
+    The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
+    digits. Complex numbers have one column for the real part and one for the imaginary part.
 
     **Arguments**
 
-    - `result` of any kind
-    - `axis` as in the metadata of the fields, such as "time" or "point"
-    - `path` of the file, which is overwritten
+    - `result`: result of any class
+    - `axis`: name of the axis in the metadata of the fields, such as "time" or "point"
+    - `path`: path of the file, which is overwritten
 
     **Returns** the path. **Raises** `InputError` for an axis that the result does not have, and for a path that cannot be
     written to.

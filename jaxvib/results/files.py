@@ -63,7 +63,7 @@ def save(result: eqx.Module, path: str | Path) -> Path:
 
 @validated
 def load(path: str | Path) -> Any:
-    """Read a result written by `save`, of whatever class it is.
+    """Read a result of any class that was written by `save`.
 
     **Arguments**: `path` of the file, ".npz".
 

@@ -1,4 +1,4 @@
-"""The folder in which compiled programs are cached on disk."""
+"""Folder in which compiled programs are cached on disk."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _folder: list[Path] = []
 
 @validated
 def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bool = False) -> Path:
-    """Cache compiled programs on disk, so that the next process that computes the same neither traces nor compiles.
+    """Cache compiled programs on disk; another process that computes the same then neither traces nor compiles.
 
     - There are two caches: jaxvib's own in `folder/programs` holds traced programs, JAX's compilation cache in `folder` itself
       holds compiled ones (`jax_compilation_cache_dir` stays if it is set already)

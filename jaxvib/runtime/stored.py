@@ -229,7 +229,7 @@ _traces: list[bool] = []
 
 @contextlib.contextmanager
 def _no_garbage_collection() -> Iterator[None]:
-    """Disable garbage collection during a trace, which creates many objects; collection takes a fifteenth of its time."""
+    """Disable garbage collection, which takes a fifteenth of the time of a trace because a trace creates many objects."""
     with _pausing:
         _traces.append(gc.isenabled() if not _traces else _traces[0])
         gc.disable()

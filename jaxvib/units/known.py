@@ -1,4 +1,4 @@
-"""Checks of numbers that may be traced and then have no value: JAX transforms the computation (jit, grad, vmap)."""
+"""Checks of numbers that have no value if JAX is transforming the computation (jit, grad, vmap)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def is_known(*trees: PyTree) -> bool:
-    """Return True if every number in the trees has a value. Modules that plan a computation call it once for a computation.
+    """Return True if every number in the trees has a value. Modules that plan a computation call it once per computation.
 
     >>> is_known({"mass": 1.0}, None)
     True

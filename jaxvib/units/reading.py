@@ -77,7 +77,7 @@ _FACTORS = {
 """Factors of the units in most drawings. Other units are read by pint, whose import takes half a second."""
 
 _UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
-"""Errors of pint, other than those of its own classes, for a text that is no unit, which pint parses as a Python expression."""
+"""Errors, other than pint's own classes, that pint raises for a text that is no unit; it parses the text as Python."""
 
 
 def unit_name(unit: str) -> str:
@@ -92,11 +92,11 @@ def _example(unit: str) -> str:
 def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
     """Return the SI magnitude of `value` in `unit`; numbers without a unit are in `unit` already.
 
-    Strings and pint quantities are converted. A frequency in hertz counts as revolutions per second if `unit` has an angle in
-    it (pint alone would take 25 Hz for 25 rad/s); "1500 1/min" is 1500 rpm there, and a bare 1/s is refused.
+    Strings and pint quantities are converted. If `unit` contains an angle, a frequency in hertz counts as revolutions per
+    second (pint alone would convert 25 Hz to 25 rad/s), "1500 1/min" is 1500 rpm, and 1/s without an angle is refused.
 
-    **Raises** `InputError` for a text that is no number, an unknown unit, a unit of another dimension, and for what is no
-    real number (`require_real`).
+    **Raises** `InputError` for a text that is no number, an unknown unit, a unit of another dimension, and a value that is not
+    a real number (`require_real`).
 
     >>> round(to_float("1500 rpm", "rad/s", "drive.speed"), 4)
     157.0796
