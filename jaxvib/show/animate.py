@@ -1,4 +1,4 @@
-"""Films of a machine as it moves: platforms, springs, rotor, loads, and the forces on the foundation."""
+"""Films of a moving machine: platforms, springs, rotor, loads, and the forces on the foundation."""
 
 from __future__ import annotations
 

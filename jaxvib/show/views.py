@@ -25,7 +25,7 @@ _FORCE: Look = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
 def _tie(
     start: tuple[float, float], end: tuple[float, float], stiffness: float, damping: float, length: float = 1.5
 ) -> list[Part]:
-    """Return a spring and a damper side by side, without one that is 0. `length` is their length at rest."""
+    """Return a spring and a damper side by side; one whose value is 0 is omitted. `length` is their length at rest."""
     both = stiffness > 0.0 and damping > 0.0
     off = 0.17 if both else 0.0
     side = np.array([start[1] - end[1], end[0] - start[0]]) / max(np.hypot(end[0] - start[0], end[1] - start[1]), 1e-9)
@@ -86,7 +86,10 @@ class View(abc.ABC):
 
     @abc.abstractmethod
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return the force of each support on the foundation, (supports, 2) N, across and up, without effects."""
+        """Return the force of each support on the foundation, (supports, 2) N, across and up.
+
+        Supports that are effects are not included.
+        """
 
     def arrows(self, pose: Pose, total: np.ndarray, per_newton: float) -> list[Part]:
         """Return arrows of the forces on the foundation.

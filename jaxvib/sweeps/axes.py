@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 SAMPLE = "sample"
-"""The name of the axis along which sampled numbers lie."""
+"""Name of the dimension of the samples."""
 
 _START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s"}
 """Numbers of a start, as in `State`, and their units."""
@@ -96,7 +96,7 @@ class Grid(NamedTuple):
 
     @property
     def dims(self) -> tuple[str, ...]:
-        """The names of the dimensions."""
+        """Names of the dimensions."""
         return (*(axis.name for axis in self.axes if axis.values is not None), *([SAMPLE] if self.samples else []))
 
     @property
@@ -184,7 +184,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
         if np.unique(values).size < values.size:
             raise InputError(f"axes.{name}", "has a value twice; name each one once")
         axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, spot)
-    for end in (axis.low, axis.high):  # the constructor checks the range of a single number
+    for end in (axis.low, axis.high):  # the constructors of the scene's parts check the ranges of single numbers
         validate_scene(put(scene, (spot,), jnp.asarray([end])))
     return axis
 

@@ -133,7 +133,7 @@ def sweep(
     timeout: Number = "30 s",
     report: Report | None = None,
 ) -> Sweep:
-    """Compute every case of a study and keep it in a store on disk; an existing store of the same study is continued.
+    """Compute every case of a study into a store on disk; an existing store of the same study is continued.
 
     - Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask
     - A finished chunk is written at once and survives any end of the process; a chunk with damaged files is computed again
