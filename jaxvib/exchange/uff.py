@@ -185,7 +185,7 @@ def _head(scene: Scene, path: Path) -> list[dict[str, Any]]:
 
 
 def _modes(scene: Scene, rotor_speed: Number | None) -> list[dict[str, Any]]:
-    """Return the natural modes at the nodes (datasets 55)."""
+    """Return the natural modes at the nodes, one dataset 55 for each."""
     nodes, directions = _nodes(scene), _directions(scene)
     numbers_ = [node.number for node in nodes]
 

@@ -26,7 +26,7 @@ from optimize.quantities.quantity import TIERS, Quantity, Tier
 __all__ = ["TEMPLATE", "Measures", "load_study", "study"]
 
 Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
-"""Measures, or a mapping from names to measures."""
+"""Type of measures: a list, or a mapping from names to measures."""
 
 _CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
 """Default number of cases of a chunk by tier: about a second of computation, which outweighs the cost of writing it."""
@@ -128,7 +128,10 @@ def _plain(spec: AxisSpec) -> Plain:
 
 
 def _named(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
-    """Return the measures and a unique name for each: the mode is appended if a quantity of several modes is measured."""
+    """Return a unique name for each measure, and the measures.
+
+    The mode is appended to the names of quantities that differ only in it.
+    """
     if isinstance(measure, Mapping):
         found = {str(name): measure_of(m, f"measure.{name}") for name, m in measure.items()}
         if found:
