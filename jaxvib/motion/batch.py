@@ -40,7 +40,7 @@ _DOUBLINGS = 40
 def advance(
     motion: PackedSystem, held: Held, begin: Array, length: Array, step: Array, *, implicit: bool = False
 ) -> tuple[Held, Array]:
-    """State of the integrator a `length` of time after `begin`, by steps of the size `step`, and the number of steps."""
+    """Return the state of the integrator a `length` of time after `begin`, by steps of size `step`, and the number of steps."""
     solution = diffrax.diffeqsolve(
         motion.term,
         Rodas4() if implicit else motion.method(),
@@ -61,7 +61,7 @@ def advance(
 def stretches(
     motion: PackedSystem, held: Held, length: Array, step: Array, number: int, *, implicit: bool
 ) -> tuple[Held, Array, Array]:
-    """Beginnings of stretches of the same `length`, s, the length of each, and the integrator's state at the first.
+    """Return the beginnings of stretches of the same `length`, s, the length of each, and the integrator's first state.
 
     Implicit steps do not resolve the acceleration of loads by drag at the start; therefore the first stretch has doubling
     steps.
@@ -82,7 +82,7 @@ def stretches(
 def pack_batch(
     field: Callable[[Array, State], State], state: State, single: bool, has_common_turns: bool, *, implicit: bool
 ) -> PackedSystem:
-    """Equations of a batch of runs; an implicit method takes the numbers of each run as a vector."""
+    """Return the equations of a batch of runs; an implicit method takes the numbers of each run as a vector."""
     if implicit:
         return PackedSystem(field, state, solver=Rodas4())
     return PackedSystem(field, state, wrapped=single, has_common_turns=has_common_turns, batch=True)
@@ -91,9 +91,9 @@ def pack_batch(
 class BatchPlan(NamedTuple):
     """Steps of a batch of runs, equal for all runs.
 
-    **Attributes**: `until` s, the end; `window` s, the stretch before it that is measured; `samples` states in it, evenly
-    apart; `each` steps in each of the `PARTS` before it; `between` steps from one sample to the next; `implicit` true if decay
-    is too fast for explicit steps.
+    **Attributes**: `until`: end time, s; `window`: length of the measuring window at the end, s; `samples`: number of evenly
+    spaced states in it; `each`: number of steps in each of the `PARTS` before it; `between`: number of steps from one sample to
+    the next; `implicit`: true if decay is too fast for explicit steps.
     """
 
     until: float
@@ -107,9 +107,9 @@ class BatchPlan(NamedTuple):
 class BatchRun(NamedTuple):
     """A run with its measurements.
 
-    **Attributes**: `scene` that ran; `window` its last stretch; `measured` and `regime` of the window; `part_speed` (PARTS,
-    count) rad/s, the loads' mean speeds over the equal parts before it, each `part_length` s long; `finite` whether the motion
-    stayed so.
+    **Attributes**: its `scene`; `window`: its last stretch; `measured` and `regime` of the window; `part_speed` (PARTS, count):
+    mean speeds of the loads, rad/s, over the equal parts before the window, each `part_length` s long; `finite`: true if the
+    motion stayed finite.
     """
 
     scene: Scene
@@ -124,7 +124,7 @@ class BatchRun(NamedTuple):
 def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     """Integrate the full equations from a state with equal steps, and measure the window at the end like `simulate`.
 
-    Under `vmap` all runs take the same steps: none waits for another, and no result depends on the other runs.
+    Under `vmap` all runs take the same steps: no run waits for another, and no result depends on the other runs.
     """
     dtype = state.displacement.dtype
     single, has_common_turns = wrap_angles(scene, dtype)

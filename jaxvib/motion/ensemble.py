@@ -193,7 +193,7 @@ def ensemble(
     last, load_speed, apart, finite, detached, taken = ends
     error = np.full(plan.allowed.shape, np.inf if estimate else np.nan, plan.end.dtype)
     if plan.is_compared:
-        # Share of the difference that a method of order 3 would leave, a safe value for this method of order 8.
+        # Share of the difference for a method of order 3, which is conservative for this method of order 8.
         error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
@@ -218,7 +218,7 @@ def _run_batch(
     equations: Equations,
     implicit: bool,
 ) -> _Ends:
-    """Integrate a batch of runs with numbers of their `own`, with a leading axis, and `common` numbers."""
+    """Integrate a batch of runs; numbers in `own` have a leading axis over the runs, those in `common` are shared by all."""
 
     def one(own: list[Array]) -> _Ends:
         mine, ours = iter(own), iter(common)
@@ -268,9 +268,9 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
 
 
 class _StateWithDetachment(State):
-    """A state, and for each load the pull of its track that is missing so far, integrated over time, (loads,) N s.
+    """State with the integral over time of the pull that each load's track would need to hold it so far, (loads,) N s.
 
-    It is exactly 0 if N was nowhere negative, whatever the weights of the method's stages.
+    The integral is exactly 0 if the normal force N was nowhere negative, whatever the weights of the method's stages.
     """
 
     missing: Array

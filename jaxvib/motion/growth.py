@@ -175,7 +175,7 @@ def growth(
 
     rng, rates, other, quarters = np.random.default_rng(0), [], None, []
     for k in range(stretches):
-        if other is None:  # not along the motion, where nothing grows
+        if other is None:  # in a direction that differs from that of the motion, in which nothing grows
             scale = error_scale(jax.tree.map(lambda x: x[None], state), unit)
             noise = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state)
             other = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, separation)
@@ -201,7 +201,7 @@ def growth(
 
 
 def _judged(late: np.ndarray) -> str:
-    """Name of the `GrowthStatus` for logarithms `late` (n,) of the growth in each stretch of the later half of a run.
+    """Return the name of the `GrowthStatus` from logarithms `late` (n,) of the growth in each stretch of a run's later half.
 
     Periodic motions are not distinguished here: "chaotic" includes "unstable".
     """
@@ -217,12 +217,12 @@ def _judged(late: np.ndarray) -> str:
 
 
 def _sum_error(values: np.ndarray) -> float:
-    """Standard error of the sum of values (n,) of which only neighbours are correlated.
+    """Return the standard error of the sum of values (n,) of which only neighbours are correlated.
 
         s^2 = n c_0 + 2 (n - 1) c_1
 
-    with the autocovariances c_k; at least that of one value. If the phase of the motion differs between ends of stretches,
-    logarithms of growth are large and cancel each other.
+    with the autocovariances c_k; the result is at least the error of one value. If the phase of the motion differs between the
+    ends of stretches, logarithms of growth are large and cancel each other.
     """
     off = values - np.mean(values)
     each = float(np.sum(off**2)) / (values.size - 1)
@@ -230,7 +230,7 @@ def _sum_error(values: np.ndarray) -> float:
 
 
 def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
-    """True if the motion from `state` comes back to it within a few turns of rotor and loads."""
+    """Return True if the motion from `state` comes back to it within a few turns of rotor and loads."""
     speed = float(scene.drive.speed)
     turning = np.abs(np.asarray(state.azimuth_rate))
     slowest = min([speed, *(float(w) for w in turning if w > 1e-2 * speed)])
@@ -253,13 +253,13 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
 
 
 def _distance(a: State, b: State, scale: State) -> float:
-    """Euclidean distance of two states, with each number in units of the scale of its part."""
+    """Return the Euclidean distance of two states, each number in units of the scale of its part."""
     parts = jax.tree.leaves(jax.tree.map(lambda x, y, s: np.sum(((np.asarray(y) - np.asarray(x)) / s) ** 2), a, b, scale))
     return math.sqrt(float(sum(parts)))
 
 
 def _at_distance(a: State, b: State, scale: State, separation: float) -> State:
-    """State at the distance `separation` from `a` towards `b`; if the two are equal, `a` with its displacements moved."""
+    """Return the state at the distance `separation` from `a` towards `b`; if both are equal, `a` with moved displacements."""
     distance = _distance(a, b, scale)
     if distance == 0.0:
         return eqx.tree_at(lambda s: s.displacement, a, a.displacement + separation * scale.displacement)

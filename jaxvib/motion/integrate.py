@@ -74,7 +74,7 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
     if control.steps is not None:
         return diffrax.ConstantStepSize()
     assert control.tolerance is not None
-    # The error of an angle is absolute: relative to the growing angle, it would let a long run lose its phase.
+    # The error of an angle is absolute: an error relative to the growing angle would let a long run lose its phase.
     one, zero, dtype = jnp.ones(()), jnp.zeros(()), state.displacement.dtype
 
     def relative_of(own: ExciterState) -> ExciterState:
@@ -89,13 +89,13 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
 
     tolerance = jnp.asarray(control.tolerance, dtype)
     units = motion.pack(spread(unit))
-    if motion.wrapped:  # the count of turns has no error, and any unit
+    if motion.wrapped:  # the count of turns has no error, so its unit has no effect
         units = (units[0], jax.tree.map(jnp.ones_like, units[1]))
     return PIController(tolerance=tolerance, unit=units, relative=motion.pack(spread(relative)), max_steps=control.max_steps)  # pyright: ignore[reportCallIssue]
 
 
 def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
-    """Controller that steps onto the times at which the acceleration of the drive jumps; fixed steps are unchanged."""
+    """Return a controller that steps onto the jumps of the drive's acceleration; fixed steps are unchanged."""
     jump_ts = [t for exciter in scene.exciters for t in exciter.drive.jump_ts()]
     if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
         return controller
@@ -103,7 +103,7 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
 
 
 def effects_rate(scene: Scene) -> Array:
-    """Fastest rate that effects add to the motion of loads, see `Effect.fastest_rate`; 0 without such effects."""
+    """Return the fastest rate that effects add to the motion of loads, see `Effect.fastest_rate`; 0 without such effects."""
     found, zero = [], jnp.zeros_like(scene.exciters[0].drive.speed)
     for exciter in scene.exciters:
         if exciter.loads is not None:
@@ -114,9 +114,10 @@ def effects_rate(scene: Scene) -> Array:
 
 @cached
 def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
-    """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count.
+    """Return the largest and the smallest of the rotor's speed and the natural frequencies, rad/s.
 
-    Among the greatest are the loads' own frequency, where they have one, and what effects add to it.
+    The frequency 0 of a free carrier does not count. The largest one includes the loads' natural frequency, if they have one,
+    and the rates that effects add.
     """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = estimated_frequencies(scene), scene.top_speed
@@ -129,17 +130,17 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 
 
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
-    """True if angles are wrapped into a turn (single precision), and True if the angles of all loads are wrapped by the same
+    """Return True if angles are wrapped into a turn (single precision), and True if all loads' angles are wrapped by the same
     turns (loads in contact)."""
     return jnp.dtype(dtype).itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 
 class IntegrationPlan(NamedTuple):
-    """Static choices of one time integration: its method, its steps, and what is kept of it.
+    """Static choices of one time integration: method, steps, and stored states.
 
-    **Attributes**: `solver` diffrax's, None for the method of order 8 in the form that is fastest here; `control` of the steps;
-    `adjoint` diffrax's, None for step replay; `samples` states kept of the whole run, 0 for none; `turns` of the slowest motion
-    in the measuring window; `max_steps`; `progress_meter` diffrax's.
+    **Attributes**: `solver` of diffrax, None for the method of order 8 in its fastest form; `control` of the steps; `adjoint`
+    of diffrax, None for step replay; `samples`: number of stored states of the whole run, 0 for none; `turns`: length of the
+    measuring window in periods of the slowest motion; `max_steps`; `progress_meter` of diffrax.
     """
 
     solver: diffrax.AbstractSolver | None
@@ -156,7 +157,7 @@ def integrate(
     scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
     """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured`."""
-    # A missing start (a jam mode absent in one run of a batch) must not delay the other runs.
+    # A start that does not exist (a jam mode that is absent in one run of a batch) must not delay the other runs.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
@@ -188,13 +189,13 @@ def integrate(
     whole = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
     if is_measured is None:
         numbers = measure(model, field, times, states, unit)
-    else:  # the window of a run with larger steps is compared only
+    else:  # the window of a run with larger steps is only compared
         numbers = jax.lax.cond(
             is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(model, states)
         )
     numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
-    # A run that did not end has no window; the state at which it stopped shows whether it was diverging.
+    # A run that did not reach its end has no window; the state at which it stopped shows if it diverged.
     ended = solution.result == diffrax.RESULTS.successful
     bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
@@ -217,7 +218,7 @@ def integrate(
 
 
 def _saves(scene: Scene, end: Array, slowest: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:
-    """Times of the states that are kept: the measuring window, the end, and those evenly spaced over the whole run."""
+    """Return the times of stored states: the measuring window, the end, and even times over the whole run."""
     longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.top_speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.turns / slowest, longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW)), diffrax.SubSaveAt(t1=True)]
@@ -234,20 +235,20 @@ def _steps(
     end: Array,
     fastest: Array,
 ) -> tuple[Array | None, diffrax.AbstractStepSizeController]:
-    """Length of the first step, s, and the controller of the others."""
+    """Return the length of the first step, s, and the controller of the others."""
     if isinstance(control, StepControl):
         first = 0.05 / fastest
         if control.steps is not None:
             first = end / jnp.asarray(control.steps)
         if control.tolerance is not None:
-            # Scaled by the order 8 of the error, so that runs with two tolerances differ from their first step on.
+            # The first step follows the tolerance by the order 8 of the error: runs with two tolerances then differ at once.
             first = 0.4 * jnp.asarray(control.tolerance) ** (1.0 / 9.0) / fastest
         return first, _controller(motion, state, unit, control)
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
 
 
 def _is_coincident(angles: list[Array]) -> Array:
-    """True if several loads of an exciter have one angle (..., count) all the time, up to the growth of rounding errors."""
+    """Return True if several loads of an exciter have one angle (..., count) all the time, up to growing rounding errors."""
 
     def one_angle(angle: Array) -> Array:
         apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
@@ -257,8 +258,7 @@ def _is_coincident(angles: list[Array]) -> Array:
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:
-    """True if the displacement of the carrier exceeds its start and its natural units by `_UNBOUNDED`, as unbounded motions
-    do."""
+    """Return True if the displacement of the carrier exceeds its start and its natural units by the factor `_UNBOUNDED`."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
     beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
     return beyond[0] | beyond[1] | ~is_finite(last)
@@ -274,13 +274,13 @@ def _status(result: diffrax.RESULTS, bounded: Array) -> RunStatus:
 
 
 def _stages(solver: diffrax.AbstractSolver) -> int:
-    """Evaluations of the vector field in a step; 0 for a method that does not state them."""
+    """Return the number of evaluations of the vector field in a step; 0 for a method that does not state it."""
     tableau = getattr(solver, "tableau", None)
     return 0 if tableau is None else tableau.num_stages - tableau.fsal
 
 
 def is_finite(state: Any) -> Array:
-    """True if every number of a state, or of another tree, is finite."""
+    """Return True if every number of a state, or of another tree, is finite."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
 
 
@@ -289,10 +289,10 @@ _MAX_TURNS = 1e15
 
 
 def whole_turns(scene: Scene, stretch: float) -> float:
-    """Longest time within `stretch`, s, after which rotors of constant speed are where they were; at least one turn.
+    """Return the longest time within `stretch`, s, of whole turns of all rotors with constant speed; at least one turn.
 
-    Only rotors out of balance count if there are several, and no rotor of a motor, whose angle is a state. **Raises**
-    `InputError` for rotors out of balance at different speeds.
+    If there are several rotors, only those with an imbalance count. The rotor of a motor does not count, since its angle is
+    part of the state. **Raises** `InputError` for rotors with an imbalance at different speeds.
     """
     one = len(scene.exciters) == 1
     counted = [

@@ -1,4 +1,4 @@
-"""Plans of runs: choices that depend on numbers of a scene, taken on the host before a program is traced.
+"""Plans of runs: choices that depend on numbers of a scene, made on the host before a program is traced.
 
 Only this module tests which numbers are known. The method and static sizes (samples, steps, stretches) follow from known
 numbers; under a JAX transformation sizes have fixed values.
@@ -70,10 +70,11 @@ _STRETCH_TURNS = 2.0e4
 class RunPlan:
     """Plan of a run.
 
-    **Attributes**: the `asked` scene, and the `scene` that runs, with the drive that its start gives it; `end` s; `state` at
-    the start; `integration` the static choices of one integration; `stretches` into which the run is cut; `is_known`: true if
-    scene, end and state have values; `is_estimated`: true if a second run with larger steps estimates the error; `accuracy` to
-    reach by repeated runs, or None; `fastest` rate of the motion, rad/s, NaN where nothing needs it.
+    **Attributes**: `asked`: the scene of the call; `scene`: the scene of the run, with the drive that belongs to its start;
+    `end`, s; `state` at the start; `integration`: the static choices of one integration; `stretches`: the number of parts of
+    the run; `is_known`: true if scene, end and state have values; `is_estimated`: true if a second run with larger steps
+    estimates the error; `accuracy` that repeated runs must reach, or None; `fastest` rate of the motion, rad/s, NaN if it is
+    not needed.
     """
 
     asked: Scene
@@ -128,7 +129,7 @@ def plan_run(
     if max_steps is None:
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_SHARE) * fastest, end)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
-        # The caller may differentiate, and derivatives of the unrolled step take several times as long to compile.
+        # The caller may differentiate the run, and derivatives of the unrolled step take several times as long to compile.
         forward = isinstance(adjoint, diffrax.ForwardMode)
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
     kept, most = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
@@ -155,7 +156,7 @@ def plan_run(
 
 
 def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *, throw: bool) -> RunPlan:
-    """Plan one of several runs that follow each other, without a trajectory and an estimate. **Raises** `InputError`."""
+    """Plan one of several consecutive runs, without a trajectory and an error estimate. **Raises** `InputError`."""
     return plan_run(
         scene, length, start=state, mode=None, separation=None, spin_up=None, save="window", samples=None, turns=20,
         estimate=False, solver=None, steps=steps, adjoint=None, max_steps=None, progress_meter=None, throw=throw,
@@ -172,8 +173,11 @@ def start_state(
 
 
 def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
-    """500 steps for each turn of the `fastest` motion, rad/s, rounded up to a power of 2: few programs where it is part of
-    one. **Raises** `InputError` for a run that would need too many."""
+    """Return a maximum number of steps: 500 for each turn of the `fastest` motion, rad/s, rounded up to a power of 2.
+
+    The number can be a static part of a program; powers of 2 keep the number of programs small. **Raises** `InputError` for a
+    run that would need too many steps.
+    """
 
     def steps_of(fastest: float, end: float) -> int:
         turns = end * fastest / (2.0 * math.pi)
@@ -187,7 +191,10 @@ def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
 
 
 def _enough_samples(scene: Scene, end: Array) -> int:
-    """Samples that resolve the vibration in a figure, without a beat; one of two numbers, and therefore of two programs."""
+    """Return a number of samples that resolve the vibration in a figure without a beat.
+
+    It is one of two numbers, which keeps the number of programs small.
+    """
 
     def samples_of(end: float, speed: float) -> int:
         return _FEW_SAMPLES if PER_TURN * end * speed / (2.0 * math.pi) <= _FEW_SAMPLES else _MANY_SAMPLES
@@ -197,7 +204,7 @@ def _enough_samples(scene: Scene, end: Array) -> int:
 
 
 def _sample_size(scene: Scene) -> float:
-    """Size of a kept state with its forces in bytes, times three copies during the computation."""
+    """Return the size of a stored state with its forces in bytes, times three copies during the computation."""
     structure = scene.machine.structure()
     numbers = 2 * structure.mass.shape[0] + structure.foundation_stiffness.shape[0] + 1
     for exciter in scene.exciters:
@@ -206,7 +213,7 @@ def _sample_size(scene: Scene) -> float:
 
 
 def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> Control:
-    """Control of the steps. **Raises** `InputError` for a choice that the precision cannot deliver."""
+    """Return the control of the steps. **Raises** `InputError` for a choice that the precision does not allow."""
     require(chosen, Tolerance, Accuracy, EqualSteps, diffrax.AbstractStepSizeController)
     if isinstance(chosen, diffrax.AbstractStepSizeController):
         if estimate:
@@ -227,7 +234,7 @@ def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) 
 
 
 ENSEMBLE_PARTS = 4
-"""Equal parts of a run of an ensemble; mean speeds are taken over the last one."""
+"""Number of equal parts of a run of an ensemble; mean speeds are taken over the last part."""
 
 _EXPLICIT_PER_RADIAN, _LEAST_STEPS = 4.0, 16
 
@@ -235,12 +242,17 @@ _EXPLICIT_PER_RADIAN, _LEAST_STEPS = 4.0, 16
 class EnsemblePlan(NamedTuple):
     """Plan of many runs that advance together.
 
-    **Attributes**: `scenes` with a leading axis over the runs, and whether constructors would have taken the numbers of each,
-    `allowed`, and of all, `is_allowed`; numbers of scenes and states that each run has for itself, `own`, and those that all
-    have in `common`; for each number in their order `is_shared`, and the `form` of scene and state that they fill; `end` s;
-    steps in each of the `ENSEMBLE_PARTS` of a run, `each`, and of a second run with larger steps, `coarse`, if it
-    `is_compared` with it; `decay` of each scene, 1/s; `implicit` steps or not; runs in a `batch`; `is_known`: true if all
-    numbers have values.
+    **Attributes**
+
+    - `scenes` with a leading axis over the runs
+    - `allowed`: true for each run with numbers that the constructors accept; `is_allowed`: true if all are accepted
+    - `own`: numbers of scenes and states that differ between runs; `common`: numbers that all runs share; `is_shared`: true for
+      each shared number, in their order; `form`: the structure of scene and state for these numbers
+    - `end`, s
+    - `each`: number of steps in each of the `ENSEMBLE_PARTS` of a run; `coarse`: that of a second run with larger steps;
+      `is_compared`: true if there is a second run
+    - `decay` of each scene, 1/s; `implicit`: true for implicit steps
+    - `batch`: number of runs in a batch; `is_known`: true if all numbers have values
     """
 
     scenes: Scene
@@ -300,7 +312,7 @@ def plan_ensemble(
     coarse = -(-each // 2)
 
     leaves, structure = jax.tree.flatten((scenes, states))
-    # A number that all runs share stays a single number. At least one array defines the number of runs.
+    # A number that all runs share stays a single number; at least one number is an array that defines the number of runs.
     is_shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in leaves]
     is_shared[0] = is_shared[0] and not all(is_shared)
     return EnsemblePlan(
@@ -324,7 +336,7 @@ def plan_ensemble(
 
 @eqx.filter_jit
 def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State, Array]:
-    """The scenes, the states at their start, and true for those with allowed numbers, with a leading axis over the runs."""
+    """Return the scenes, their initial states, and true for scenes with allowed numbers, with a leading axis over the runs."""
 
     def one(value: PyTree[Array]) -> tuple[Scene, State, Array]:
         given = call_user(make, "make", value)
@@ -342,5 +354,5 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
 
 @cached
 def _rates(scenes: Scene) -> tuple[Array, Array]:
-    """The fastest rates of the motion, rad/s, and of the decay, 1/s, of each scene."""
+    """Return the fastest rates of the motion, rad/s, and of the decay, 1/s, of each scene."""
     return jax.vmap(lambda scene: (frequency_bounds(scene)[0], fastest_decay(scene)))(scenes)

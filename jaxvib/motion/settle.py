@@ -36,7 +36,7 @@ _REMEMBERED = 32
 """Number of stretches, of 100 slow periods each, on which the decision about a steady mean is based."""
 
 _SCATTER = 3.6
-"""Largest difference of the means over the four quarters of these that counts as chance, in standard errors (95 %)."""
+"""Largest difference of the means over the four quarters of these stretches that counts as chance, in standard errors, 95 %."""
 
 _AWAY = 10.0
 """Largest distance of a settled motion from its steady state, in units of the drift."""
@@ -45,11 +45,11 @@ _CREEPS = 4
 """Number of stretches on which the decision about creeping loads is based."""
 
 _EVENLY = 0.05
-"""Largest relative difference of the angles by which loads creep in two of these."""
+"""Largest relative difference of the angles by which loads creep in two of these stretches."""
 
 _NEUTRAL = 0.01
-"""Largest change of the residual unbalance, relative to that of the angles in rad, of loads that creep along balanced
-arrangements; in any other direction it is at least 1 divided by the number of loads."""
+"""Largest ratio of the change of the residual unbalance and the change of the angles, in rad, of loads that creep along
+balanced arrangements. In any other direction the ratio is at least 1 divided by the number of loads."""
 
 _FALLS = -3.0
 """Slope of the logarithm of the drift, in standard errors, beyond which the drift is decreasing."""
@@ -128,9 +128,9 @@ def settle(
 class _SettlePlan:
     """Plan of stretches of a run.
 
-    **Attributes**: `first` stretch, at most `stretches` in all; `drift` below which the motion has settled, and the `usual` one
-    of the precision; `remembered` stretches by which a steady mean is judged, None if the motion must come to the drift; the
-    slowest `decay` of the carrier, 1/s.
+    **Attributes**: `first`: plan of the first stretch; `stretches`: their largest number; `drift`: the drift below which the
+    motion has settled; `usual`: the default drift of the precision; `remembered`: the number of stretches on which the decision
+    about a steady mean is based, None if the motion must reach the drift; `decay`: the slowest decay of the carrier, 1/s.
     """
 
     first: RunPlan
@@ -163,7 +163,7 @@ def _plan_settle(
     count(periods, "periods")
     double = scene.top_speed.dtype.itemsize >= 8
     usual = 1e-6 if double else 1e-3
-    # Stretches of whole turns: an imbalance continues at the angle at which it was.
+    # Stretches are whole turns: an imbalance then continues at its angle.
     length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
     start = ("rest" if mode is None else "jam") if start is None else start
     is_jam = isinstance(start, str) and start == "jam"
@@ -197,7 +197,7 @@ def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
         drifts.append(float(run.drift))
         if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _AWAY * plan.drift:
             judged = _judged(run, "done")
-            # Loads that are not at exactly one angle leave an unstable motion without a test.
+            # No test is needed for loads that are not at exactly one angle: they leave an unstable motion.
             if is_coincident or status_name(judged.status) == "done":
                 return judged, True
         if plan.remembered is not None:
@@ -227,7 +227,7 @@ def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
 
 
 def _slowest_decay(scene: Scene) -> float:
-    """Smallest decay rate of the free vibrations of the carrier with its loads, 1/s; 0 if one of them does not decay."""
+    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if one does not decay."""
     mass, stiffness, damping = (np.asarray(matrix, float) for matrix in _matrices(scene))
     flow = np.linalg.solve(mass, -np.concatenate([stiffness, damping], axis=1))
     poles = np.linalg.eigvals(np.concatenate([np.eye(len(mass), 2 * len(mass), len(mass)), flow]))
@@ -236,12 +236,12 @@ def _slowest_decay(scene: Scene) -> float:
 
 
 def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -> float:
-    """Relative distance of a motion from its steady state, estimated from the drifts of its stretches so far.
+    """Estimate the relative distance of a motion from its steady state from the drifts of its stretches so far.
 
     A distance that decays at the rate a falls by 1 - exp(-a T) of itself from one half of the measuring window to the other,
     T apart; this decrease is the drift. Free vibrations that beat with the jam make some drifts small by chance; therefore the
-    largest of three counts unless the vibrations decay within a window. The rate is the carrier's slowest `decay`, or if it has
-    none the one at which drifts fall from stretch to stretch, of the time `stretch` each.
+    largest of three drifts counts unless the vibrations decay within a window. The rate is the carrier's slowest `decay`, or,
+    if a vibration does not decay, the rate at which drifts fall from one stretch, of the length `stretch`, to the next.
     """
     half, recent = 0.5 * float(np.ptp(np.asarray(run.window.time))), max(drifts[-3:])
     if decay == 0.0 and len(drifts) >= 6 and recent > 0.0:
@@ -253,7 +253,7 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
 
 
 def _steady_in_the_mean(seen: np.ndarray) -> bool:
-    """True if the values of stretches (4 n, 3 + nd), each with its drift first, scatter about constant means.
+    """Return True if the values of stretches (4 n, 3 + nd), each with its drift first, scatter about constant means.
 
     Changes below half the drift are not resolved.
     """
@@ -273,7 +273,7 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
 
 
 def _is_creeping(regimes: Sequence[Regime]) -> bool:
-    """True if loads balance the rotor in each of some stretches and creep evenly along balanced arrangements."""
+    """Return True if loads balance the rotor in each of some stretches and creep evenly along balanced arrangements."""
     if len(regimes) < _CREEPS or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
         return False
     phase = np.array([np.asarray(regime.phase) for regime in regimes])
@@ -285,7 +285,7 @@ def _is_creeping(regimes: Sequence[Regime]) -> bool:
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:
-    """Check that the loads still turn at the speed of the jam mode in which they started."""
+    """Raise `ComputationError` if the loads no longer turn at the speed of the jam mode in which they started."""
     modes = jam_modes(scene)
     speeds = np.asarray(modes.omega)
     away = {k: abs(float(speeds[modes.row(k)]) - float(run.omega)) for k in modes.mode_numbers()}

@@ -1,4 +1,4 @@
-"""Time integration of a scene, through diffrax."""
+"""Time integration of a scene with diffrax."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def simulate(
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:
-    """Return the run of a plan, not yet judged by separation. **Raises** `ComputationError` if it fails and `throw` is true."""
+    """Return the run of a plan, without the test for separation. **Raises** `ComputationError` on failure if `throw` is true."""
     begun = time.perf_counter()
     if plan.accuracy is not None:
         run = _run_to_accuracy(plan, plan.accuracy)
@@ -183,7 +183,7 @@ def _integration(
 
 
 def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
-    """Return the plan with its limit of steps as a number that goes to the program, where the steps can have it."""
+    """Return the plan with its limit of steps as an argument of the program, if the control of the steps allows it."""
     control, most = integration.control, integration.max_steps
     if not isinstance(control, StepControl) or (control.steps is not None and float(control.steps) > most):
         return integration
@@ -192,8 +192,10 @@ def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
 
 
 def _run_in_stretches(plan: RunPlan, control: Control, *, is_measured: bool) -> Run:
-    """Return the run of the last of several stretches; each begins at time 0 after whole turns of the rotor, its angles within
-    one turn."""
+    """Return the run of the last of several stretches.
+
+    Each begins at time 0 after whole turns of the rotor, with its angles within one turn.
+    """
     number, end = plan.stretches, float(plan.end)
     if isinstance(control, StepControl) and control.steps is not None:
         control = StepControl(steps=np.asarray(np.ceil(control.steps / number), control.steps.dtype))
@@ -220,7 +222,7 @@ def _sum(counts: list[Array]) -> Array:
 
 
 _COARSER = 100.0
-"""Ratio of the tolerances of the second run, for the error estimate, and the first."""
+"""Ratio of the tolerances of the second run (for the error estimate) and the first."""
 
 
 def _coarser(control: StepControl) -> StepControl:
@@ -246,7 +248,7 @@ def _run_with_estimate(plan: RunPlan) -> Run:
 
 
 _ATTEMPTS = 6
-"""Maximum number of runs for an `accuracy`."""
+"""Maximum number of runs to reach an `accuracy`."""
 
 
 def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
@@ -266,7 +268,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
         radians = plan.fastest * latest.window.time[-1]
         if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, plan.scene, latest.steps, radians)) > accuracy:
             break
-        # Slightly smaller than proportional, since the error decreases more slowly than the tolerance.
+        # The new tolerance is slightly smaller than proportional, since the error decreases more slowly than the tolerance.
         share = min(max(0.2 * (accuracy / float(run.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(run.error)) else 1e-2
         before, coarser = latest, control
         control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), dtype))
@@ -281,14 +283,14 @@ def _compared(
     coarser: StepControl,
     before: Array | np.ndarray,
 ) -> Run:
-    """Return the finer run with its estimated error and the cost of both runs; `before`: evaluations of previous runs."""
+    """Return the run with smaller steps, with its estimated error and the cost of both; `before`: previous evaluations."""
     theirs, counted = (coarse.window.state, coarse.status), (fine.evaluations, before)
     error, evaluations = _estimated(plan.scene, plan.fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
 
 def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
-    """Share of the difference between two runs that is the error of the finer one, if the motion is smooth.
+    """Return the share of the difference between two runs that is the error of the finer one, if the motion is smooth.
 
     With a method of order 8 the error falls with the power 8/9 of the tolerance and the power 8 of the number of steps. The
     powers used here are 0.45 and 3, which makes the estimate conservative.
@@ -311,8 +313,8 @@ def _estimated(
     coarser: StepControl,
     evaluations: tuple[Array, Array | np.ndarray],
 ) -> tuple[Array, Array]:
-    """Estimated error of a run, from its window and the states and the status of a coarser one, and the sum of the
-    `evaluations`; `fastest` as in `frequency_bounds`."""
+    """Return the estimated error of a run, from its window and the states and the status of a run with larger steps, and the
+    sum of the `evaluations`; `fastest` as in `frequency_bounds`."""
     # The error of a run that is compared with itself, or with one that failed, is not known.
     found = status == RunStatus.done
     if control.steps is not None:
@@ -325,7 +327,7 @@ def _estimated(
 
 
 def last_state(scene: Scene, run: Run) -> State:
-    """State at the end of a run at constant speed, for its continuation, with angles within a turn to keep their digits."""
+    """Return the last state of a run at constant speed, to continue it, with angles within a turn to keep their digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, has_common_turns = wrap_angles(scene, last.displacement.dtype)
 
@@ -342,7 +344,7 @@ _FAILURES = ("max_steps_reached", "not_finite", "no_step", "not_accurate", "no_s
 
 
 def _hint(plan: RunPlan, run: Run, name: str) -> str:
-    """Place of a failure, and the change that may help."""
+    """Return text on the place of a failure and on a change that may help."""
     hint, kept = "", run.window if run.trajectory is None else run.trajectory
     times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
     if not bool(np.all(finite)) and bool(np.any(finite)):

@@ -46,7 +46,7 @@ START_SEPARATION = math.radians(1.0)
 one angle, stable or not."""
 
 Turning = Literal["rolling", "still"]
-"""Rotation of the loads themselves at the start: rolling on their track, or none in space."""
+"""Initial rotation of the loads about themselves: rolling on their track, or none in space."""
 
 
 @validated
@@ -124,7 +124,7 @@ def initial_state(
         modes = jam_modes(scene)
     except InputError as error:
         why, _, advice = error.problem.partition(";")
-        if "simulate" not in advice:  # which is who asks
+        if "simulate" not in advice:  # `simulate` is the caller, so that advice would be circular
             raise
         raise InputError("start", f"is 'jam', but {error.field} {why}; start at 'rest', or from a State") from error
     row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(scene.exciter, scene.loads, 0.0)
@@ -282,7 +282,7 @@ def _require_shapes(state: State | ExciterState, **lengths: int) -> None:
 
 
 def require_start(scene: Scene, state: State) -> None:
-    """**Raises** `InputError` if loads that touch cannot start from their angles (..., count), if these are known."""
+    """**Raises** `InputError` if loads with contact overlap at known initial angles (..., count)."""
     for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         for term in terms_of(exciter.effects, LoadInteraction):
             if term.validate_start is not None and exciter.loads is not None:

@@ -1,4 +1,4 @@
-"""Decay that is faster than the motion: its rate, and the method and steps of runs with it."""
+"""Stiffness: rates of decay that are faster than the motion, and the method and steps of such runs."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from jaxvib.runtime.programs import cached
 __all__ = ["IMPLICIT_PER_RADIAN", "advice", "fastest_decay", "is_unresolved", "steps_of", "stiff_solver"]
 
 _RESOLVED = 3.0
-"""Largest decay in an explicit step that leaves the method accurate; beyond about 6 it diverges."""
+"""Largest product of decay rate and explicit step for which the method is accurate; above about 6 it diverges."""
 
 _STIFF = 100.0
 """Ratio of the rates of decay and motion beyond which the implicit method costs less than explicit steps."""
 
 IMPLICIT_PER_RADIAN = 32.0
-"""Equal implicit steps in a radian of the fastest motion; order 4 then leaves about 1e-7."""
+"""Number of equal implicit steps per radian of the fastest motion; the method of order 4 then has an error of about 1e-7."""
 
 _MAX_IMPLICIT = 64
-"""Largest size of a state for which the dense matrices of the implicit method pay off."""
+"""Largest size of a state for which the dense matrices of the implicit method cost less than explicit steps."""
 
 
 @cached
 def fastest_decay(scene: Scene) -> Array:
-    """Fastest decay rate, 1/s, of the loads by drag and of the carrier by damping.
+    """Return the fastest decay rate, 1/s, of the loads by drag and of the carrier by damping.
 
         max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j),      the largest eigenvalue of M^-1 C
 
@@ -70,16 +70,16 @@ def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
 
 
 def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:
-    """Implicit method if the decay of a scene with known numbers is too fast for explicit steps, otherwise None."""
+    """Return the implicit method if the decay of a scene with known numbers is too fast for explicit steps, else None."""
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
     return Rodas4() if size <= _MAX_IMPLICIT and float(fastest_decay(scene)) > _STIFF * float(fastest) else None
 
 
 def steps_of(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
-    """Length of equal steps, s, and True if they have to be implicit.
+    """Return the length of equal steps, s, and True if they have to be implicit.
 
-    **Arguments**: `fastest` rate of the motion, rad/s, and of the `decay`, 1/s; explicit steps `per_radian` of the motion; the
-    length of a `step` that is prescribed.
+    **Arguments**: `fastest` rate of the motion, rad/s; rate of the `decay`, 1/s; number of explicit steps `per_radian` of the
+    motion; the length of the `step` if it is prescribed.
     """
     if step is not None:
         return step, decay * step > _RESOLVED
@@ -89,12 +89,12 @@ def steps_of(fastest: float, decay: float, per_radian: float, step: float | None
 
 
 def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.ndarray:
-    """True if explicit steps of that length, s, diverge by the `decay`, 1/s."""
+    """Return True if explicit steps of that length, s, diverge by the `decay`, 1/s."""
     return decay * step > 2.0 * _RESOLVED
 
 
 def advice(scene: Scene) -> str:
-    """Cause of short steps of a run, as the end of a sentence; empty if the decay is not faster than the motion."""
+    """Return the cause of short steps as the end of a sentence; empty if the decay is not faster than the motion."""
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""

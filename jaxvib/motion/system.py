@@ -30,8 +30,8 @@ Held: TypeAlias = PyTree[Array]
 _TURN = 2.0 * math.pi
 
 _LONG_ARRAY = 4
-"""Smallest number of entries in an array of the state for which arrays are used instead of single numbers: derivatives take
-less time and everything compiles sooner; runs take the same time, from 8 entries on two thirds."""
+"""Smallest number of entries in an array of the state for which arrays are used instead of single numbers. With arrays
+derivatives take less time and programs compile sooner; runs take the same time, and two thirds of it from 8 entries on."""
 
 _MOST_WRITTEN = 8
 """Largest number of numbers in a state for which the stages of the method are written out one after another."""
@@ -46,13 +46,13 @@ class PackedSystem(eqx.Module):
     If angles are wrapped, the integrator has each angle within a turn and the number of whole turns. A long run in single
     precision keeps its phase this way: an angle of a million radians has no digits left for the place in a turn.
 
-    **Arguments**: the vector field; a state; `wrapped` whether angles are; `has_common_turns` whether all loads' angles are
-    wrapped by the same turns, so that their differences stay; `batch`: true if many runs advance together; the `solver` that
-    integrates them, if it is not `method`.
+    **Arguments**: the vector field; a state; `wrapped`: true if angles are wrapped; `has_common_turns`: true if the angles of
+    all loads are wrapped by the same turns, which keeps their differences; `batch`: true if many runs advance together; the
+    `solver`, if it is not `method`.
 
-    **Attributes**: `program`: the equations, on numbers if `is_scalarized`, otherwise on arrays; None if JAX does not give
-    access to programs; `size`: how many numbers the state has; `is_on_scalars`: True if they are separate scalars; `args` the
-    arguments of `term`.
+    **Attributes**: `program`: the equations, on single numbers if `is_scalarized`, otherwise on arrays; None if JAX does not
+    give access to programs; `size`: the number of numbers in the state; `is_on_scalars`: True if they are separate scalars;
+    `args`: the arguments of `term`.
     """
 
     args: Args
@@ -83,13 +83,13 @@ class PackedSystem(eqx.Module):
         self.size = sum(leaf.size for leaf in leaves)
         self.args, given = field, (jnp.zeros((), leaves[0].dtype), state, field)
         is_written = self.size <= _MOST_WRITTEN if solver is None else isinstance(solver, UnrolledDopri8)
-        # Vectors over the angles of many loads are as full as vectors over runs.
+        # Vectors over the angles of many loads use vector registers as fully as vectors over runs.
         is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG_ARRAY)
         program = scalarized_program(_rates_of, *given) if is_small else None
         self.is_scalarized = program is not None
         self.program = arrays_program(_rates_of, *given) if program is None else program
         if program is not None:
-            # Split into entries here, so that the time loop contains no arrays.
+            # Arrays are split into entries here, so that the time loop contains no arrays.
             self.args = scalars_of(field)
         self.is_on_scalars = self.is_scalarized and (batch or is_written)
         self.fences = self.is_on_scalars and solver is None
@@ -100,8 +100,8 @@ class PackedSystem(eqx.Module):
         return diffrax.ODETerm(self._rates)
 
     def method(self, adjoint: diffrax.AbstractAdjoint | None = None) -> diffrax.AbstractSolver:
-        """The method of order 8 in the form that is fastest here, with the derivatives of `adjoint`, or by step replay."""
-        # Without the numbers of the equations, since a method must not hold traced arrays.
+        """Return the method of order 8 in its fastest form, with derivatives by `adjoint`, or by step replay."""
+        # The numbers of the equations are left out, since a method must not contain traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
         if self.size <= _MOST_WRITTEN:
             return UnrolledDopri8(batch=self.batch, wrap=wrap)
@@ -113,7 +113,7 @@ class PackedSystem(eqx.Module):
         return (y, jax.tree.map(jnp.zeros_like, y)) if self.wrapped else y
 
     def unpack(self, held: Held) -> State:
-        """States along a leading axis from those of the integrator; wrapped angles count from the turn of the first one."""
+        """Return states along a leading axis from those of the integrator; angles count from the turn of the first state."""
         if not self.wrapped:
             return self._state(held)
         y, turns = held
@@ -132,7 +132,7 @@ class PackedSystem(eqx.Module):
         return _turned(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
 
     def _angles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mask of the numbers that are angles, and for each number the place of the one whose turns are taken out of it."""
+        """Return a mask of the numbers that are angles, and for each number the index of the angle that defines its turns."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         places = jax.tree.unflatten(
             self.like, [np.arange(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
@@ -148,7 +148,7 @@ class PackedSystem(eqx.Module):
         return is_angle, leader
 
     def _state(self, y: Held) -> State:
-        """States along a leading axis."""
+        """Return states along a leading axis from the numbers of the integrator."""
         rows = jnp.stack(y, axis=-1) if self.is_on_scalars else y
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         parts = [
