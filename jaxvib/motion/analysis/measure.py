@@ -32,11 +32,11 @@ __all__ = [
 ]
 
 LEAST = 1e-4
-"""Changes are relative to no less than this share of the unbalance radius S/M, of forces to S n^2: a balanced rotor has next to
-no amplitude and force of its own."""
+"""Smallest scale of changes, as a share of the unbalance radius S/M for amplitudes and of S n^2 for forces. It is needed
+because the amplitude and the force of a balanced rotor are almost zero."""
 
 Field = Callable[[Array, State], State]
-"""The equations of motion: the rates of a state at a time."""
+"""Equations of motion: function from a time and a state to the rates of the state."""
 
 
 class Trajectory(eqx.Module):
@@ -117,7 +117,7 @@ class Measured(AbstractMeasured):
 
 
 def trajectory(model: Model, times: Array, states: State) -> Trajectory:
-    """States at times, with the forces and rotor speeds that belong to them."""
+    """Return the trajectory of states at times, with their forces and rotor speeds."""
     force = jax.vmap(model.foundation_force)(states.displacement, states.velocity)
     pairs = [(exciter.turning_drive, own.rotor) for exciter, own in zip(model.scene.exciters, states.exciters, strict=True)]
     angles = tuple(jax.vmap(drive.rotor_angle)(times, rotor) for drive, rotor in pairs)
@@ -150,11 +150,11 @@ def turning_directions(scene: Scene) -> np.ndarray:
 
 
 def measure(model: Model, field: Field, times: Array, states: State, unit: State) -> Measured:
-    """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
+    """Measure the amplitudes and the load speed of an evenly sampled stretch of motion, see `Measured`.
 
-    Extrema and whole turns are found on interpolants that use the rates the equations of motion give, not on the samples.
-    `field` gives the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
-    `jax.tree_util.Partial`, and no plain function. `unit`: the scene's `natural_units`.
+    Extrema and whole turns are computed on interpolants with the rates of the equations of motion, not on the samples.
+    `field` returns the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
+    `jax.tree_util.Partial`, not a plain function. `unit`: the scene's `natural_units`.
     """
     early, late, whole = _spans(model, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
@@ -176,7 +176,7 @@ def measure(model: Model, field: Field, times: Array, states: State, unit: State
 
 
 def unmeasured(model: Model, states: State) -> Measured:
-    """NaN in place of what `measure` reads off these states."""
+    """Return the result of `measure` for these states with NaN for all values."""
     nd, loads = states.displacement.shape[1], turning_directions(model.scene).size
     shapes = {"omega": (), "load_speed": (loads,), "amplitude": (nd,), "foundation_force": (), "drift": ()}
     return Measured(**{name: jnp.full(shape, jnp.nan, states.displacement.dtype) for name, shape in shapes.items()})
@@ -184,11 +184,11 @@ def unmeasured(model: Model, states: State) -> Measured:
 
 @eqx.filter_custom_jvp
 def _spans(model: Model, field: Field, times: Array, states: State) -> Array:
-    """Half of peak to peak of displacements and foundation forces, over the first half of the samples, the second and all of
-    them, (3, outputs).
+    """Return half of peak to peak of displacements and foundation forces, over the first half of the samples, the second half
+    and all of them, (3, outputs).
 
-    Derivatives, of any order, cost next to nothing: the equations are evaluated once more at the few samples beside the
-    extrema, and are differentiated there alone.
+    Derivatives of any order cost little: the equations are evaluated again at the few samples next to the extrema, and only
+    these evaluations are differentiated.
     """
     (low, high), _, _ = _extrema(model, field, times, states)
     return (high - low) / 2.0
@@ -215,7 +215,7 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
-    """Least and greatest values of each output, and their places, see `locate_extrema`; (2, 3, outputs) each."""
+    """Return the least and greatest values of each output, and their places, (2, 3, outputs) each, see `locate_extrema`."""
     rates = scalarized_vmap(_rates)((times, states), field)
     values, slopes = jax.vmap(lambda *y: _outputs(model, _step(times), *y))(states, rates)
     return jax.vmap(locate_extrema, in_axes=1, out_axes=-1)(values, slopes)
@@ -226,16 +226,19 @@ def _rates(moment: tuple[Array, State], field: Field) -> State:
 
 
 def _outputs(model: Model, step: Array, state: State, rates: State) -> tuple[Array, Array]:
-    """Displacements and foundation forces, and how they change in a sampling step."""
+    """Return displacements and foundation forces, and their rates times the sampling step."""
     force, change = jax.jvp(lambda s: model.foundation_force(s.displacement, s.velocity), (state,), (rates,))
     return jnp.concatenate([state.displacement, force]), jnp.concatenate([rates.displacement, change]) * step
 
 
 def mean_speeds(times: Array, angle: Array, rate: Array, first: Sequence[int], last: Sequence[int] | None = None) -> Array:
-    """Mean speeds over stretches of samples, each over the whole turns before its last one, or over the whole stretch.
+    """Return mean speeds over stretches of samples.
+
+    Each is the mean over the whole turns before the last sample of the stretch, or over the stretch if that is less than a
+    turn.
 
     **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each stretch
-    (default of the latter: the last of all). **Returns** (stretches, m) rad/s.
+    (default: the last sample of all). **Returns** (stretches, m) rad/s.
     """
     ends = [len(times) - 1] * len(first) if last is None else last
     each = jax.vmap(_mean_speed, in_axes=(None, 1, 1, None, None))
@@ -256,7 +259,7 @@ def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) ->
     i = jnp.argmin(jnp.where((k >= first) & (k <= last), jnp.abs(phi - target), jnp.inf))
     t_i, phi_i, rate_i = jnp.unstack(sample(i))
     start = t_i + (target - phi_i) / _away_from_zero(rate_i)
-    # One secant step on the cubic through the sample: enough, the sample is next to it.
+    # One secant step on the cubic is accurate enough, since the sample is next to the root.
     j = jnp.where(start > t_i, jnp.minimum(i + 1, last), jnp.maximum(i - 1, first))
     t_j, _, rate_j = jnp.unstack(sample(j))
     h = jnp.where(i == j, 1.0, t_j - t_i)
@@ -266,7 +269,7 @@ def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) ->
 
 
 def _step(times: Array) -> Array:
-    """Between even samples: of all of them, for late in a long run two neighbours are rounded each."""
+    """Return the step of even samples as a mean over all of them, since late in a long run each time is rounded."""
     return (times[-1] - times[0]) / (times.shape[0] - 1)
 
 
@@ -277,7 +280,7 @@ def _away_from_zero(x: Array) -> Array:
 
 @cached
 def relative_amplitude(stretch: Trajectory, i: int, j: int) -> Array:
-    """Amplitude of platform `i` relative to platform `j` (counted from 1) over an evenly sampled stretch, m zero to peak."""
+    """Return the amplitude of platform `i` relative to platform `j` (from 1) over an evenly sampled stretch, m zero to peak."""
     x, v = (values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity))
     (low, high), _, _ = locate_extrema(x, v * _step(stretch.time))
     return (high - low)[2] / 2.0

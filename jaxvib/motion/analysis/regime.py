@@ -33,18 +33,18 @@ if TYPE_CHECKING:
 __all__ = ["REGIMES", "Regime", "RegimeName", "regime"]
 
 _SAME_SPEED = 3e-3
-"""Relative difference below which two speeds count as equal: of two loads, of a load and the rotor, of one load early and
-late."""
+"""Relative difference below which two speeds count as equal: of two loads, of a load and the rotor, or of one load in the first
+and the second half."""
 
 _LOCKED = 0.1
-"""Change of relative phases between two halves of the window below which they count as fixed, rad."""
+"""Change of relative phases between both halves of the window below which they count as fixed, rad."""
 
 _STEADY_SLIP = 0.02
-"""Relative difference of the slip of a load in two halves of the window below which the slip is steady: the load is jammed,
-even with a small slip."""
+"""Relative difference of the slip of a load in both halves of the window below which the slip is steady. A load with a steady
+slip is jammed, even if the slip is small."""
 
 _BALANCED = 0.02
-"""Residual unbalance below which loads count as balancing the rotor, relative to the loads' own at one angle."""
+"""Residual unbalance below which loads count as balancing the rotor, relative to the unbalance of all loads at one angle."""
 
 
 class RegimeName(eqx.Enumeration):
@@ -132,7 +132,7 @@ class Regime(Result):
 
     def _remainder(self) -> str:
         share = float(self.unbalance)
-        # The loads have at most their own unbalance; the excess belongs to the rotor.
+        # The loads can have at most their unbalance at one angle; the excess belongs to the rotor.
         if share > 1.005:
             return f"the rotor's imbalance is more than the loads can balance: {share:.2g} times their unbalance is left"
         return f"{100.0 * share:.3g} % of the loads' unbalance is left"
@@ -198,8 +198,8 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED
     behind = behind & (jnp.abs(slips[1] - slips[0]) < _STEADY_SLIP * jnp.abs(slips[1] + slips[0]) / 2.0)
     with_rotor = (jnp.abs(speed - rotor) < _SAME_SPEED * reference) & ~behind
-    # Mean of exp(i (phi_j - phi_1)), relative to the first load; the difference of the means of both halves shows if it is
-    # fixed.
+    # Mean of exp(i (phi_j - phi_1)), relative to the first load; the difference of the means of both halves shows if the phase
+    # is fixed.
     to_first, moved = _relative(phi - phi[:, :1], half)
     to_rotor, slid = _relative(phi - turn[:, None], half)
     one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (jnp.max(moved) < _LOCKED)
@@ -233,7 +233,7 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
 
 
 def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
-    """Jam mode of loads with a mean speed between ascending natural frequencies, which are infinite if missing."""
+    """Return the jam mode of loads with a mean speed between ascending natural frequencies, infinite if missing."""
     ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
     below = jnp.sum(natural <= mean)
     rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
@@ -241,22 +241,22 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 
 
 def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
-    """True if the rotor of a motor is caught at a resonance: at most 15 % below it and more than 5 % below the speed of the
-    motor without load."""
+    """Return True if the rotor of a motor is caught at a resonance: at most 15 % below it, and more than 5 % below the speed of
+    the motor without load."""
     if scene.drive.ideal:
         return jnp.zeros((), bool)
     return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
 
 
 def _relative(angle: Array, half: int) -> tuple[Array, Array]:
-    """Mean direction (count,) rad of angles (nt, count), and how far it moved from the first to the second half."""
+    """Return the mean direction (count,) rad of angles (nt, count), and its change from the first to the second half."""
     point = jnp.exp(1j * angle)
     early, late = jnp.mean(point[:half], axis=0), jnp.mean(point[half:], axis=0)
     return jnp.angle(jnp.mean(point, axis=0)), jnp.abs(jnp.angle(late * jnp.conj(early)))
 
 
 def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
-    """Residual unbalance of loads at `phase` to the rotor, relative to that of all loads at one angle.
+    """Return the residual unbalance of loads at `phase` to the rotor, relative to that of all loads at one angle.
 
     For a rotor that tilts, the moment about the point of the loads is included, relative to the levers of the loads, or to the
     radius of gyration of the rotor if the levers are 0.
@@ -280,8 +280,8 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
-    """Natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor the forward whirls at its
-    speed."""
+    """Return the natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor the forward whirls at
+    its speed."""
     if scene.mounting().gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])

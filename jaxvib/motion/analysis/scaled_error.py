@@ -21,10 +21,11 @@ __all__ = ["error_scale", "estimated_error", "natural_units", "scaled_error", "t
 
 @cached
 def natural_units(scene: Scene) -> State:
-    """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed; of a slip
-    the rotor's speed at the loads' distance from its axis.
+    """Return the natural units of the state.
 
-    S is the unbalance of the loads, or that of the rotor if it is larger.
+    They are the unbalance radius S/M for displacements, that times the rotor's speed for velocities, 1 rad for angles, the
+    rotor's speed for their rates, and for a slip the rotor's speed times the loads' distance from the axis. S is the unbalance
+    of the loads, or that of the rotor if it is larger.
     """
     carrier, pairs = scene.machine.carrier(), [_exciter_units(exciter) for exciter in scene.exciters]
     unbalances = [unbalance for each, _ in pairs for unbalance in each]
@@ -34,7 +35,7 @@ def natural_units(scene: Scene) -> State:
 
 
 def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
-    """Unbalances of an exciter, kg m, and the natural units of its state."""
+    """Return the unbalances of an exciter, kg m, and the natural units of its state."""
     loads, speed, effects = exciter.loads, exciter.drive.speed, exciter.effects
     unbalances = [] if exciter.unbalance is None else [exciter.unbalance]
     arm = speed
@@ -55,14 +56,14 @@ def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
 
 
 def error_scale(state: State, unit: State) -> State:
-    """The scales of differences between states, one for each part of the state.
+    """Return the scales of differences between states, one for each part of the state.
 
     The scale of displacements and velocities is the largest value, but at least the natural unit, since a motion at rest has no
-    scale. That of angles and speeds is the natural unit, 1 rad and the rotor speed.
+    scale. The scale of angles and speeds is the natural unit, 1 rad and the rotor speed.
 
     **Arguments**: `state` a `State`, or a stretch of them whose arrays have a leading axis; `unit` its `natural_units`.
 
-    **Returns** `State` of numbers, NumPy's where numbers are known: nothing is compiled for them.
+    **Returns** `State` of numbers; known ones are NumPy's, for which nothing is compiled.
     """
     xp = numpy_of((state, unit))
 
@@ -91,12 +92,12 @@ def error_scale(state: State, unit: State) -> State:
 
 
 def scaled_error(a: State, b: State, scale: State) -> Array:
-    """The largest difference of two states in all their numbers, each relative to its part's `scale`.
+    """Return the largest difference of two states over all their numbers, each relative to the `scale` of its part.
 
     **Arguments**: `a`, `b` states, or stretches of them whose arrays have a leading axis; `scale` a `State` of numbers, see
     `error_scale`.
 
-    **Returns** a number, NumPy's where numbers are known; NaN where one of the states is not finite.
+    **Returns** a number, of NumPy if the states are known; NaN if one of them is not finite.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.array([x]), np.zeros(1), (np.array([3.0]),), (np.array([50.0]),)) for x in (2e-3, 1e-3))
@@ -107,7 +108,7 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
     xp = numpy_of((a, b, scale))
 
     def apart(x: Array, y: Array, unit: Array) -> Array:
-        with np.errstate(invalid="ignore"):  # where a run did not finish there is nothing to compare
+        with np.errstate(invalid="ignore"):  # a run that did not finish has NaN states
             return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / xp.asarray(unit)
 
     return xp.max(xp.stack(jax.tree.leaves(jax.tree.map(apart, a, b, scale))))
@@ -120,7 +121,7 @@ def estimated_error(
     steps: Array | int = 0,
     radians: Array | np.ndarray | int = 0,
 ) -> Array:
-    """The error of a run, from its `difference` to one with larger steps.
+    """Return the error of a run, from its `difference` to a run with larger steps.
 
         difference x share + 2 eps (steps + radians)
 
@@ -129,7 +130,7 @@ def estimated_error(
     radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits it, since its equal steps round far
     less.
 
-    **Arguments**: `difference` see `scaled_error`; `steps` of the run; `radians` that the fastest speed or frequency turns by.
+    **Arguments**: `difference`, see `scaled_error`; `steps` of the run; `radians`: phase of the fastest motion over the run.
 
     **Returns** a number, or an array of them.
     """
@@ -138,7 +139,7 @@ def estimated_error(
 
 
 def turned(state: State, to: State) -> State:
-    """A state (or a stretch of them), its angles moved by whole turns to where they are nearest to those of another.
+    """Return a state (or a stretch of them) with its angles moved by whole turns to be nearest to those of another.
 
     In single precision angles are wrapped into a turn, and one of two close runs may have an additional turn.
 

@@ -41,19 +41,19 @@ GROWTH = 1e-2
 
 
 def is_nearly_one_angle(angle: np.ndarray) -> bool:
-    """True if several loads with the angles (nt, count) stay within `NEARLY_ONE_ANGLE` of each other."""
+    """Return True if several loads with the angles (nt, count) stay within `NEARLY_ONE_ANGLE` of each other."""
     return angle.shape[1] > 1 and bool(np.max(np.ptp(angle, axis=1)) < NEARLY_ONE_ANGLE)
 
 
 def would_separate(scene: Scene, stretch: Trajectory) -> bool:
-    """True if several loads have nearly one angle, and small differences of their angles grow."""
+    """Return True if several loads have nearly one angle, and small differences of their angles grow."""
     time = np.asarray(stretch.time)
     near = [k for k, own in enumerate(stretch.state.exciters) if own.angle and is_nearly_one_angle(np.asarray(own.angle[0]))]
     return any(separation_rate(scene, stretch, k) * float(time[-1] - time[0]) > GROWTH for k in near)
 
 
 def separation_rate(scene: Scene, stretch: Trajectory, k: int = 0) -> float:
-    """Growth rate of small differences between the angles of loads at nearly one angle, 1/s; negative if they decay.
+    """Return the growth rate of small differences between angles of loads at nearly one angle, 1/s; negative for decay.
 
     **Arguments**: `stretch` an evenly sampled stretch of a run of `scene`, such as `run.window`; `k`, the number of the exciter
     with the loads, from 0.
@@ -78,7 +78,7 @@ def prepare_separation(scene: Scene, state: State, samples: int) -> None:
 def _transition(
     scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray, which: int
 ) -> tuple[Array, Array, Array]:
-    """The transition matrix from sample `first` to the last one, the logarithm of its factor, and the time between them."""
+    """Return the transition matrix from sample `first` to the last one, the logarithm of its factor, and the time between."""
     field = vector_field(scene)
     step = (times[-1] - times[0]) / (times.shape[0] - 1)
     begin = jax.tree.map(lambda leaf: leaf[0], states)
@@ -94,7 +94,7 @@ def _transition(
 
     def moved(carry: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
         transition, log_scale = carry
-        # Pairs of steps are counted from the end, where the last sample is.
+        # Pairs of steps are counted from the end, so that they end at the last sample.
         end = times.shape[0] - 1 - 2 * pair
         a, b, c = (matrix(jnp.maximum(end - 2 + k, 0)) for k in range(3))
         span = jnp.where(end - 2 >= first, 2.0 * step, 0.0)
@@ -108,7 +108,7 @@ def _transition(
 
 
 def _basis(scene: Scene, state: State, which: int) -> tuple[Callable[[Array], State], Callable[[State], Array], int]:
-    """Tangents of the state from numbers x, the numbers of such a tangent, and how many there are."""
+    """Return the function from numbers x to a tangent of the state, its inverse, and the number of these numbers."""
     exciter = scene.exciters[which]
     touching = has_term(exciter.effects, LoadInteraction)
     shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(exciter.loads))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["Spectrum", "spectrum_of"]
 
 _FINER = 4
-"""Ratio of the resolution of a piece and the spacing of frequencies, which resolves peaks to 2 %."""
+"""Ratio of the resolution of a piece and the spacing of frequencies; the heights of peaks are then accurate to 2 %."""
 
 _OVER = 1.5
 """Largest frequency of spectra, in units of the largest rotor speed."""
@@ -117,13 +117,13 @@ class Spectrum(Result):
 
 
 def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None, parts: int) -> Spectrum:
-    """The spectrum of a run's window (`parts` 1), or of so many pieces of its trajectory, see `Run.spectrum`."""
+    """Return the spectrum of a run's window if `parts` is 1, otherwise of this number of pieces of its trajectory."""
     count(parts, "parts")
     if parts > 1 and trajectory is None:
         raise InputError("parts", f"is {parts}; the run kept its end only, simulate with save='all', or give 1")
     kept = window if parts == 1 or trajectory is None else trajectory
     time = np.asarray(kept.time, float)
-    # Neighbouring pieces share a half, so that nothing falls between the windows' ends.
+    # Neighbouring pieces share a half, since Hann's window suppresses the ends of each piece.
     size = time.size if parts == 1 else 2 * time.size // (parts + 1)
     if size < 64:
         raise InputError("parts", f"is {parts}, which leaves {size} samples for a piece; 64 are needed, give fewer parts")

@@ -52,14 +52,14 @@ from jaxvib.units.known import when_known
 __all__ = ["envelope"]
 
 _WINDOW = 512
-"""Samples in the window at the end over which is measured: 25 in a beat of the slowest resonance."""
+"""Number of samples in the measuring window at the end: 25 in a beat of the slowest resonance."""
 
 _MAX_WINDOW_TURNS = 256
-"""Turns of the rotor that the window is long at most, as in `simulate`."""
+"""Largest length of the window in turns of the rotor, as in `simulate`."""
 
 
 class _Tolerance(WrappedController):
-    """Measures errors against the length of a complex vector: one of its parts is often 0 when the others are not."""
+    """Controller with errors relative to the length of a complex vector, since one of its parts is often 0."""
 
     controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
@@ -96,10 +96,10 @@ class _Tolerance(WrappedController):
     ) -> Decision:
         def sizes(y: Array) -> Array:
             parts = jnp.split(jnp.abs(y), np.cumsum(self.blocks)[:-1])
-            # An angle grows without end; its error is never relative.
+            # An angle grows without bound; its error is never relative.
             return jnp.concatenate([*(jnp.broadcast_to(jnp.max(x), x.shape) for x in parts[:-1]), jnp.zeros_like(parts[-1])])
 
-        # An error that is not a number would make the next step's length one that is not.
+        # A NaN error would make the length of the next step NaN.
         error = None if y_error is None else jnp.where(jnp.isnan(y_error), jnp.inf, y_error)
         keep, start, end, jumped, state, result = self.controller.adapt_step_size(
             t0, t1, sizes(y0), sizes(y1_candidate), args, error, error_order, controller_state
@@ -109,7 +109,7 @@ class _Tolerance(WrappedController):
 
 
 class _Units(eqx.Module):
-    """The units: the unbalance radius S/M of the loads, that times the rotor's speed, the rotor's speed; 1 rad."""
+    """Units: the unbalance radius S/M of the loads, that times the rotor's speed, the rotor's speed, and 1 rad."""
 
     length: Array
     speed: Array
@@ -204,7 +204,7 @@ def envelope(
     if isinstance(start, State):
         state = validate_state(scene, start, mode, separation)
     else:
-        # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
+        # The state of rest exists for every scene; therefore the compiled run makes it, which takes less time than here.
         known = start in ("rest", "spin_up") and mode is None and separation is None
         state = None if known else initial_state(scene, start, mode=mode, separation=separation, throw=throw)
     run = _run(scene, end, state, *choices)
@@ -252,7 +252,7 @@ def _run(
     max_steps: int,
 ) -> Envelope:
     begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
-    # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
+    # A start that does not exist (a jam mode that is absent in one run of a batch) must not delay the other runs.
     exists = is_finite(begin)
     begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
     model, nd = linear_model(scene), begin.displacement.shape[0]
@@ -327,7 +327,7 @@ def _at_rest(scene: Scene) -> Amplitudes:
 
 
 def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[..., Array], Args]:
-    """The averaged equations on the integrator's vector, and their arguments: on single numbers, where there are few."""
+    """Return the averaged equations on the integrator's vector, and their arguments; on single numbers if there are few."""
 
     def on_arrays(t: Array, y: Array, args: tuple[Averaged, _Units]) -> Array:
         field, units = args
@@ -359,7 +359,7 @@ def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
 
 
 def _measure(model: Model, window: Envelopes) -> Measured:
-    """The window in the numbers of `Measured`: means of speeds, the greatest of each amplitude."""
+    """Return the values of `Measured` for the window: means of speeds, and the maximum of each amplitude."""
     half = window.time.shape[0] // 2
     amplitude, force = jnp.max(window.amplitude, axis=0), jnp.max(window.foundation_force, axis=0)
     speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
@@ -379,8 +379,11 @@ def _measure(model: Model, window: Envelopes) -> Measured:
 
 
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
-    """True if potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
-    and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
+    """Return True if every load can turn against its potential.
+
+    At the end it must have the energy to pass the top, I w^2/2 > (max V - min V)/2. If it did not have it at the start, drag
+    must have been able to lift it, D n > max |dV/dphi|.
+    """
     loads, potentials = scene.loads, terms_of(scene.all_effects, LoadPotential)
     if not potentials:
         return jnp.asarray(True)
