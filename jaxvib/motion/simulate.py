@@ -140,7 +140,7 @@ def simulate(
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:
-    """Return the run of a plan, without the test for separation. **Raises** `ComputationError` on failure if `throw` is true."""
+    """Return the run of a plan, not tested for separation. **Raises** `ComputationError` if it fails and `throw` is true."""
     begun = time.perf_counter()
     if plan.accuracy is not None:
         run = _run_to_accuracy(plan, plan.accuracy)
