@@ -239,7 +239,7 @@ def orbits(
         motion = periodic_motion(model, grid, given, v, s, deviation)
         return motion, *_all_quantities(model, grid, motion)
 
-    if value.shape[0] == 1:  # a program without an axis of length one is a smaller one
+    if value.shape[0] == 1:  # a program without an axis of length one is smaller
         alone = one(*jax.tree.map(lambda x: x[0], (value, start, deviation)))
         motion, harmonics, measured = jax.tree.map(lambda x: x[..., None], alone)
     else:
@@ -256,7 +256,7 @@ def orbits(
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
     met = residual < 4096.0 * tiny
-    speed_error = speed_error + tiny  # beside a fold the load speed magnifies rounding too
+    speed_error = speed_error + tiny  # near a fold the load speed magnifies rounding too
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), deviation_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
@@ -300,8 +300,8 @@ def orbits(
 def numbers_of(
     model: CoincidentModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
-    """Fields of one orbit that follow from its known motion, with derivatives, equal to those of `orbits` for the same
-    arguments; 0 where these are NaN."""
+    """Return fields of one orbit from its known motion, with derivatives, equal to those of `orbits` for the same arguments; 0
+    if these are NaN."""
     grid, there = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
     x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
     deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
@@ -322,7 +322,7 @@ def numbers_of(
 
 
 def _all_quantities(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
-    """Harmonics of one motion; slope of the branch, residual, errors of the rotor speed and of the deviation; and
+    """Return harmonics of one motion; slope of the branch, residual, errors of the rotor speed and of the deviation; and
     `_motion_quantities`."""
     branch = branch_tangent(model, grid, motion)
     harmonics = harmonics_of(model, grid, motion, branch.response)
@@ -332,10 +332,10 @@ def _all_quantities(model: CoincidentModel, grid: Grid, motion: PeriodicSolution
 def _motion_quantities(
     model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
 ) -> tuple[Array, ...]:
-    """Amplitude, foundation force, power and contact torque between the loads of one motion.
+    """Return amplitude, foundation force, power and contact torque between the loads of one motion.
 
-    The power is the sum of the dissipation by drag, friction and the carrier. It equals n times the mean torque, which loses
-    its digits for strong drag, since that torque belongs to a small difference n - phi'.
+    The power is the sum of the dissipation by drag, friction and the carrier. It equals n times the mean torque; for strong
+    drag that product loses its digits, since the torque is computed from a small difference n - phi'.
     """
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     torque = model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque)
@@ -344,17 +344,17 @@ def _motion_quantities(
     power = power + model.linear.dissipated(velocity)
     nd = harmonics.displacement.shape[0]
     swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
-    # Components of the force on the foundation are combined like those of a vector.
+    # Components of the foundation force are combined as those of a vector.
     force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
     contact_torque = _least_contact_torque(model, grid, motion, harmonics)
     return (swings[:nd], force, power, contact_torque)
 
 
 def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
-    """Smallest mean torque over a period, N m, by which a load pushes the next one; the loads lie side by side.
+    """Return the smallest mean torque over a period, N m, by which a load pushes the next one; the loads lie side by side.
 
-    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The mean is
-    decisive, since no vibration of a jam presses the loads together at every instant.
+    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The criterion is
+    the mean, since no vibration of a jam presses the loads together at every instant.
     """
     loads = model.loads
     if loads.ball_radius is None or loads.count == 1:
@@ -371,8 +371,10 @@ _PEAK_SEARCH_PARTS = 16
 
 
 def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array:
-    """Maximum, (16,), of the signal with harmonics (K,) in each part of the period, including its ends. For a signal that
-    changes its sign in `half` a period, maximum of the magnitude in each part of the half."""
+    """Return the maximum, (16,), of the signal with harmonics (K,) in each part of the period, including its ends.
+
+    For a signal that changes its sign in `half` a period, it is the maximum of the magnitude in each part of the half.
+    """
     each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PEAK_SEARCH_PARTS
     if half:
         each, width = each // 2, width / 2.0
@@ -382,7 +384,7 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
         np.asarray(orders, harmonics.real.dtype),
     )
     angles = k * (starts[:, None] + width * places)[..., None]
-    # Real and imaginary parts in one real array, since products of complex numbers take four times as long.
+    # Real and imaginary parts are in one real array, since products of complex numbers take four times as long.
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
     both, none = jnp.concatenate([harmonics.real, harmonics.imag]), np.zeros((k.size, k.size), k.dtype)
     slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
@@ -394,7 +396,7 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     def halley(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry
         first, second, third = derivatives @ wave.T * side[None]
-        below = -jnp.finfo(second.dtype).tiny  # 0, so that the step goes uphill in any case
+        below = -jnp.finfo(second.dtype).tiny  # almost 0; the step then goes uphill in any case
         step = first / jnp.minimum(second - 0.5 * first * third / jnp.minimum(second, below), below)
         theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), starts, starts + width)
         sine, cosine = sine_and_cosine(k[None] * theta[:, None])
@@ -405,11 +407,11 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
 
 
 def _swing(orders: np.ndarray, harmonics: Array) -> Array:
-    """(max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
-    symmetric = bool(np.all(orders % 2 == 1))  # the signal turns its sign in half a period
+    """Return (max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
+    symmetric = bool(np.all(orders % 2 == 1))  # the signal changes its sign in half a period
 
     def highest(c: Array) -> Array:
-        return greatest(_peaks(orders, c, half=symmetric))  # between the samples, not that beside the highest sample
+        return greatest(_peaks(orders, c, half=symmetric))  # maximum between samples, maybe not next to the largest one
 
     def swing(c: Array) -> Array:
         return highest(c) if symmetric else (highest(c) + highest(-c)) / 2.0

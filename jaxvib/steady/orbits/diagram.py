@@ -124,7 +124,7 @@ def exact_branches(
 
     Each point is solved separately at its own load speed; therefore folds need no continuation. Special points are bracketed by
     the points of the diagram and then found as roots: of dn/dOmega (fold), of prod (1 - s_i s_j) over pairs of multipliers
-    (torus), of prod (1 + s_i) (period doubling; the loss of symmetry, where s is the growth over half a period with the
+    (torus), of prod (1 + s_i) (period doubling, or the loss of symmetry if s is the growth over half a period with the
     half-turn), of prod (1 - s_i) for loads that separate (loss of symmetry).
 
     **Arguments**: `points` along Omega, crowded about the resonances; `least`, `most` load speeds, rad/s or text (a fifth of
@@ -181,7 +181,7 @@ class _Solver:
 
     def __init__(self, scene: Scene, accuracy: float, slowest: float):
         self.scene, self.accuracy = scene, accuracy
-        # Decay is fastest for the slowest loads. One method for all points, so that no test changes sign between methods.
+        # Decay is fastest for the slowest loads. All points use one method, so that no test changes sign between methods.
         self.implicit = bool(_is_stiff(scene, jnp.asarray(slowest, scene.drive.speed.dtype)))
 
     def __call__(self, omega: np.ndarray) -> _Values:
@@ -231,12 +231,12 @@ def _values(scene: Scene, omega: Array | np.ndarray, many: int, accuracy: float,
 
 
 _KINDS_OF_TESTS = ("torus", "half_turn", "half_turn", "symmetry")
-"""Bifurcation at a sign change of each test; without the half-turn symmetry, s = -1 is a period doubling."""
+"""Kind of the bifurcation at a sign change of each test; without the half-turn symmetry, s = -1 is a period doubling."""
 
 
 def _tests(growth: Floquet) -> Array:
-    """Test functions (P, 4) of the growths s over a turn of the grid: prod (1 - s_i s_j) over pairs, prod (1 + s_i); for loads
-    that separate prod (1 + s_i), prod (1 - s_i)."""
+    """Return test functions (P, 4) of the growths s over a turn of the grid: prod (1 - s_i s_j) over pairs, prod (1 + s_i); for
+    loads that separate prod (1 + s_i), prod (1 - s_i)."""
     s = growth.roots
     first, second = np.triu_indices(s.shape[0], 1)
     tests = [jnp.prod(1.0 - s[first] * s[second], axis=0), jnp.prod(1.0 + s, axis=0)]
@@ -246,7 +246,7 @@ def _tests(growth: Floquet) -> Array:
 
 
 def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
-    """Roots of the test functions, from all sign changes between neighbouring points."""
+    """Return the roots of the test functions, from all sign changes between neighbouring points."""
     kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
     if not has_half_turn(solve.scene.all_effects):
         kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]

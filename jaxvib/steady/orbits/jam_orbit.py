@@ -37,7 +37,7 @@ _MAX_SPEED_DIFFERENCE = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
 _UNKNOWN_STEPS = 64
-"""Steps in the integration of the multipliers under a JAX transformation, since reverse derivatives need a static number."""
+"""Number of integration steps for the multipliers under a JAX transformation; reverse derivatives need a static number."""
 
 
 @validated
@@ -112,21 +112,21 @@ def jam_orbit(
 
 
 def _solve_accurately(plan: OrbitPlan) -> Orbit:
-    """Return the first orbit that is accurate enough, or the best one: near a fold more points add rounding errors only."""
+    """Return the first orbit that is accurate enough, or the best one, since more points only add rounding near a fold."""
     best, least = None, math.inf
     for points in plan.points:
         orbit = _solve(plan, points)
         error = float(orbit.error)
         if best is None or error < least:
             best, least = orbit, error
-        if not error > plan.accuracy:  # NaN where there is no motion
+        if not error > plan.accuracy:  # NaN if there is no motion
             break
     assert best is not None
     return best
 
 
 def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
-    """Return the plan that starts where a search of the whole branch finds the mode."""
+    """Return the plan that starts from the mode in a search of the whole branch."""
     found = exact_mode_speeds(plan.scene).get(mode)
     start = plan.start if found is None else jnp.asarray(found, dtype=plan.start.dtype)
     return dataclasses.replace(plan, exists=jnp.asarray(found is not None), start=start, is_settled_first=True)
@@ -163,7 +163,7 @@ def _outputs(
     points: int,
     *_: object,
 ) -> Orbit:
-    """Outputs that follow from the solved motion, without multipliers and errors."""
+    """Return the outputs that follow from the solved motion, without multipliers and errors."""
     empty = jax.tree.map(lambda _: None, orbit)
     return dataclasses.replace(empty, **numbers_of(coincident_model(jammed_model(scene)), orbit, value, start, given, points))
 

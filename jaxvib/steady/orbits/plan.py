@@ -1,4 +1,4 @@
-"""Plans of exact jams: choices that depend on numbers of a scene, taken on the host before a program is traced.
+"""Plans of exact jams: choices that depend on numbers of a scene, made on the host before a program is traced.
 
 Only this module tests which numbers are known. Under a JAX transformation the number of collocation points is fixed.
 """
@@ -40,10 +40,11 @@ _BYTES_PER_POINT = 16.0
 class OrbitPlan:
     """Plan of an exact jam.
 
-    **Attributes**: the `scene`; the speed that is `given`, its `value`, and the `start` of the other one, rad/s; `exists`: true
-    if the leading order has the mode; `direction`: the sign of dn/dOmega that the mode needs, or None; its number `mode`, or
-    None; `points` to try in turn; relative `accuracy`; `implicit` integration of the multipliers or not; `is_known`: true if
-    all numbers have values; `is_settled_first`: true if Newton starts from the motion at the load speed `start`.
+    **Attributes**: the `scene`; `given`: the name of the prescribed speed; its `value`, and the `start` of the other speed,
+    rad/s; `exists`: true if the leading order has the mode; `direction`: the sign of dn/dOmega that the mode needs, or None;
+    `mode`: its number, or None; `points`: numbers of collocation points to try in turn; relative `accuracy`; `implicit`: true
+    for implicit integration of the multipliers; `is_known`: true if all numbers have values; `is_settled_first`: true if
+    Newton's method starts from the motion at the load speed `start`.
     """
 
     scene: Scene
@@ -119,7 +120,7 @@ def _accuracy(scene: Scene, accuracy: float | None) -> float:
 
 
 def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known: bool) -> tuple[int, ...]:
-    """Numbers of collocation points to try in turn: on half a period if the motion has that symmetry, else on a period."""
+    """Return numbers of collocation points to try in turn, on half a period if the motion has that symmetry, else on one."""
     if points is not None:
         bodies = 1 if loads.alike else loads.count
         size = _BYTES_PER_POINT * bodies**2 * float(points if isinstance(points, int) else 1)
@@ -129,7 +130,7 @@ def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known
 
 
 def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
-    """Return whether the leading order has the jam mode, the sign of dn/dOmega there, and its load speed, rad/s."""
+    """Return True if the leading order has the jam mode, the sign of dn/dOmega there, and its load speed, rad/s."""
     if scene.mounting().gyroscopic is not None:
         raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
     jams = jams_of(scene)

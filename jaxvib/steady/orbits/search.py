@@ -21,7 +21,7 @@ _BRANCH_POINTS, _POINTS_PER_BATCH = 800, 100
 """Number of points of the exact branch, and of points in a batch."""
 
 _PARTS_PER_INTERVAL = 32
-"""Number of interpolated parts of the interval between two of these points."""
+"""Number of interpolated parts of the interval between two neighbouring points of the branch."""
 
 _NEAR_FOLD_DISTANCE = 1e-6
 """Relative distance of the rotor's speed from a fold of the cubics below which the fold itself is computed."""
@@ -33,7 +33,7 @@ def _fold_points(scene: Scene) -> tuple[Array, Array]:
 
 
 def exact_mode_speeds(scene: Scene) -> dict[int, float]:
-    """Return the load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode, to start from.
+    """Return approximate load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode.
 
     The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`.
     """
@@ -73,9 +73,9 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 
 
 def _ends_before(scene: Scene, low: float, high: float, target: float, looks: int = 2) -> bool:
-    """True if the exact branch turns back, between two load speeds, before it reaches the rotor speed `target`.
+    """Return True if the exact branch turns back, between two load speeds, before it reaches the rotor speed `target`.
 
-    The fold is bracketed in ever smaller windows; the zero of its slope locates it to rounding.
+    The fold is bracketed in smaller and smaller intervals; the zero of the slope locates it to rounding.
     """
     omega = np.linspace(low, high, _BRANCH_POINTS)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
@@ -92,7 +92,7 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, looks: in
 
 
 def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the cubics through (x, y) with the given slopes, `_PARTS_PER_INTERVAL` in each interval."""
+    """Return points of the cubics through (x, y) with the given slopes, `_PARTS_PER_INTERVAL` in each interval."""
     t, h = np.arange(_PARTS_PER_INTERVAL) / _PARTS_PER_INTERVAL, np.diff(x)[:, None]
     a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
     cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
@@ -101,8 +101,8 @@ def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.n
 
 @cached
 def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
-    """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN without a
-    jam."""
+    """Return rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN without
+    a jam."""
     model = coincident_model(jammed_model(scene))
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 

@@ -23,7 +23,7 @@ _MAX_NEWTON_STEPS = 60
 
 
 def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
-    """Response of the carrier to unbalance: its k-th harmonic per k-th harmonic of sum_g S_g e(phi_g), (K, nd, np).
+    """Return the response of the carrier to unbalance: its k-th harmonic per harmonic of sum_g S_g e(phi_g), (K, nd, np).
 
     X_k = D(k w)^-1 B^T k^2 w^2,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
     """
@@ -37,19 +37,19 @@ def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, order
 
 
 def _port_response(model: CoincidentModel, grid: Grid, omega: Array, speed: Array) -> Array:
-    """Response A_k (K, np, np) of the port to unbalance: k-th harmonic of its acceleration per k-th harmonic of
+    """Return the response A_k (K, np, np) of the port to unbalance: k-th harmonic of its acceleration per k-th harmonic of
     sum_g S_g e(phi_g)."""
     return _port_response_from(model, grid, omega, unbalance_response(model, omega, speed, grid.orders))
 
 
 def _port_response_from(model: CoincidentModel, grid: Grid, omega: Array, response: Array) -> Array:
-    """`_port_response` from the response of the carrier, whose first orders are those of the grid."""
+    """Return `_port_response` from the response of the carrier, whose first orders are those of the grid."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
     return -(w**2)[:, None, None] * (model.linear.mount.rows[0] @ response[: w.size])
 
 
 def _feedback(grid: Grid, port_response: Array) -> Array:
-    """Matrix (np, np, M, M) from sum_g S_g e(phi_g) at the points to the acceleration of the port at the points."""
+    """Return the matrix (np, np, M, M) from sum_g S_g e(phi_g) to the acceleration of the port, both at the points."""
     by_distance = jnp.einsum("kab,dk->abd", port_response.real, grid.cosine) - jnp.einsum(
         "kab,dk->abd", port_response.imag, grid.sine
     )
@@ -91,7 +91,7 @@ def _balance(
 def _jacobian(
     model: CoincidentModel, grid: Grid, port_response: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
 ) -> Array:
-    """Jacobian d residual / d deviation, (G M, G M)."""
+    """Return the Jacobian d residual / d deviation, (G M, G M)."""
     g, m = deviation.shape
     unit = (model.drag * omega)[:, None]
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
@@ -102,7 +102,7 @@ def _jacobian(
         - (omega * by_rate / unit)[:, :, None] * grid.first[None]
     )
     shake = model.unbalance[None, :, None] * balance.moving
-    # Dry friction depends on the acceleration that the other bodies cause, too.
+    # Dry friction also depends on the acceleration that the other bodies cause.
     torque_response = (shake if by_acceleration is None else shake - by_acceleration) / unit[None]
     coupling = jnp.einsum("agi,abij,bhj->gihj", torque_response, _feedback(grid, port_response), shake)
     return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
@@ -153,7 +153,7 @@ def periodic_motion(
 
 
 def _speed_pair(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]:
-    """Load speed and rotor speed."""
+    """Return load speed and rotor speed."""
     return (value, x) if given == "omega" else (x, value)
 
 
@@ -244,7 +244,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, 
 def _linearize(
     model: CoincidentModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
-    """Residuals (G M + 1,), their Jacobian, and the scale of the torques in them."""
+    """Return residuals (G M + 1,), their Jacobian, and the scale of the torques in them."""
     if known is None:
         port_response, by_x = jax.jvp(
             lambda z: _port_response(model, grid, *_speed_pair(given, value, z)), (x,), (jnp.ones_like(x),)
@@ -278,7 +278,7 @@ class BranchTangent(NamedTuple):
 
 
 def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
-    """Tangent of the branch at a periodic motion, and the error of the motion.
+    """Return the tangent of the branch at a periodic motion, and the error of the motion.
 
     The error is the change by one Newton step with the residuals at twice as many points; for the deviation the highest
     harmonic of psi is added.
@@ -307,7 +307,7 @@ def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution)
         jnp.stack([-_append_mean_condition(by_omega), _append_mean_condition(jax.lax.stop_gradient(fine_residual))], axis=1),
     )
     slope, error = found_by[-1, 0], jax.lax.stop_gradient(found_by[:, 1])
-    # The highest harmonic's real part, and its imaginary one.
+    # Real and imaginary part of the highest harmonic.
     last = jnp.max(jnp.sum((deviation @ deviation_analysis(grid)[:, [grid.deviation_orders.size - 1, -1]]) ** 2, axis=1))
     return BranchTangent(
         slope,
@@ -320,12 +320,12 @@ def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution)
 
 
 def _append_mean_condition(residual: Array) -> Array:
-    """Residuals followed by that of the condition mean psi = 0, which is zero."""
+    """Append the residual of the condition mean psi = 0, which is zero, to the residuals."""
     return jax.lax.pad(residual, np.zeros((), residual.dtype), [(0, 1, 0)])
 
 
 def _bordered(by_deviation: Array, by_unknown: Array) -> Array:
-    """Bordered Jacobian: derivatives by psi and by the unknown speed, with the condition mean psi = 0 as last row."""
+    """Return the bordered Jacobian: derivatives by psi and by the unknown speed; the last row is the condition mean psi = 0."""
     m = by_deviation.shape[0]
     pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
     return jnp.concatenate([jnp.concatenate([by_deviation, by_unknown[:, None]], axis=1), pin[None, :]])
@@ -342,7 +342,7 @@ class Harmonics(NamedTuple):
 
 
 def harmonics_of(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, response: Array | None = None) -> Harmonics:
-    """Harmonics of psi and of the motion of the carrier; `response` (K, nd, np): its `unbalance_response`, if known."""
+    """Return harmonics of psi and of the carrier's motion; `response` (K, nd, np): its `unbalance_response`, if known."""
     carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)
     force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)

@@ -20,26 +20,29 @@ from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
 __all__ = ["Floquet", "floquet", "is_stiff", "steps_for"]
 
 _PHASE_PER_STEP = 0.7
-"""Phase of the carrier's fastest motion in an explicit step, rad; order 8 then leaves 1e-12 in the multipliers of loads as fast
-as the carrier, and 1e-10 if they are three times as fast."""
+"""Phase of the carrier's fastest motion in an explicit step, rad. With order 8 the error of the multipliers is then 1e-12 for
+loads as fast as the carrier, and 1e-10 for loads three times as fast."""
 
 _STIFF_DECAY_RATIO = 3.0
-"""Ratio of decay rate and fastest oscillation beyond which the implicit method is used. Explicit steps would have to resolve
-the decay, and diverge from a ratio of about 15 on."""
+"""Ratio of decay rate and fastest oscillation above which the implicit method is used. Explicit steps would have to resolve
+the decay, and diverge above a ratio of about 15."""
 
-# The last stage of the method is the end of the step, whose evaluation is the first one of the next step.
+# The last stage of the method is at the end of the step; its evaluation is the first one of the next step.
 _NODES = np.concatenate([[0.0], NODES[:-1]])
 _ROWS = np.pad(ROWS[:-1, : len(_NODES)], ((1, 0), (0, 0)))
 _WEIGHTS = ROWS[-1]
 
 
 class Floquet(NamedTuple):
-    """Growth of small disturbances of periodic jams, trailing axis over the orbits.
+    """Growth of small disturbances of periodic jams, with a trailing axis over the orbits.
 
-    **Attributes**: `roots` (2 nd + 2 G - 1, P) complex: growth over a turn of the grid, that is half a period followed by the
-    half-turn if the motion has that symmetry (multipliers are their squares), otherwise a period (they are the multipliers);
-    without the trivial root, a shift in time. `inner` (2, P): the same for two loads that separate while the others
-    stay, None for a single load. `trivial` (P,): the trivial root, 1 but for the error of the integration.
+    **Attributes**
+
+    - `roots` (2 nd + 2 G - 1, P) complex: growth over a turn of the grid, without the trivial root of a shift in time. If the
+      motion has the half-turn symmetry, a turn of the grid is half a period followed by the half-turn, and the multipliers are
+      the squares of the roots; otherwise it is a period, and the roots are the multipliers
+    - `inner` (2, P): the same for two loads that separate while the others do not move, None for a single load
+    - `trivial` (P,): the trivial root, which is 1 except for the error of the integration
     """
 
     roots: Array
@@ -57,7 +60,7 @@ class _Rates(NamedTuple):
 
 
 def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
-    """Rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
+    """Return the rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
 
     A body of loads decays by drag and friction with an inertia that the motion of the carrier reduces:
 
@@ -82,16 +85,16 @@ def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
 
 
 def is_stiff(model: CoincidentModel, omega: Array, speed: Array) -> Array:
-    """True if multipliers at load speeds `omega` and the rotor's `speed` (rad/s) need the implicit method, by the decay rates
-    of loads and carrier."""
+    """Return True if multipliers at load speeds `omega` and the rotor's `speed` (rad/s) need the implicit method, because of
+    the decay rates of loads and carrier."""
     rates = _rates(model, omega, speed)
     return jnp.maximum(rates.damping, rates.drag) > _STIFF_DECAY_RATIO * (rates.oscillation + 2.0 * omega)
 
 
 def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
-    """Number of integration steps in a turn of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
+    """Return the number of integration steps in a turn of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
 
-    An `implicit` method is stable at any rate of decay: only the oscillation decides.
+    An `implicit` method is stable at any rate of decay; its steps follow the oscillation only.
     """
     rates = _rates(model, omega, speed)
     turn = np.pi if model.half_turn else 2.0 * np.pi
@@ -138,7 +141,7 @@ class _Disturbances(NamedTuple):
 
     @classmethod
     def about(cls, model: CoincidentModel, motion: PeriodicSolution) -> _Disturbances:
-        """Equations about the motions of a model."""
+        """Return the equations about the motions of a model."""
         carrier, mount, mass = model.linear.carrier, model.linear.mount, model.linear.mass
         nd = mass.shape[0]
         parts = [carrier.stiffness, carrier.damping, *([] if mount.gyroscopic is None else [mount.gyroscopic])]
@@ -169,7 +172,7 @@ class _Disturbances(NamedTuple):
         )
 
     def coefficients(self, grid: Grid, harmonics: Harmonics, theta: Array, waves: Array) -> _Coefficients:
-        """Coefficients at angles theta (m,), from exp(i k theta), k = 0, 1, ..., and its derivatives `waves` (3, m, K)."""
+        """Return coefficients at angles theta (m,), from exp(i k theta), k = 0, 1, ..., and derivatives, `waves` (3, m, K)."""
         model, omega = self.model, self.omega
         gap = 2 if grid.symmetric else 1
         of_deviation, of_motion = (slice(k[0], k[-1] + 1, gap) for k in (grid.deviation_orders, grid.orders))
@@ -189,12 +192,12 @@ class _Disturbances(NamedTuple):
         return _Coefficients(s * moving, coupling, -s * point * rate[None], s * moving2, stiff / unit, by_rate)
 
     def damped(self, q1: Array) -> Array:
-        """Acceleration of the carrier by damping and gyroscopic forces at the velocity q1."""
+        """Return the acceleration of the carrier by damping and gyroscopic forces at the velocity q1."""
         answer = _times(self.damping, q1) / self.w
         return answer if self.gyroscopic is None else answer + self.n * _times(self.gyroscopic, q1) / self.w
 
     def whole_motion(self, c: _Coefficients, x: Array, x1: Array) -> Array:
-        """Second derivatives of carrier and bodies of loads, x = (Q, d)."""
+        """Return second derivatives of carrier and bodies of loads, x = (Q, d)."""
         nd = self.stiffness.shape[0]
         (q, d), (q1, d1) = ((part[:nd], part[nd:]) for part in (x, x1))
         t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
@@ -212,11 +215,11 @@ class _Disturbances(NamedTuple):
 
     @staticmethod
     def relative_motion(c: _Coefficients, x: Array, x1: Array) -> Array:
-        """Second derivative of the angle between loads of one body, the carrier at rest."""
+        """Return the second derivative of the angle between loads of one body, with the carrier at rest."""
         return c.by_rate[:, None] * x1 + c.by_angle[:, None] * x
 
     def along_orbit(self, grid: Grid, harmonics: Harmonics) -> Array:
-        """Direction of a shift in time, (2 nd + 2 G, P): the derivative of the motion itself."""
+        """Return the direction of a shift in time, (2 nd + 2 G, P): the derivative of the motion itself."""
         at, at1 = _signals(harmonics.displacement, _derivatives(grid.orders, 2, harmonics.displacement)) / self.length
         deviation, deviation1, deviation2 = _signals(
             harmonics.deviation, _derivatives(grid.deviation_orders, 3, harmonics.deviation)
@@ -240,7 +243,7 @@ def floquet(
     *,
     implicit: bool = False,
 ) -> Floquet:
-    """Floquet multipliers of the full state about periodic motions, by one integration of all linear equations.
+    """Compute Floquet multipliers of the full state about periodic motions by one integration of all linear equations.
 
     With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
 
@@ -248,8 +251,8 @@ def floquet(
         I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
 
     T is the torque on the body. With dry friction it also depends on the acceleration of the port, a = Omega^2 B q''.
-    Loads of one body that separate (sum d_j = 0) leave the carrier at rest: the second equation without its last term. Loads
-    that lie side by side are pressed together and do not separate.
+    Loads of one body that separate (sum d_j = 0) leave the carrier at rest: they obey the second equation without its last
+    term. Loads that lie side by side are pressed together and do not separate.
 
     All orbits take equal steps of the same length, by Dormand and Prince's method of order 8, or `implicit` ones by
     `radau.transition`, which resolve any drag of the loads and any damping of the carrier.
@@ -288,7 +291,7 @@ def _explicit_transition(
     h: Array,
     steps: int | Array,
 ) -> tuple[Array, ...]:
-    """Transition matrices (2 n, 2 n, P) over a turn of the grid, one for each field, by explicit steps of the length `h`."""
+    """Return transition matrices (2 n, 2 n, P) over a turn of the grid, one for each field, by explicit steps of length `h`."""
     dtype = equations.omega.dtype
 
     def step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -322,7 +325,7 @@ def _implicit_transition(
     h: Array,
     steps: int | Array,
 ) -> tuple[Array, ...]:
-    """Transition matrices like those of `_explicit_transition`, by implicit steps."""
+    """Return the transition matrices of `_explicit_transition`, by implicit steps."""
     # One solve for all equations, since its program is as large as the rest of the step.
     total, orbits, dtype = sum(sizes), equations.omega.shape[0], equations.omega.dtype
 
@@ -353,10 +356,9 @@ def _integrate(
     begin: Callable[[], tuple[Array, ...]],
     step: Callable[[_Coefficients, tuple[Array, ...]], tuple[Array, ...]],
 ) -> tuple[Array, ...]:
-    """State after `steps` steps from `begin`, each with the coefficients at its `nodes`."""
+    """Return the state after `steps` steps from `begin`, each with the coefficients at its `nodes`."""
     places = jnp.asarray(nodes, dtype=equations.omega.dtype)
-    # exp(i k theta) is updated from step to step by a product, since sines and cosines at every node took a quarter of the
-    # time.
+    # exp(i k theta) is updated by a product in each step, since sines and cosines at every node took a quarter of the time.
     every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
     at_nodes, turning = _derivatives(every, 3, harmonics.deviation) * _wave(every, places * h), _wave(every, h[None])
 
@@ -370,36 +372,36 @@ def _integrate(
 
 
 def _units(size: int, equations: _Disturbances) -> Array:
-    """A unit matrix (size, size, P) for each orbit."""
+    """Return a unit matrix (size, size, P) for each orbit."""
     omega = equations.omega
     return jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype)[:, :, None], (size, size, omega.shape[0]))
 
 
 def _wave(orders: np.ndarray, theta: Array) -> Array:
-    """exp(i k theta) at angles theta (n,): (1, n, K)."""
+    """Return exp(i k theta) at angles theta (n,): (1, n, K)."""
     return jnp.exp(1j * np.asarray(orders, theta.dtype)[None, None] * theta[None, :, None])
 
 
 def _derivatives(orders: np.ndarray, number: int, like: Array) -> Array:
-    """Factors of exp(i k theta) in its first derivatives, the 0th first: (number, 1, K), of the type of `like`."""
+    """Return the factors of exp(i k theta) in its derivatives of order 0, 1, ...: (number, 1, K), of the type of `like`."""
     return jnp.asarray((1j * orders) ** np.arange(number)[:, None, None], like.dtype)
 
 
 def _signals(harmonics: Array, waves: Array) -> Array:
-    """Re sum_k c_k exp(i k theta) and derivatives, from the waves' own (number, n, K); c (m, K, P) gives (number, m, n, P)."""
+    """Return Re sum_k c_k exp(i k theta) and derivatives, (number, m, n, P), from c (m, K, P) and waves (number, n, K)."""
     parts = jnp.concatenate([harmonics.real, harmonics.imag], -2)
     return jnp.einsum("dnk,mkp->dmnp", jnp.concatenate([waves.real, -waves.imag], -1), parts)
 
 
 def _times(matrix: Array, vectors: Array) -> Array:
-    """Matrix (a, b) times (b, ..., P); of a small matrix as a sum, which the compiler fuses with its surroundings."""
+    """Return the matrix (a, b) times (b, ..., P); for a small matrix as a sum, which the compiler can fuse."""
     if matrix.size > 16:
         return jnp.tensordot(matrix, vectors, 1)
     return jnp.sum(matrix.reshape(*matrix.shape, *[1] * (vectors.ndim - 1)) * vectors[None], axis=1)
 
 
 def _small_solve(weight: Array, right: Array) -> Array:
-    """x (np, ...) of (1 - weight) x = right, np = 1 or 2 written out, weight (np, np, ...)."""
+    """Return the solution x (np, ...) of (1 - weight) x = right, written out for np = 1 or 2; weight (np, np, ...)."""
     a = np.eye(weight.shape[0]).reshape(*weight.shape[:2], *[1] * (weight.ndim - 2)) - weight
     if weight.shape[0] == 1:
         return right / a[0]
@@ -408,13 +410,13 @@ def _small_solve(weight: Array, right: Array) -> Array:
 
 
 def _eigenvalues(matrices: Array) -> Array:
-    """Eigenvalues (P, n) of matrices (P, n, n), one matrix after the other, since batched library calls may deadlock if several
-    programs run in parallel (jaxlib 0.10)."""
+    """Return eigenvalues (P, n) of matrices (P, n, n), one matrix after the other, since batched library calls may deadlock if
+    several programs run in parallel (jaxlib 0.10)."""
     return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
 
 
 def _deflate(matrix: Array, known: Array) -> tuple[Array, Array]:
-    """Eigenvalue of the eigenvector `known`, and a matrix with the other eigenvalues."""
+    """Return the eigenvalue of the eigenvector `known`, and a matrix with the other eigenvalues."""
     unit = known / jnp.linalg.norm(known)
     mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))
     mirror = mirror / jnp.linalg.norm(mirror)
