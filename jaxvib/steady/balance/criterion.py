@@ -1,4 +1,4 @@
-"""Empirical criterion of auto-balancing: rotor speeds at which loads spread and cancel, and at which they gather."""
+"""Empirical criterion of auto-balancing: rotor speeds at which loads balance the rotor, and at which they gather."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ CRITERION_TERMS = (
     SlipRelease,
     SupportForce,
 )
-"""Terms that the criterion allows: those without a separate force on each load, such as that of a potential."""
+"""Terms that the criterion allows: terms without a separate force on each load, such as the force of a potential."""
 
 
 @validated
@@ -196,7 +196,7 @@ def _gathering(resonances: Array, additional: Array) -> Array:
 
 
 def criterion_table(result: Criterion) -> dict[str, Any]:
-    """Result of the criterion as plain lists and numbers for JSON; speeds in rad/s.
+    """Return the result of the criterion as plain lists and numbers for JSON, with speeds in rad/s.
 
     **Returns** a dict: `status` a sentence; `resonances`, `additional` lists of speeds without damping,
     `damped_resonances`, `damped_additional` with; `balancing`, `gathering` lists of [from, to] with damping,
@@ -223,7 +223,7 @@ def criterion_table(result: Criterion) -> dict[str, Any]:
 
 
 def _joined(rows: np.ndarray) -> list[list[float | None]]:
-    """Rows [from, to] without the empty ones, those that touch joined, both within rounding."""
+    """Join rows [from, to] that touch and omit empty ones, within rounding."""
     joined: list[list[float]] = []
     close = np.sqrt(np.finfo(rows.dtype).eps)
     for start, end in rows[~np.isnan(rows[:, 0])].tolist():

@@ -27,25 +27,25 @@ BATCH = 16
 """Number of rotor speeds in a batch of monodromy matrices."""
 
 _FORGOTTEN = 40.0
-"""Decay in a turn, exp(-40), beyond which a vibration is below the rounding of multipliers."""
+"""Exponent of the decay in a turn, exp(-40), above which a vibration is below the rounding of multipliers."""
 
 _FEWEST, _MOST = 16, 2**17
 """Maximum number of steps in a turn; slower rotors are allowed only if the carrier comes to rest within a turn."""
 
 
 def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
-    """State of the balanced motion after the rotor has turned by `turn` rad."""
+    """Return the state of the balanced motion after the rotor has turned by `turn` rad."""
     rest = jnp.zeros(len(scene.machine.structure().coordinates), angles.dtype)
     return State(rest, rest, (turn + angles,), (jnp.full_like(angles, 1.0) * scene.drive.speed,))
 
 
 def at_constant_speed(scene: Scene) -> Scene:
-    """Copy of the scene with a rotor that has its working speed from the start."""
+    """Return the scene with a rotor that has its working speed from the start."""
     return scene.replace(drive=ConstantSpeed(scene.drive.speed))
 
 
 def _steps_for(scene: Scene) -> Array:
-    """Number of steps in which `monodromy` resolves a turn: the carrier's oscillation, and the turn itself."""
+    """Return the number of steps with which `monodromy` resolves a turn and the carrier's oscillation in it."""
     linear, speed = linear_model(scene), scene.drive.speed
     fastest = jnp.max(linear.modes()[0])
     if linear.mount.gyroscopic is not None:
@@ -55,7 +55,7 @@ def _steps_for(scene: Scene) -> Array:
 
 
 def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
-    """Monodromy matrix of the balanced motion over one turn of the rotor, (2 (nd + N), 2 (nd + N)).
+    """Return the monodromy matrix of the balanced motion over one turn of the rotor, (2 (nd + N), 2 (nd + N)).
 
         x'' = P(n t) x + R(n t) x',  x = (q / R, dphi),     (x, x' / n)(turn) = monodromy (x, x' / n)(0)
 
@@ -89,7 +89,7 @@ def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
 
 @cached
 def monodromies(scene: Scene, angles: Any, speeds: Any, steps: int | None) -> Array:
-    """Monodromy matrices at rotor speeds (S,), S a multiple of `BATCH`: (S, 2 (nd + N), 2 (nd + N))."""
+    """Return monodromy matrices at rotor speeds (S,), S a multiple of `BATCH`: (S, 2 (nd + N), 2 (nd + N))."""
 
     def flow(speed: Array) -> Array:
         this = eqx.tree_at(lambda s: s.drive.speed, scene, speed)
@@ -100,7 +100,7 @@ def monodromies(scene: Scene, angles: Any, speeds: Any, steps: int | None) -> Ar
 
 @cached
 def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array, Array]:
-    """Monodromy matrix at the rotor speed of the scene, and the same with half as many steps."""
+    """Return the monodromy matrix at the rotor speed of the scene, and the same with half as many steps."""
     fine = _steps_for(scene) if steps is None else steps
     return monodromy(scene, angles, fine), monodromy(scene, angles, fine // 2)
 
@@ -130,7 +130,7 @@ def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | N
 
 @cached
 def _slowest_decay(scene: Scene) -> tuple[Array, Array]:
-    """Slowest decay of the vibrations of the carrier, 1/s, at the speed of the scene, and the number of steps in a turn."""
+    """Return the slowest decay of vibrations of the carrier, 1/s, at the scene's rotor speed, and the steps in a turn."""
     model = linear_model(scene)
     nd = model.mass.shape[0]
     solved = jnp.linalg.solve(

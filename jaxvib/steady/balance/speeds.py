@@ -176,7 +176,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
 
 @cached
 def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, Array, Array]:
-    """Characteristic speeds, and the port, stiffness and mass of the carrier with its loads."""
+    """Return the characteristic speeds, and the port, stiffness and mass of the carrier with its loads."""
     model = linear_model(scene)
     carrier, direction = model.carrier, _direction(model)
     gyroscopic = model.mount.gyroscopic
@@ -197,12 +197,12 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
 
 
 def _direction(model: LinearModel) -> Array:
-    """Force direction b = B^T e (nd,); real for a port with one direction, whose phase has no effect."""
+    """Return the force direction b = B^T e (nd,); real for a port with one direction, whose phase has no effect."""
     return model.mount.rows[0][0] if len(model.mount.axes) == 1 else model.direction
 
 
 def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
-    """Input checks."""
+    """**Raises** `InputError` if no coordinate moves the port, a rotor has a motion without a spring, or rounding hides one."""
     if not np.any(port):
         problem = "moves with none of the coordinates; put the exciter where it can move, or its loads cannot act"
         raise InputError("machine.port", problem)
@@ -210,7 +210,7 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
         return
-    # Resonances that rounding hides beside the highest, although a spring resists the motion.
+    # Resonances that rounding hides, relative to the highest one, although a spring resists the motion.
     rounding = mass.shape[0] * np.finfo(mass.dtype).eps
     inverse = np.linalg.inv(np.linalg.cholesky(mass))
     squares = np.linalg.eigvalsh(inverse @ stiffness @ inverse.T)
@@ -231,7 +231,7 @@ def _inverse_root(values: Array) -> Array:
 
 
 def _free_and_held_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
-    """Ascending eigenvalues and vectors of `square` (nd, nd), and its eigenvalues (nd - 1,) on the complement of c."""
+    """Return ascending eigenvalues and vectors of `square` (nd, nd), and its eigenvalues (nd - 1,) on the complement of c."""
     size = magnitude(c[0])
     phase = jnp.where(size > 0.0, c[0] / jnp.where(size > 0.0, size, 1.0), 1.0)
     # A reflection maps c to the first axis; the other axes are then a basis of the complement of c.
@@ -246,7 +246,7 @@ def _free_and_held_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
 
 
 def _sign_changes(model: LinearModel, direction: Array, resonances: Array, additional: Array, shapes: Array) -> Array:
-    """Sign changes of Re(b^H D(w)^-1 b), ascending (2 nd - 1,), the first from + to -; NaN for missing ones."""
+    """Return the sign changes of Re(b^H D(w)^-1 b), ascending (2 nd - 1,), the first from + to -; NaN for missing ones."""
     frozen, b, poles, zeros, forms = jax.lax.stop_gradient((model, direction, resonances, additional, shapes))
     carrier = model.carrier
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
@@ -256,7 +256,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     smooth = 1j * last**2 / mobility * jnp.outer(b, b.conj())
 
     def pull(m: LinearModel, w: Array) -> Array:
-        # A trace of damping: a mode that never moves the port and has none would divide 0 by 0 at its resonance.
+        # A small damping is added, since a mode without damping that never moves the port gives 0/0 at its resonance.
         matrix = m.dynamic_stiffness(w) + 2j * w * trace * frozen.mass + smooth
         return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
 
@@ -279,7 +279,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     grid = jnp.concatenate([0.999 * poles[:1], inside.ravel(), 1.001 * poles[-1:]])
 
     # Below the first resonance the sign is + whatever the damping; a machine that can drift has its change at speed 0.
-    # (A loop, so that many machines at once need the memory of one grid point each.)
+    # A loop over the grid points, so that a batch of machines needs the memory of one grid point for each.
     positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: pull(frozen, w) > 0.0, grid[1:]))
     passed = jnp.cumsum(positive[1:] != positive[:-1])
     order = jnp.arange(2 * resonances.shape[0] - 1)

@@ -54,7 +54,7 @@ class BalancedStability(Result):
         return StabilityStatus.stable if self.stable else StabilityStatus.unstable
 
     def summary(self) -> str:
-        """Text of the stability and of the growth of errors."""
+        """Return the stability and the growth of errors as text."""
         largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
         return (
             f"{self.message} at {self.growth:.4g} 1/s; largest multipliers {largest}, {self.neutral} of them neutral, "
@@ -62,7 +62,7 @@ class BalancedStability(Result):
         )
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """The multipliers in the complex plane, and the unit circle.
+        """Plot the multipliers in the complex plane, and the unit circle.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """

@@ -1,4 +1,4 @@
-"""The balanced motion: how loads can cancel each other, and whether that motion is stable, exactly."""
+"""Balanced motion: arrangements in which loads cancel each other, and their exact stability."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class BalancedStates(Result):
         return balanced_intervals(self.scene, low, high, self._arranged(arrangement), points=points, steps=steps)
 
     def _arranged(self, arrangement: int) -> np.ndarray:
-        """The angles of an arrangement. **Raises** `ComputationError` where there is none."""
+        """Return the angles of an arrangement. **Raises** `ComputationError` if there is none."""
         if not len(self.angles):
             raise failure(self.status)
         if not 0 <= arrangement < len(self.angles):
@@ -186,7 +186,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
         status = BalanceStatus.alone if sides.size == 1 else BalanceStatus.outweighed
         return BalancedStates(status, np.zeros((0, n)), 0, [], (), scene)
     if largest > rest - rounding:
-        # In one line: the largest against all others.
+        # All loads are on one line, the largest opposite all others.
         one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
     else:
         one = _inscribed(sides) * np.array([[1.0], [-1.0]])
@@ -205,7 +205,7 @@ def _sides(loads: CircularLoads) -> np.ndarray:
 
 
 def _imbalance(scene: Scene) -> complex:
-    """The rotor's own, kg m, in its frame; refused where loads at one point cannot cancel it."""
+    """Return the imbalance of the rotor, kg m, in its frame. **Raises** `InputError` if loads at one point cannot cancel it."""
     thrown = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
     static = [complex(*map(float, each.static)) for each in thrown]
     moment = [complex(*map(float, each.moment)) for each in thrown]
@@ -221,15 +221,15 @@ def _imbalance(scene: Scene) -> complex:
 
 
 def _inscribed(sides: np.ndarray) -> np.ndarray:
-    """Directions of the sides of the polygon inscribed in a circle, in the order of the loads, the first at 0."""
+    """Return directions of the sides of the polygon inscribed in a circle, in the order of the loads, the first at 0."""
     largest = int(np.argmax(sides))
     low, high = 0.0, 1.0
 
     def centre_angles(x: float) -> np.ndarray:
         return 2.0 * np.arcsin(np.minimum(sides / sides[largest] * x, 1.0))
 
-    # x = largest side / diameter. The centre is inside the polygon where the sides reach all round at x = 1; else it is
-    # beyond the largest side, which then turns by what the others turn, backward.
+    # x = largest side / diameter. The centre is inside the polygon if the angles of the sides at x = 1 add up to a full turn or
+    # more. Otherwise it is beyond the largest side, whose angle is then the sum of the others, in the opposite direction.
     inside = centre_angles(1.0).sum() >= 2.0 * np.pi
     others = np.arange(sides.size) != largest
 
@@ -238,7 +238,7 @@ def _inscribed(sides: np.ndarray) -> np.ndarray:
         return turns.sum() - 2.0 * np.pi if inside else turns[largest] - turns[others].sum()
 
     if not inside:
-        low = 1e-9  # at 0 both are 0
+        low = 1e-9  # both sides of the equation are 0 at 0
     for _ in range(200):
         middle = (low + high) / 2.0
         if excess(middle) > 0.0:
@@ -253,7 +253,7 @@ def _inscribed(sides: np.ndarray) -> np.ndarray:
 
 
 def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np.ndarray:
-    """Orthonormal changes of the angles (N, d) that keep the sum to first order; the common turn first, if free."""
+    """Return orthonormal changes of the angles (N, d) that keep the sum to first order; a free common turn is the first."""
     n = sides.size
     change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) / sides.max()
     _, values, right = np.linalg.svd(change)
@@ -298,9 +298,9 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
     growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
-    # Half the steps have 64 times the error at least: of order 11 where everything is resolved, of 6 where loads decay at once.
+    # Half as many steps have at least 64 times the error: the order is 11 if all is resolved, and 6 if loads decay in a step.
     error = float(np.max(np.min(np.abs(fine[:, None] - coarse[None, :]), axis=1))) / 63.0
-    # Neutral multipliers are 1: what they differ from it is rounding, which grows with the number of steps.
+    # Neutral multipliers are 1; their difference from 1 is rounding, which grows with the number of steps.
     rounding = float(np.max(np.sort(np.abs(fine - 1.0))[:neutral], initial=fine.size * np.finfo(fine.real.dtype).eps))
     is_decided = abs(growth) * 2.0 * np.pi / float(scene.drive.speed) > error + 2.0 * rounding
     order = np.argsort(-np.abs(fine))
@@ -328,7 +328,7 @@ def balanced_growth(
     """
     angles, neutral = _arrangement(scene, angles)
     flat = np.ravel(np.asarray(speeds, dtype=float))
-    # Whole batches only, so that few shapes are compiled.
+    # Speeds are padded to whole batches, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % BATCH), mode="edge")
     flows = monodromies(at_constant_speed(scene), angles, padded, checked_steps(scene, flat, steps))[: flat.size]
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
@@ -370,9 +370,9 @@ def stability_changes(
     close: float = 1e-7,
     steps: int | None = None,
 ) -> np.ndarray:
-    """Speeds at which the balanced motion changes its stability, ascending, by halving to `close` of the speed.
+    """Return the speeds at which the balanced motion changes its stability, ascending, by bisection to `close` of the speed.
 
-    `stable` says for each of `speeds` whether the motion is; a change between two of them is found.
+    `stable`: True for each of `speeds` at which the motion is stable; changes between two of them are found.
     """
     (change,) = np.nonzero(stable[1:] != stable[:-1])
     left, right = speeds[change], speeds[change + 1]
@@ -384,7 +384,7 @@ def stability_changes(
 
 
 def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
-    """Angles at which the loads are known to cancel, and how many neutral directions they have."""
+    """Return validated angles at which the loads cancel each other, and the number of their neutral directions."""
     sides, imbalance = _sides(circular_loads(scene)), _imbalance(scene)
     if not np.min(np.asarray(natural_frequencies(scene))) > 0.0:
         problem = (
@@ -404,7 +404,7 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
 
 
 def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: int) -> np.ndarray:
-    """The largest growth rate, 1/s, of multipliers (..., n) over a turn, without the `neutral` ones nearest to 1."""
+    """Return the largest growth rate, 1/s, of multipliers (..., n) over a turn, without the `neutral` ones nearest to 1."""
     nearest = np.argsort(np.abs(multipliers - 1.0), axis=-1)
     others = np.take_along_axis(multipliers, nearest[..., neutral:], -1)
     return np.log(np.max(np.abs(others), axis=-1)) * np.asarray(speed) / (2.0 * np.pi)
@@ -417,7 +417,7 @@ def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
 
 @cached
 def _disturbance(scene: Scene, angles: Any) -> Array:
-    """The largest acceleration of a load, rad/s^2, in the balanced motion, at some turns of the rotor."""
+    """Return the largest acceleration of a load, rad/s^2, in the balanced motion, at some angles of the rotor."""
     field, speed = vector_field(at_constant_speed(scene)), scene.drive.speed
 
     def acceleration(turn: Array) -> Array:
