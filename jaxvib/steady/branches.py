@@ -160,7 +160,7 @@ def branches(
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     model = jammed_model(scene).decomposed()
     crowded, resonances = fold_points(model, per_side)
-    # The requested number of points: those of the dense grid, thinned evenly and moved into the range.
+    # The requested number of points is taken evenly from the dense grid and moved into the range.
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
     share = jnp.linspace(0.0, 1.0, points)
     omega = jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))

@@ -1,7 +1,7 @@
 """Outcome of a computation: its result, the error of its status, or the status `refused`.
 
-Numbers of a scene may have no value until a compiled program runs. Checks of such numbers are skipped when the scene is built;
-if one of them is not allowed, the result has the status `refused` and no numbers.
+Numbers of a scene may have no value until a compiled program runs. Their validation is skipped when the scene is built; if one
+of them is not allowed, the result has the status `refused` and no numbers.
 """
 
 from __future__ import annotations
@@ -66,12 +66,12 @@ def outcome(
 
 
 def unknown_is_positive(number: Array | None) -> Array | None:
-    """True if a number that has no value yet is finite and positive, as one traced Boolean; None for a known number."""
+    """Return a traced Boolean, True if a number without a value yet is finite and positive; None for a known number."""
     return None if number is None or is_known(number) else jnp.isfinite(number) & (number > 0.0)
 
 
 def without_numbers(allowed: Array, found: Any) -> Any:
-    """The tree with NaN and False in place of its numbers unless `allowed`; a scene in it stays as it is."""
+    """Return the tree with NaN and False in place of its numbers unless `allowed`; a scene in it is unchanged."""
 
     def kept(value: Any) -> Any:
         if not isinstance(value, Array):

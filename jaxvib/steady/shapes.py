@@ -99,7 +99,7 @@ def _mode_shapes(scene: Scene) -> ModeShapes:
     tilts = np.array([unit == "rad" for unit in model.carrier.units])
     lever = jnp.where(tilts, jnp.sqrt(inertia / inertia[0]), 1.0)
     rows = vectors.T * lever[None, :]
-    # The largest amplitude is 1; of several equal ones the first.
+    # The largest amplitude is 1; if several are equal, the first one counts.
     size = jnp.abs(rows)
     place = jnp.argmax(size > (1.0 - 1e-6) * jnp.max(size, axis=1, keepdims=True), axis=1)
     return ModeShapes(frequency, rows / jnp.take_along_axis(rows, place[:, None], axis=1), lever, model.carrier.coordinates)

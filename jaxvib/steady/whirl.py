@@ -34,8 +34,8 @@ __all__ = ["CriticalSpeeds", "Whirl", "WhirlStatus", "critical_speeds", "whirl"]
 Weights = Literal["fixed", "none"]
 
 _TIE, _TIE_ROUNDINGS = 1e-9, 100.0
-"""Size of the coupling that separates two whirls of one speed, relative to the matrices of the machine, and its minimum in
-units of the rounding."""
+"""Size of the added coupling that separates two whirls of one speed, relative to the matrices of the machine, and its minimum
+in units of the rounding."""
 
 
 class WhirlStatus(eqx.Enumeration):
@@ -213,15 +213,15 @@ def _tie(dtype: np.dtype) -> float:
 
 
 def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array) -> tuple[Array, Array]:
-    """Kind of each natural motion, and the relative error of its eigenvalue.
+    """Return the kind of each natural motion, and the relative error of its eigenvalue.
 
         (s^2 M + s C + K) x = 0,      m s^2 + c s + k = 0 with m = x^H M x, c = x^H C x, k = x^H K x
 
-    The kind is - Re(2 s + c/m): of the two real roots of a single equation it is negative for the slower one, in which damping
-    holds back what the spring pulls, and positive for the faster one, in which damping stops a mass. Several overdamped motions
-    are distinguished by it too, whatever their roots: it is the sign characteristic of the Hermitian matrix polynomial.
+    The kind is - Re(2 s + c/m). For the two real roots of a single equation it is negative at the slower one, at which damping
+    balances the spring, and positive at the faster one, at which damping stops the mass. It is the sign characteristic of the
+    Hermitian matrix polynomial, and therefore distinguishes several overdamped motions too, whatever their roots.
 
-    The error is the step of Newton's method for the scalar equation, with the rounding of its terms counted.
+    The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.
 
     **Arguments**: M, C (gyroscopic terms included) and K (nd, nd); `values` s (k,); `shapes` x (nd, k).
     """
@@ -231,7 +231,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
     slope, length = jnp.abs(2.0 * m * values + c), jnp.abs(values)
     rounding = len(sizes) * jnp.finfo(sizes.dtype).eps * (rough[0] * length**2 + rough[1] * length + rough[2])
     residual = jnp.abs((m * values + c) * values + k) + rounding
-    # The distance of two nearly equal roots is the square root of the rounding.
+    # Rounding separates two nearly equal roots by its square root.
     step = jnp.minimum(residual / jnp.where(slope > 0.0, slope, 1.0), jnp.sqrt(residual / m.real))
     step = jnp.where(slope > 0.0, step, jnp.sqrt(residual / m.real))
     return -(2.0 * values + c / m).real, step / length
@@ -303,7 +303,7 @@ def _require_springs(stiffness: np.ndarray) -> None:
 
 
 def _held(stiffness: np.ndarray) -> bool:
-    """True if springs resist every motion, within rounding."""
+    """Return True if springs resist every motion, within rounding."""
     size = np.sqrt(np.where(np.diag(stiffness) > 0.0, np.diag(stiffness), 1.0))
     rounding = 4.0 * stiffness.shape[0] * np.finfo(stiffness.dtype).eps
     return bool(np.all(np.linalg.eigvalsh(stiffness / np.outer(size, size)) > rounding))
@@ -315,14 +315,14 @@ def _mass(model: LinearModel, loads: Weights) -> Array:
 
 
 def _sense_matrix(mount: Mount) -> Array:
-    """Gyroscopic matrix (nd, nd) that separates whirls of one speed by their direction."""
+    """Return a gyroscopic matrix (nd, nd) that separates whirls of one speed by their direction."""
     planes = jnp.stack(mount.rows)
     turn = planes[:, 0].T @ planes[:, 1]
     return turn - turn.T
 
 
 def _sense(mount: Mount, shapes: Array) -> Array:
-    """Twice the area that shapes (nd, k) sweep in a turn, at the rotor and by its tilts; positive in the direction of the
-    rotor."""
+    """Return twice the area that shapes (nd, k) sweep in a turn, at the rotor and by its tilts; positive in the direction of
+    the rotor."""
     moved = jnp.stack(mount.rows).astype(shapes.dtype) @ shapes
     return jnp.sum(jnp.imag(moved[:, 0] * jnp.conj(moved[:, 1])), axis=0)

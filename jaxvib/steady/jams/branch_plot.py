@@ -19,7 +19,7 @@ __all__ = ["MARKS", "branch_summary", "plot_branch"]
 
 
 class _Branch(Protocol):
-    """Arrays of a branch that are drawn, with one entry for each point along the load speed."""
+    """Plotted arrays of a branch, with one entry for each point along the load speed."""
 
     omega: Array
     rotor_speed: Array
@@ -31,7 +31,7 @@ class _Branch(Protocol):
 
 
 def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], judged: str) -> str:
-    """Text with the ranges of a branch and its special points.
+    """Return text with the ranges of a branch and its special points.
 
     **Arguments**: `marks`: special points (kind, load speed, rotor speed); `judged`: text on how stability is determined.
     """
@@ -65,12 +65,12 @@ def plot_branch(
     modes: np.ndarray | None = None,
     resonances: np.ndarray | None = None,
 ) -> Drawn:
-    """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
+    """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed; stable solid, unstable dashed.
 
-    **Arguments**: `marks` special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most` the greatest
-    rotor speed shown, rad/s (a third above the scene's if None); how stability is `judged`; `show` which panels, `ax` onto
-    which axes; `modes` the number of the jam mode at each point, counted by the resonances and the slope if None; the
-    `resonances` (nd,) rad/s, computed if None.
+    **Arguments**: `marks`: special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most`: the
+    greatest rotor speed shown, rad/s (a third above the scene's if None); `judged`: text on how stability is determined;
+    `show`: names of the panels; `ax`: axes to draw onto; `modes`: the number of the jam mode at each point, counted by the
+    resonances and the slope if None; `resonances` (nd,) rad/s, computed if None.
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel.
     """

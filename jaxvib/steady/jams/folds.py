@@ -69,12 +69,12 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
 
 def rotor_speed_at(model: JammedModel, omega: Array, speed: Array | None = None) -> Array:
-    """`jam_rotor_speed` for an assembled scene."""
+    """Return `jam_rotor_speed` for an assembled scene."""
     return _balance(model, omega, speed)[0]
 
 
 def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
-    """Rotor speed of light loads at a load speed (rad/s), see `jam_rotor_speed`; the starting point for exact jams.
+    """Return the rotor speed of light loads at a load speed (rad/s), see `jam_rotor_speed`; the start for exact jams.
 
     If the response of the carrier depends on the rotor speed (gyroscopic), n = w + torque(w, n)/drag can have several roots.
     The result is the lowest one on a grid of rotor speeds from w to 1e4 w.
@@ -92,13 +92,13 @@ def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
 
 
 def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
-    """Rotor speed of `rotor_speed_at` and the amplitudes of the carrier."""
+    """Return the rotor speed of `rotor_speed_at` and the amplitudes of the carrier."""
     displacement = model.displacement(omega, speed)
     return _speed_for(model, omega, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement)), displacement
 
 
 def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
-    """Rotor speed of light loads that turn at `omega`, from w^2 e^H B Y, m/s^2, see `JammedModel.forward_acceleration`."""
+    """Return the rotor speed of light loads at `omega`, from w^2 e^H B Y, m/s^2, see `JammedModel.forward_acceleration`."""
     # The torque of the drag is opposite to that of the acceleration -w^2 Y.
     torque = mean_torque(model.unbalance, acceleration)
     free = omega + torque / model.drag
@@ -113,22 +113,22 @@ def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
 
 
 def scanned_speed(model: JammedModel, omega: Array) -> Array:
-    """`rotor_speed_at` in modal form, for a search: O(nd), without derivatives by numbers of the scene."""
+    """Return `rotor_speed_at` in modal form, for a search: O(nd), without derivatives by numbers of the scene."""
     return _speed_for(model, omega, model.forward_acceleration(omega))
 
 
 def branch_tangent(model: JammedModel, omega: Array) -> tuple[Array, Array, Array]:
-    """Rotor speed at a load speed, dn/dOmega along the branch, and the amplitudes (nd,) of the carrier."""
+    """Return the rotor speed at a load speed, dn/dOmega along the branch, and the amplitudes (nd,) of the carrier."""
     return jax.jvp(lambda w: _balance(model, w), (omega,), (jnp.ones_like(omega),), has_aux=True)
 
 
 def branch_slope(model: JammedModel, omega: Array) -> Array:
-    """Slope dn/dOmega of the branch."""
+    """Return the slope dn/dOmega of the branch."""
     return branch_tangent(model, omega)[1]
 
 
 def scanned_slope(model: JammedModel, omega: Array) -> Array:
-    """Slope dn/dOmega of `scanned_speed`."""
+    """Return the slope dn/dOmega of `scanned_speed`."""
     return jax.jvp(partial(scanned_speed, model), (omega,), (jnp.ones_like(omega),))[1]
 
 
@@ -140,9 +140,10 @@ def branch_root(
     high: Array,
     ends: tuple[Array, Array],
 ) -> Array:
-    """Load speed between `low` and `high` at which a function of the branch is 0, with exact derivatives.
+    """Return the load speed between `low` and `high` at which a function of the branch is 0, with exact derivatives.
 
-    **Arguments**: the function from the matrices, `exact`, and in modal form, `scanned`; `ends`, its values at both ends.
+    **Arguments**: `exact`: the function from the matrices; `scanned`: the same function in modal form; `ends`: its values at
+    both ends.
     """
     f = partial(exact, model)
     if model.modal is None:
@@ -182,7 +183,7 @@ def branch_pieces(model: JammedModel) -> Pieces:
     speeds, speed_end = speeds[:-1], jax.lax.stop_gradient(speeds[-1:])
     main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
     omega, speeds, found = omega[main], speeds[main], found[main]
-    if model.modal is not None:  # now with derivatives, half as often
+    if model.modal is not None:  # once more with derivatives, at half as many points
         speeds = jax.vmap(partial(rotor_speed_at, model))(omega)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
@@ -196,14 +197,14 @@ def branch_pieces(model: JammedModel) -> Pieces:
 
 
 def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
-    """Mode numbers (2 nd + 1,) of the pieces of a branch with folds at the load speeds `cuts` (2 nd,), if `found` is True.
+    """Return mode numbers (2 nd + 1,) of the pieces of a branch; its folds are the load speeds `cuts` (2 nd,) that are `found`.
 
     Each peak belongs to the nearest resonance, except that two peaks never share a resonance and every peak has one.
     """
     nd = resonances.shape[0]
     peak = np.arange(nd)
     nearest = 1 + jnp.argmin(jnp.abs(resonances[None, :] - cuts[0::2, None]), axis=1)
-    # Numbers rise by at least 1 from peak to peak, and leave enough for later peaks.
+    # Numbers of resonances rise by at least 1 from peak to peak, and leave at least one for each later peak.
     owner = peak + jnp.minimum(jax.lax.cummax(nearest - peak), nd + 1 - jnp.sum(found[1::2]))
     owner = jnp.minimum(owner, nd)
     last = 2 * nd + 1
@@ -212,7 +213,7 @@ def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
 
 
 def without_ripples(speeds: Array, count: Array, most: int) -> Array:
-    """Indices of the `most` relevant folds among twice as many with rotor speeds `speeds`, of which the first `count` exist.
+    """Return indices of the `most` relevant folds among twice as many with rotor speeds `speeds`; the first `count` exist.
 
     A branch has one peak for each resonance. If it has additional ripples, the pairs of folds with the smallest ratio of rotor
     speeds are dropped.
@@ -232,11 +233,11 @@ def without_ripples(speeds: Array, count: Array, most: int) -> Array:
 
 
 def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
-    """Grid of load speeds for the search for folds, and the resonances; only the resonances have derivatives.
+    """Return a grid of load speeds for the search for folds, and the resonances; only the resonances have derivatives.
 
     The grid has `per_side` points on each side of each pole s of det(K + s^2 M + s C) = 0, with a density that follows the
-    width of its peak. Undamped resonances would not do: a strong damper between two platforms locks them into one body, whose
-    sharp peak is at neither resonance.
+    width of its peak. Undamped resonances are not sufficient: a strong damper between two platforms locks them into one body,
+    whose sharp peak is at neither resonance.
     """
     resonances, _ = model.modes()
     fixed = jax.lax.stop_gradient(resonances)
@@ -262,7 +263,7 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
 
 
 def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
-    """Poles: the 2 nd complex s with det(K + s C + s^2 M) = 0."""
+    """Return the poles: the 2 nd complex s with det(K + s C + s^2 M) = 0."""
     n = mass.shape[0]
     solved = small_solve(mass, jnp.concatenate([stiffness, damping], axis=1))
     shift = jnp.concatenate([jnp.zeros((n, n), mass.dtype), jnp.eye(n, dtype=mass.dtype)], axis=1)
@@ -270,12 +271,12 @@ def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
 
 
 def _first_places(there: Array, size: int, otherwise: int) -> Array:
-    """The first `size` indices at which `there` (n,) is True, ascending, padded with `otherwise`."""
+    """Return the first `size` indices at which `there` (n,) is True, ascending, padded with `otherwise`."""
     return jnp.sort(jnp.where(there, jnp.arange(there.shape[0]), otherwise))[:size]
 
 
 def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
-    """Grid and `slopes` on it, with points added at minima of |slope|, since one interval can contain two folds."""
+    """Return a grid with points added at minima of |slope|, since one interval can contain two folds, and `slopes` on it."""
     value = slopes(grid)
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])

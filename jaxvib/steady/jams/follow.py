@@ -78,7 +78,7 @@ def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
 
 
 def _newton(f: Callable[[Array], Array], start: Array, most: Array) -> Array:
-    """Root of `f` by Newton's method with steps of at most a tenth of the unknown, which stays below `most`."""
+    """Return a root of `f` by Newton's method with steps of at most a tenth of the unknown, which stays below `most`."""
 
     def step(_: int, w: Array) -> Array:
         value, slope = jax.jvp(f, (w,), (jnp.ones_like(w),))

@@ -1,4 +1,4 @@
-"""Leading-order jam modes: where light loads get stuck, by algebra alone."""
+"""Leading-order jam modes: the speeds at which light loads jam, computed by algebra alone."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
 
 def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
-    """Jams from their load speeds; without resonances and folds."""
+    """Return jams with all fields computed from their load speeds, without resonances and folds."""
     n, model, there = scene.drive.speed, jammed_model(scene).decomposed(), jams.status != JamStatus.absent
     omega = jax.vmap(lambda root: known_root(lambda w: rotor_speed_at(model, w) - n, root))(jnp.where(there, jams.omega, n))
     fields = _fields(model, jnp.where(there, omega, n), there, jams.status == JamStatus.at_fold)
@@ -262,7 +262,7 @@ def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
 
 @cached(outputs_from_solution=_from_jams)
 def jams_of(scene: Scene) -> JamModes:
-    """`jam_modes` for a validated scene."""
+    """Return `jam_modes` for a validated scene."""
     n, model = scene.drive.speed, jammed_model(scene).decomposed()
     pieces = branch_pieces(model)
     omega, exists = _solved_on_pieces(model, pieces)
@@ -273,7 +273,7 @@ def jams_of(scene: Scene) -> JamModes:
     chosen = jnp.argmax(hits, axis=1)
     omega = jnp.where(there, omega[chosen], n)
 
-    # Closer to a fold, rounding hides the difference between its rotor speed and the scene's, and derivatives have no digits.
+    # Closer to a fold, rounding hides the difference between its rotor speed and the scene's; derivatives have no digits there.
     speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
     close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
     close = (close | jnp.roll(close, -1))[chosen]
@@ -305,7 +305,7 @@ def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> d
 def jam_at(
     model: JammedModel, number: Array, omega: Array, rotor_speed: Array | None = None, at_fold: Array | None = None
 ) -> Jam:
-    """Jam of mode `number` with load speed `omega` rad/s at a rotor speed (rad/s) at which it exists, all scalars.
+    """Return the jam of mode `number` with load speed `omega` rad/s at a rotor speed (rad/s) at which it exists, all scalars.
 
     **Arguments**: `rotor_speed` (default: that of the branch); `at_fold`: True if it lies at its fold (default: if the slope
     of the branch is almost zero). Never returns `absent`; the caller has established that the mode exists.
@@ -336,8 +336,11 @@ def jam_at(
 
 
 def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
-    """True if the torque of the vibration on each load at its best phase, S w^2 |e^H B Y| / 2, reaches the torque
-    b_W R^2 (n - w) of its drag; the vibration is largest for coincident loads. Always True for equal loads."""
+    """Return True if the vibration can hold every load against its drag; always True for equal loads.
+
+    This is the case if the torque of the vibration on each load at its best phase, S w^2 |e^H B Y| / 2, reaches the torque
+    b_W R^2 (n - w) of its drag. The vibration is largest for coincident loads.
+    """
     loads = model.loads
     if loads.alike:
         return True
@@ -347,7 +350,7 @@ def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, dis
 
 
 def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
-    """Jams at load speeds `omega` (any number, ascending), each at its own rotor speed, and the folds."""
+    """Return jams at load speeds `omega` (any number, ascending), each at its own rotor speed, and the folds."""
     pieces = branch_pieces(model)
     cuts = jnp.where(pieces.folds.exists, pieces.folds.omega, jnp.inf)
     numbers = pieces.mode[jnp.searchsorted(cuts, omega)]
@@ -356,7 +359,7 @@ def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
 
 
 def _solved_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]:
-    """Load speeds on the monotone pieces at which the branch has the scene's rotor speed, and True where there is one."""
+    """Return load speeds on the monotone pieces at which the branch has the scene's rotor speed, and True if they exist."""
     target = model.scene.drive.speed
     gaps = pieces.speed_low - target, pieces.speed_high - target
     exists = (pieces.high > pieces.low) & (gaps[0] * gaps[1] <= 0.0)

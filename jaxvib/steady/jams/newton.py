@@ -83,7 +83,7 @@ def damped_newton(
 
 
 def _on_arrays(step: Callable[[_State, Given], _State], begin: _State, given: Given) -> Callable[..., Sequence[Array]]:
-    """Step on the arrays of a state, with the sine and cosine of programs on single numbers if JAX allows."""
+    """Return the step on the arrays of a state, with the sine and cosine of programs on single numbers if JAX allows."""
     program, structure, known = arrays_program(step, begin, given), jax.tree.structure(begin), jax.tree.leaves(given)
     if program is None:
         return lambda *now: jax.tree.leaves(step(jax.tree.unflatten(structure, now), given))
@@ -91,7 +91,7 @@ def _on_arrays(step: Callable[[_State, Given], _State], begin: _State, given: Gi
 
 
 def _iterate(step: Callable[..., Sequence[Array]], begin: Sequence[Array], times: int) -> Sequence[Array]:
-    """State after the first evaluation and `times` steps, or fewer if the damping, its last number, becomes infinite."""
+    """Return the state after the first evaluation and `times` steps, or fewer if its last number, the damping, is infinite."""
 
     def going(now: tuple[Array, list[Array]]) -> Array:
         return (now[0] <= times) & (now[1][-1] < jnp.inf)

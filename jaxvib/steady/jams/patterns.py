@@ -19,7 +19,7 @@ class PhasePattern(eqx.Enumeration):
 
 
 def phase_pattern(phase: Array) -> PhasePattern:
-    """The pattern of phases (count,) rad: by their resultants |mean exp(i k phase)| for k = 1 and 2.
+    """Return the pattern of phases (count,) rad, from their resultants |mean exp(i k phase)| for k = 1 and 2.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> bool(phase_pattern(jnp.array([0.0, 0.1, 3.1, 3.2])) == jv.PhasePattern.opposite)

@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 __all__ = ["PhaseBranch", "drag_curve"]
 
 _PHASE_JUMP = 0.3
-"""Phases that move by more, rad, from one load speed to the next are drawn as another pattern's."""
+"""Change of a phase, rad, from one load speed to the next above which a figure shows another pattern."""
 
 
 class PhaseBranch(Result):
-    """One phase pattern over the loads' speed, at a given rotor speed.
+    """Phase pattern over the load speed, at a fixed rotor speed.
 
-    **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): at how many times the scene's drag the loads jam there,
-    NaN where the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable` (n,) as in `PhaseJam`;
-    `rotor_speed` rad/s, and `drag` (count,) N s/m that the factor multiplies.
+    **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): the factor on the scene's drag with which the loads jam
+    at this speed, NaN if the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable` (n,) as in `PhaseJam`;
+    `rotor_speed` rad/s; `drag` (count,) N s/m, which the factor multiplies.
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s", "omega"))
@@ -43,13 +43,13 @@ class PhaseBranch(Result):
 
     @property
     def status(self) -> PhaseStatus:
-        """At each load speed whether the pattern was found there, a `PhaseStatus`."""
+        """Outcome of the search for the pattern at each load speed, a `PhaseStatus`."""
         return jax.vmap(lambda f: PhaseStatus.where(jnp.isnan(f), PhaseStatus.not_converged, PhaseStatus.found))(
             self.drag_factor
         )
 
     def summary(self) -> str:
-        """The ranges of load speed and drag, for a person to read."""
+        """Return the ranges of load speed and drag as text."""
         factor, omega = np.asarray(self.drag_factor), np.asarray(self.omega)
         there = np.isfinite(factor)
         if not np.any(there):
@@ -61,7 +61,7 @@ class PhaseBranch(Result):
         )
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable
+        """Plot the speeds of loads and rotor over the drag (N s/m, or relative to the scene's if loads differ in it); stable
         solid, unstable dashed.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
@@ -76,7 +76,7 @@ class PhaseBranch(Result):
 
 
 def drag_curve(branch: PhaseBranch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drag factor, load speed and stability to be drawn: the factor is NaN where phases jump to another pattern."""
+    """Return drag factor, load speed and stability for a figure; the factor is NaN if phases jump to another pattern."""
     turned = np.exp(1j * np.diff(np.asarray(branch.phase), axis=0))
     jump = np.append(False, np.max(np.abs(turned - 1.0), axis=1) > _PHASE_JUMP)
     return np.where(jump, np.nan, np.asarray(branch.drag_factor)), np.asarray(branch.omega), np.asarray(branch.stable)

@@ -118,7 +118,7 @@ class PhaseJams(AbstractPhaseJam):
                 branches.append(phase_branch(self.scene, jam, jnp.asarray(speeds)))
                 factor, at, stable = drag_curve(branches[-1])
                 for _, other, _, _ in curves:
-                    # Dashes on other dashes would look like a line that is not broken.
+                    # Dashed lines on top of each other would look like a solid line.
                     factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE_DIFFERENCE * factor), np.nan, factor)
                 curves.append((sentence(jam.pattern), factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
@@ -189,7 +189,7 @@ def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, p
     groups = equal_loads(balance)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(balance.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
-    # A start that was barely solved can give the same jam again, which only the converged jams reveal.
+    # Starts that were solved to a low accuracy can lead to the same jam, which shows only after convergence.
     first = starts_at[np.asarray(places, dtype=int)]
     jams = in_chunks(_JAMS_PER_PROGRAM, lambda w, a: _jams_from(scene, w, a), omega[first], phase[first])
     found = np.flatnonzero(status_names(jams.status) == "found")
@@ -218,7 +218,7 @@ def _distinct(
     starts = np.bincount(which, starts, once.size).astype(int)
     places: list[int] = []
     reached: list[int] = []
-    near = 0  # first of `places` that is slow enough to be the same jam
+    near = 0  # first of `places` whose speed is close enough for the same jam
     for m in np.argsort(-omega[once], kind="stable"):
         k = once[m]
         while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME_SPEED_DIFFERENCE * omega[places[near]]:
@@ -237,12 +237,12 @@ _assembled_balance = cached(assemble_torque_balance)
 
 @cached
 def _jams_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
-    """`jam_from` many speeds and phases."""
+    """Return `jam_from` for many speeds and phases."""
     return eqx.filter_vmap(jam_from, in_axes=(None, 0, 0))(scene, omega, phase)
 
 
 def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
-    """True if the branch has the jam of this growth, or its mirror image, at that place and the scene's own drag."""
+    """Return True if the branch has a jam with this growth, or its mirror image, at that place at the scene's drag."""
     near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
     return near and abs(float(branch.growth[place] - growth)) < 1e-3 * abs(float(growth))
 
@@ -253,10 +253,10 @@ def _selected(jams: PhaseJam, index: Array | np.ndarray) -> PhaseJam:
 
 
 def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
-    """The phase pattern of `jam` followed over load speeds `omega` (n,) rad/s, ascending, below the rotor's.
+    """Follow the phase pattern of `jam` over load speeds `omega` (n,) rad/s, ascending, below the rotor speed.
 
-    The drag is explicit in the load speed, so that there is no turning back at folds: where the drag factor has an extremum
-    over `omega`, two jams of the pattern merge. Where a pattern ends, what comes next may be another one: phases jump there.
+    The drag is explicit in the load speed; therefore folds need no continuation: two jams of the pattern merge at an extremum
+    of the drag factor over `omega`. If a pattern ends, the next phases may belong to another pattern: they jump there.
 
     **Returns** `PhaseBranch`. **Raises** `InputError` for speeds that do not ascend or are not between 0 and the rotor's.
 
@@ -284,7 +284,7 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
 
 @cached
 def _follow_pattern(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Array, ...]:
-    """Phases at load speeds (n,), each computed from the previous ones, or from `phase` where `anew` (n,) is True."""
+    """Return phases at load speeds (n,), each computed from the previous ones, or from `phase` if `anew` (n,) is True."""
     balance = assemble_torque_balance(scene)
 
     def step(last: Array, at: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
@@ -302,7 +302,7 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, anew: Array) -> tu
 
 
 def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:
-    """True if two sets of phases differ only by a common turn and by an exchange of equal loads."""
+    """Return True if two sets of phases differ only by a common turn and by an exchange of equal loads."""
 
     def points(phase: np.ndarray, group: np.ndarray) -> np.ndarray:
         return np.exp(1j * phase[group])
@@ -318,7 +318,7 @@ def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bo
 
 
 def _match(first: np.ndarray, second: np.ndarray) -> bool:
-    """True if two sets of points are the same in some order."""
+    """Return True if two sets of points are the same in some order."""
     left = list(second)
     for point in first:
         near = int(np.argmin([abs(point - other) for other in left]))

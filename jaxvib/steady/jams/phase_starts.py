@@ -40,25 +40,27 @@ _SPEEDS_PER_PROGRAM, _PHASES_PER_PROGRAM = 400, 2048
 """Numbers of load speeds and of sets of phases in one program."""
 
 _PARTS_PER_CUT, _CUT_COUNT = 8, 2
-"""Parts into which an interval of load speeds with a jam is divided, and number of divisions before Newton's method starts."""
+"""Number of parts into which an interval of load speeds with a jam is divided, and number of divisions before Newton's method
+starts."""
 
 
 _STARTS_PER_PROGRAM = 256
 """Number of starts in one program; typical scenes need a few hundred."""
 
 _STARTS_OF_CLUSTERS, _MAX_DIVISIONS = 16, 64
-"""Least number of random sets of phases for a division of equal loads into clusters, and largest number of divisions: more are
-not tried one by one, every load then has a phase of its own."""
+"""Least number of random sets of phases for a division of equal loads into clusters, and largest number of divisions. If there
+are more divisions, they are not searched separately, and every load has an independent phase."""
 
 
 def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Speeds (n,) and phases (n, count) of solved balances, from `number` random sets of phases in all; not all distinct.
+    """Return speeds (n,) and phases (n, count) of solved balances, from `number` random sets of phases in total.
 
         T_j = (w^4/2) S Im(e^{-i a_j} F),      F = sum_k S_k A_jk e^{i a_k} the same for equal loads
 
     Equal loads need the same torque, therefore Im(e^{-i a_j} F) is the same for all of them, and at most two phases a_j are
-    possible. A search with one body for each cluster of loads at one phase, for each division of the equal loads into two
-    clusters, hence misses no jam; the unknowns are two phases for each group of equal loads, however many loads it has.
+    possible. Therefore no jam is missed by a search over all divisions of the equal loads into two clusters, with one body for
+    each cluster. The unknowns are two phases for each group of equal loads, whatever the number of its loads. The results are
+    not all distinct.
     """
     divisions = _divisions(equal_loads(balance))
     each = max(number // len(divisions), min(number, _STARTS_OF_CLUSTERS))
@@ -78,12 +80,12 @@ def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
 
 @cached
 def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple[Array, Array]:
-    """`solve_balance` from many speeds and phases."""
+    """Return `solve_balance` from many speeds and phases."""
     return jax.vmap(lambda w, a: solve_balance(balance, w, a, on_numbers=True))(omega, phase)
 
 
 def equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
-    """Groups of loads that are alike in every number, by their places."""
+    """Return groups of loads with equal numbers, as indices."""
     direction = np.asarray(balance.direction)
     rows = np.concatenate(
         [np.real(direction), np.imag(direction), np.stack([balance.unbalance, balance.drag, balance.averaged.inertia], 1)],
@@ -94,10 +96,11 @@ def equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
 
 
 def _at_resonances(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Starts at every natural frequency below the rotor speed, from each of the `phases`.
+    """Return starts at every natural frequency below the rotor speed, from each of the `phases`.
 
-    Two clusters of one size have a jam exactly where the carrier lags a quarter of a turn, which no grid of load speeds meets.
-    That of two loads alone is left out: it exists at any drag, and the diagram over the drag has no curve for it.
+    Two clusters of one size have a jam at the speed at which the carrier lags by exactly a quarter of a turn, which no grid of
+    load speeds meets. The jam of only two loads is left out: it exists at any drag, and the diagram over the drag has no curve
+    for it.
     """
     frequencies = np.asarray(estimated_frequencies(balance.model.scene))
     inside = frequencies[(frequencies > 0.0) & (frequencies < float(balance.speed))]
@@ -105,7 +108,7 @@ def _at_resonances(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarr
 
 
 def _divisions(groups: list[np.ndarray]) -> list[np.ndarray]:
-    """Numbers of the clusters of all loads, (count,), for each division of every group into two clusters."""
+    """Return the cluster number of each load, (count,), for each division of every group into two clusters."""
     count = sum(group.size for group in groups)
     sizes = [range(1, max(group.size // 2, 1) + 1) for group in groups]
     if np.prod([len(some) for some in sizes]) > _MAX_DIVISIONS:
@@ -121,7 +124,7 @@ def _divisions(groups: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _merged(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalance:
-    """The balance of clusters of equal loads: each is one load with the unbalance and the drag of all its loads."""
+    """Return the balance of clusters of equal loads: each is one load with the unbalance and the drag of all its loads."""
     first, many = np.unique(cluster, return_index=True, return_counts=True)[1:]
     averaged = balance.averaged
     scaled = [on_device(np.asarray(x)[first] * many) for x in (averaged.unbalance, averaged.drag, averaged.inertia)]
@@ -146,7 +149,7 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     if not good.any():
         return speeds[:1], phases[:1]
     row, size, angles = row[good], np.log(factor[good]), angles[good]
-    # Angles in the turn that begins at -1 rad: many phases lie at 0 and pi, far from its ends.
+    # The angles are in the turn that begins at -1 rad, since many phases are at 0 and pi, far from its ends.
     inside = angles[:, 1:] - 2.0 * np.pi * np.floor((angles[:, 1:] + 1.0) / (2.0 * np.pi))
     once = distinct_rows(np.concatenate([row[:, None], np.rint(1e4 * size[:, None]), np.rint(1e3 * inside)], axis=1))[0]
     row, size, angles = row[once], size[once], angles[once]
@@ -159,7 +162,7 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     low, high, held = speeds[row[held[passed]]], speeds[beside[passed]], held[passed]
     at, sign = angles[held], np.sign(size[held])
     for _ in range(_CUT_COUNT if held.size else 0):
-        # All points between at once, which for few jams takes no longer than one of them.
+        # All intermediate points are computed at once, which for few jams takes no longer than one of them.
         share = np.arange(1, _PARTS_PER_CUT) / _PARTS_PER_CUT
         between = low[:, None] + share * (high - low)[:, None]
         each = _data_at_speeds(balance, between.ravel())
@@ -201,7 +204,7 @@ class AtSpeed(eqx.Module):
 
 
 def at_speed(balance: TorqueBalance, omega: Array) -> AtSpeed:
-    """Data of the search at one load speed."""
+    """Return the data of the search at one load speed."""
     influence = influence_of(balance, omega)[0]
     torque = jnp.sum(magnitude(influence) * balance.unbalance[:, None] * balance.unbalance[None, :]) * omega**4
     return AtSpeed(omega, influence, torque / (jnp.min(balance.drag) * jnp.abs(balance.speed - omega)))
@@ -213,13 +216,13 @@ def _data_at_each(balance: TorqueBalance, omega: Array) -> AtSpeed:
 
 
 def _data_at_speeds(balance: TorqueBalance, omega: np.ndarray) -> AtSpeed:
-    """Data of the search at load speeds (n,), padded to whole chunks so that one program serves any number of them."""
+    """Return data of the search at load speeds (n,), padded to whole chunks: one program is valid for any number of them."""
     filled = omega[np.minimum(np.arange(-(-omega.size // _SPEEDS_PER_PROGRAM) * _SPEEDS_PER_PROGRAM), omega.size - 1)]
     return on_device(in_chunks(_SPEEDS_PER_PROGRAM, lambda w: _data_at_each(balance, w), filled))
 
 
 def _follow_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Results of `_solve_phases` with the logarithm of the drag's multiple."""
+    """Return the results of `_solve_phases` with the logarithm of the drag's multiple."""
     factor, angles, good = _solve_phases(balance, at, row, phase)
     return np.log(np.where(good, factor, 1.0)), angles, good
 
@@ -228,15 +231,15 @@ def _solve_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: n
     """Solve for phases from starts (n, count), each at the load speed number `row` (n,), in rounds of Newton steps; each round
     continues with the starts that have not converged.
 
-    **Returns** the drag's multiple (n,), the phases, and True for those that are a jam's.
+    **Returns** the drag's multiple (n,), the phases, and True for the phases of a jam.
     """
     factor, phase, residual = np.zeros(row.size), np.array(phase), np.full(row.size, np.inf)
     eps, left = float(np.finfo(phase.dtype).eps), np.arange(row.size)
     for _ in range(_MAX_ROUNDS):
         found = in_chunks(_PHASES_PER_PROGRAM, _newton_round, row[left], phase[left], shared=(balance, at))
         factor[left], phase[left], residual[left] = found
-        # Convergence to three quarters of the digits: near a double solution, half of the digits leaves phases far from both.
-        # Half of the digits is accepted at the end, since solutions that lie on a curve reach no more.
+        # Three quarters of the digits must have converged: near a double solution, residuals with half of the digits allow
+        # phases far from both. At the end half of the digits is accepted, since solutions on a curve reach no more.
         left = left[~(residual[left] < eps**0.75)]
         if left.size == 0:
             break
@@ -250,7 +253,7 @@ def _newton_round(row: Array, phase: Array, balance: TorqueBalance, at: AtSpeed)
 
 
 def load_speeds(balance: TorqueBalance) -> np.ndarray:
-    """Load speeds below the rotor speed, dense near the carrier's resonances at this rotor speed."""
+    """Return load speeds below the rotor speed, dense near the carrier's resonances at this rotor speed."""
     mass, nd = np.asarray(balance.model.mass), balance.model.mass.shape[0]
     stiffness, damping = np.asarray(balance.model.carrier.stiffness), np.asarray(balance.model.damping(balance.speed))
     flow = np.linalg.solve(mass, np.concatenate([-stiffness, -damping], axis=1))
@@ -265,7 +268,7 @@ def load_speeds(balance: TorqueBalance) -> np.ndarray:
 
 
 def _regular_phases(balance: TorqueBalance) -> np.ndarray:
-    """Regular sets of phases (ns, count): all equal, and every split into two opposite groups."""
+    """Return regular sets of phases (ns, count): all equal, and every division into two opposite groups."""
     n = balance.unbalance.shape[0]
     splits = range(2 ** min(n - 1, 5))
     return np.array([[np.pi * ((k >> j) & 1) if j < min(n - 1, 5) else 0.0 for j in range(n)] for k in splits])

@@ -52,7 +52,7 @@ class PhaseStatus(eqx.Enumeration):
 
 
 def degrees(angle: float) -> float:
-    """Angle in degrees of an angle in rad, rounded for display, so that rounding errors of 0 print as 0.
+    """Return an angle in degrees from one in rad, rounded for display, so that rounding errors of 0 print as 0.
 
     >>> degrees(2.5e-19), degrees(3.141592653589793)
     (0.0, 180.0)
@@ -161,7 +161,7 @@ def assemble_torque_balance(scene: Scene) -> TorqueBalance:
 
 
 def influence_of(balance: TorqueBalance, omega: Array) -> tuple[Array, Array]:
-    """Influence coefficients of the loads.
+    """Return the influence coefficients of the loads.
 
     **Returns** A_jk (count, count), complex: response at load j per centrifugal force of load k; and D^-1 P^T (nd, count):
     response of the carrier.
@@ -172,17 +172,17 @@ def influence_of(balance: TorqueBalance, omega: Array) -> tuple[Array, Array]:
 
 
 def torques_at(balance: TorqueBalance, influence: Array, omega: Array, turn: Array) -> Array:
-    """Torques (count,) N m of `phase_torques` from the influence coefficients (count, count) and exp(i a) (count,)."""
+    """Return torques (count,) N m of `phase_torques` from influence coefficients (count, count) and exp(i a) (count,)."""
     return mean_torque(balance.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, balance.unbalance * turn))
 
 
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
-    """Mean torque (count,) N m of the vibration on each load; they turn at `omega` (scalar, rad/s), at `phase` (count,).
+    """Return the mean torque (count,) N m of the vibration on loads that turn at `omega` (scalar, rad/s), at `phase` (count,).
 
         T_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H L_j D(w)^-1 L_k^T e],     S = m R
         D(w) = K - w^2 (M + sum_j m_j L_j^T L_j) + i w (C + n G)
 
-    L_j (np, nd) is how load j's point moves with the carrier's coordinates: its port, at its station; n the rotor's speed.
+    L_j (np, nd) maps the carrier's coordinates to the displacement of the port at the station of load j; n is the rotor speed.
 
     **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a given speed, and
     effects that this theory leaves out.
@@ -205,13 +205,13 @@ def _phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
 
 
 def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
-    """The jam that Newton's method finds from a speed `omega` (scalar, rad/s) and phases (count,) rad of the loads.
+    """Return the jam that Newton's method finds from a speed `omega` (scalar, rad/s) and phases (count,) rad of the loads.
 
         b_j R_j^2 (n - w) + T_j(w, a) = 0,     j = 1 .. count
 
-    for w and all phases but the first, see `phase_torques`. Stability: growth of small disturbances of the averaged motion,
-    q = Re(z(t) exp(i w t)) with the loads' angles free, an autonomous system of 4 nd + 2 count numbers; no quasi-static step is
-    taken. On supports that are alike both ways nothing is averaged away.
+    is solved for w and all phases but the first, see `phase_torques`. Stability is the growth of small disturbances of the
+    averaged motion, q = Re(z(t) exp(i w t)), with free angles of the loads: an autonomous system of 4 nd + 2 count numbers,
+    without a quasi-static assumption. On supports that are equal in both directions averaging is exact.
 
     **Returns** `PhaseJam`; `vmap` over starts and scenes goes through it, derivatives of all but stability are those of the
     implicit function theorem. An imbalance of the rotor is left out of amplitudes and forces, see `phase_jams`.
@@ -236,7 +236,7 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
 
 def loads_with_drag(scene: Scene) -> CircularLoads:
-    """The loads of a scene. **Raises** `InputError` if one has no drag."""
+    """Return the loads of a scene. **Raises** `InputError` if one has no drag."""
     loads = turning_loads(scene)
     require_drag(loads, each=True)
     return loads
@@ -265,7 +265,7 @@ def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_numb
 
 @cached
 def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
-    """`phase_jam` for validated arguments."""
+    """Return `phase_jam` for validated arguments."""
     balance = assemble_torque_balance(scene)
     frozen = jax.lax.stop_gradient(balance)
     w, angles = solve_balance(balance, omega, phase)
@@ -285,7 +285,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     bounded = jnp.all(magnitude(z) * 100.0 * jnp.finfo(w.dtype).eps < jnp.max(size))
     status = PhaseStatus.where(bounded | ~good, status, PhaseStatus.unbounded)
     there = good & bounded
-    # NaN instead of a speed where there is no jam: eigenvalues take as long as everything else.
+    # Eigenvalues take as long as everything else; if there is no jam, the speed is NaN and they are skipped.
     growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z)))
 
     def kept(value: Array) -> Array:
@@ -308,12 +308,12 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
 
 def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
-    """Growth of small disturbances of jams whose loads are together, every load moving for itself, (n,) 1/s.
+    """Return the growth of small disturbances of jams of coincident loads, (n,) 1/s, with each load free to move separately.
 
-    **Arguments**: `omega` (n,) rad/s of the jams that light coincident loads have.
+    **Arguments**: `omega` (n,) rad/s of the jams of light coincident loads.
 
-    **Returns** the `growth` of `PhaseJam` for each; NaN where there is no such jam nearby, as for `omega` that is NaN, and
-    where loads lie side by side or rub, of which the theory knows nothing.
+    **Returns** the `growth` of `PhaseJam` for each; NaN if there is no such jam nearby, if `omega` is NaN, and if loads lie
+    side by side or have dry friction, which this theory does not include.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
