@@ -52,8 +52,8 @@ class CriticalSpeeds(Result):
     **Attributes**
 
     - `speed` (nd,), rad/s, ascending, inf for an absent one (a thin disc has no second forward one)
-    - `forward` (nd,): True if the whirl goes round with the rotor; only then does an imbalance excite it if supports are alike
-      both ways
+    - `forward` (nd,): True if the whirl turns in the direction of the rotor. On supports that are equal in both directions an
+      imbalance excites forward whirls only
     - `status`: a `WhirlStatus`
     """
 
@@ -69,7 +69,7 @@ class CriticalSpeeds(Result):
         return "\n".join([*lines, *lost]) or "no critical speed"
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """Forward and backward critical speeds, on a line each, in `unit`.
+        """Plot forward and backward critical speeds, on a line each, in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -241,8 +241,8 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
     """Return the synchronous critical speeds: (K - w^2 (M - i G)) X = 0, the whirl turning at the rotor's own speed w.
 
-    The eigenproblem is Hermitian. On supports that are alike both ways, a forward tilt has the inertia A - C, a backward one A
-    + C.
+    The eigenproblem is Hermitian. On supports that are equal in both directions, a forward tilt has the inertia A - C, a
+    backward one A + C.
 
     **Arguments** as `whirl`: `scene`; `loads` "fixed" or "none".
 

@@ -101,17 +101,17 @@ class Criterion(Result):
 
 
 def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = None) -> Array:
-    """Functional of the criterion at speed `omega` (scalar, rad/s): mean of S . r over one turn, kg m^2.
+    """Return the functional of the criterion at speed `omega` (scalar, rad/s): mean of S . r over one turn, kg m^2.
 
         f(S, w) = (S^2 w^2 / 2) Re(e^H A(w) e)
 
     S is the loads' common unbalance and r the displacement of the exciter's axis under it, A the receptance of the
     port and e the direction that turns; for a port of two directions e^H A e is the trace of A, plus what a
-    gyroscopic coupling adds. Where f < 0 the axis moves away from the loads and they spread until they balance; where
-    f > 0 they gather. The paper claims it for two or more loads, and approximately: see `balanced_stability` for the
-    exact answer.
+    gyroscopic coupling adds. If f < 0, the axis moves away from the loads and they spread until they balance; if f > 0,
+    they gather. The paper states this for two or more loads, as an approximation; see `balanced_stability` for the exact
+    result.
 
-    **Arguments**: `unbalance` S kg m; left out, that of all loads at one point.
+    **Arguments**: `unbalance` S kg m; default: that of all loads at one point.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0)
@@ -200,7 +200,7 @@ def criterion_table(result: Criterion) -> dict[str, Any]:
 
     **Returns** a dict: `status` a sentence; `resonances`, `additional` lists of speeds without damping,
     `damped_resonances`, `damped_additional` with; `balancing`, `gathering` lists of [from, to] with damping,
-    `undamped_balancing`, `undamped_gathering` without. `to` is None where the interval has no end. Intervals that
+    `undamped_balancing`, `undamped_gathering` without. `to` is None if the interval has no end. Intervals that
     touch are joined; empty ones are omitted.
 
     >>> import jaxvib as jv

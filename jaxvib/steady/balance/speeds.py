@@ -64,16 +64,16 @@ class CharacteristicSpeeds(Result):
 
     @property
     def status(self) -> CriterionStatus:
-        """A `CriterionStatus`: whether supports hold the machine, and whether the speeds could be computed at all.
+        """Outcome, a `CriterionStatus`: the support of the machine, and the success of the computation.
 
-        Every machine has a first resonance, with damping and without, and finite shapes: other speeds may be missing.
+        Every machine has a first resonance, with damping and without, and finite shapes; other speeds may be absent.
         """
         there = jnp.isfinite(self.resonances[0]) & jnp.isfinite(self.damped_resonances[0]) & jnp.all(jnp.isfinite(self.shapes))
         status = CriterionStatus.where(self.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.judged)
         return CriterionStatus.where(there, status, CriterionStatus.not_finite)
 
     def labelled(self, *, damped: bool = False) -> list[tuple[str, float]]:
-        """All speeds with their labels ("resonance 1", "additional 1", ...), ascending."""
+        """Return all speeds with their labels ("resonance 1", "additional 1", ...), ascending."""
         kinds = ("resonance", "additional")
         speeds = (self.damped_resonances, self.damped_additional) if damped else (self.resonances, self.additional)
         rows = zip(kinds, speeds, strict=True)
@@ -96,7 +96,7 @@ class CharacteristicSpeeds(Result):
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """Resonances and additional speeds, without and with damping, on a line each, in `unit`.
+        """Plot resonances and additional speeds, without and with damping, on a line each, in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -108,7 +108,7 @@ class CharacteristicSpeeds(Result):
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:
-    """Receptance of the exciter's port at speed `omega` (scalar, rad/s), (np, np) complex, m/N.
+    """Return the receptance of the exciter's port at speed `omega` (scalar, rad/s), (np, np) complex, m/N.
 
         A(w) = B [K - w^2 (M + sum m_j B^T B) + i w (C + w G)]^-1 B^T,     displacement = Re(A F exp(i w t))
 
@@ -134,7 +134,7 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 
 
 def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
-    """Resonances and additional speeds of a scene's machine with its loads, without and with damping.
+    """Return resonances and additional speeds of a scene's machine with its loads, without and with damping.
 
     Coincident loads push the port with S w^2 Re(e exp(i w t)), e the direction that turns (one number for a port with
     one direction, (1, -i) for two). The criterion is the mean of force times displacement, with b = B^T e:
@@ -152,8 +152,8 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes judges
     many machines.
 
-    **Raises** `InputError` where no coordinate moves the port, a spring is too stiff beside the others for the
-    precision, a gyroscopic carrier has a motion that no spring holds, or loads have stations of their own.
+    **Raises** `InputError` if no coordinate moves the port, a spring is too stiff for the precision compared with the
+    others, a gyroscopic carrier has a motion without a spring, or loads have different stations.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,

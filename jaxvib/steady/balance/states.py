@@ -282,7 +282,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     **Returns** `BalancedStability`.
 
     **Raises** `InputError` for angles at which the loads do not cancel, for a machine that can drift, for effects that disturb
-    the balanced motion (gravity), for a rotor that turns too slowly beside an undamped carrier, and as `balanced_states`;
+    the balanced motion (gravity), for a rotor that turns too slowly for an undamped carrier, and as `balanced_states`;
     `ComputationError` with its status if nothing cancels.
 
     >>> import jaxvib as jv

@@ -44,7 +44,7 @@ class Folds(eqx.Module):
 
 
 def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
-    """Rotor speed n (rad/s) of a jam of light, coincident loads with load speed `omega` (scalar, rad/s).
+    """Return the rotor speed n (rad/s) of a jam of light, coincident loads with load speed `omega` (scalar, rad/s).
 
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 

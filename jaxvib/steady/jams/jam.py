@@ -283,7 +283,7 @@ def jams_of(scene: Scene) -> JamModes:
 
 
 def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> dict[str, Any]:
-    """Fields of `JamModes` from load speeds, rad/s, existence flags and fold flags."""
+    """Return the fields of `JamModes` from load speeds, rad/s, existence flags and fold flags."""
     n = model.scene.drive.speed
 
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:

@@ -204,7 +204,7 @@ def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, p
 def _distinct(
     omega: np.ndarray, phase: np.ndarray, starts: np.ndarray, groups: list[np.ndarray]
 ) -> tuple[list[int], np.ndarray]:
-    """Indices of distinct jams among n, by falling speed, and the sum of the `starts` (n,) that led to each."""
+    """Return indices of distinct jams among n, by falling speed, and the sum of the `starts` (n,) that led to each."""
     # Most jams occur many times: those in one cell of half the allowed difference are merged first.
     cells = np.concatenate(
         [

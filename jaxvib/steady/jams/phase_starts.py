@@ -177,8 +177,8 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
 
 
 def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the first occurrence of each distinct row of integers (n, m), ascending, and the number of that row for
-    each row (n,).
+    """Return indices of the first occurrence of each distinct row of integers (n, m), ascending, and for each row the number
+    of its distinct row, (n,).
 
     Rows are compared by one hash each, which is much faster; the probability that two of 1e5 rows share a hash is 3e-10.
     """

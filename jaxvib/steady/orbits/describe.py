@@ -140,11 +140,11 @@ class Orbit(Result):
         return "stable" if self.stable else "unstable"
 
     def force_peaks(self) -> Array:
-        """Greatest force on the foundation in each of 16 equal parts of the period, N, (16,); the largest is
+        """Return the greatest foundation force in each of 16 equal parts of the period, N, (16,); the largest is
         `foundation_force`.
 
-        `foundation_force` has a kink where another peak becomes the largest; these do not. For a force that does not change its
-        sign in half a period, or for two directions, `foundation_force` alone, (1,).
+        `foundation_force` has a kink if another peak becomes the largest; these forces do not. For a force that does not change
+        its sign in half a period, or for two directions, the result is `foundation_force` alone, (1,).
         """
         if self.force_harmonics.shape[0] > 1 or any(k % 2 == 0 for k in self.orders):
             return self.foundation_force[None]
