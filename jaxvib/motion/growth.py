@@ -137,8 +137,8 @@ def growth(
     - `until`, s or text: approximate length of all stretches together; each is a whole number of turns of the rotor; typical:
       20 to 200
     - `start`, `mode`, `separation` as `simulate`
-    - `stretches`, at least 8; typical: 40 (the default). They must be so many that motions a rounding apart are not far apart
-      after one
+    - `stretches`, at least 8; typical: 40 (the default). They must be so many that two motions which differ by rounding are
+      still close to each other after one stretch
 
     **Returns** `Growth`. **Raises** `InputError` for a drive whose speed changes; `ComputationError` for a run that fails.
 

@@ -160,10 +160,10 @@ class Run(AbstractMeasured, Result):
 
     @property
     def detached(self) -> Array:
-        """Time at which each load first did not press on a track that only pushes, (loads,) s, among the kept states.
+        """Time at which each load first lost contact with a track that can only push, (loads,) s, among the stored states.
 
-        NaN for a load that pressed throughout, and for loads that are held from both sides. The equations continue as if the
-        load stayed on its track, so the computed motion after this time is not that of a real load.
+        NaN for a load that kept contact throughout, and for loads that are held from both sides. The equations keep the load on
+        its track, so the computed motion after this time is not that of a real load.
         """
         loads = [exciter.loads for exciter in self.scene.exciters if exciter.loads is not None]
         is_pushed = np.repeat([each.one_sided for each in loads], [each.count for each in loads])

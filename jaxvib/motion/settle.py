@@ -77,7 +77,7 @@ def settle(
       amplitudes, force and speed over each quarter of them differ by no more than their scatter explains, or by half the given
       `drift`, and the drift does not fall
     - `creeping`: four loads or more, or three with an imbalance, balance the rotor in a whole family of arrangements
-      (`balanced_states`), and nothing but small disturbances such as gravity moves them along it, for hours. If they balance
+      (`balanced_states`), and only small disturbances such as gravity move them along it, for hours. If they balance
       the rotor, free vibrations of the carrier have decayed, and over four stretches the loads creep evenly while their
       unbalance does not change, the status is `creeping`
 
@@ -85,11 +85,11 @@ def settle(
 
     - `scene` with a drive of constant speed
     - `start`, `mode`: as `simulate`; default: near the jam mode `mode`, at rest without a mode
-    - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam too
-    - `drift`: the change that counts as none, see `Measured`; typical: 1e-3 to 1e-8. If it is given the motion must come to
-      less. The default is 1e-6, in single precision 1e-3, and a motion that is steady in the mean or creeps has settled too.
-      The estimated distance of the motion from its end, from the slowest decay of the carrier or from the fall of the drift,
-      must be below ten times as much: with little damping a motion changes slowly long before it has settled
+    - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, also in a jam
+    - `drift` below which a motion has settled, see `Measured`; typical: 1e-3 to 1e-8. A given drift must be reached. The
+      default is 1e-6, in single precision 1e-3, and a motion that is steady in the mean or creeps has settled too.
+      The distance of the motion from its steady state, estimated from the slowest decay of the carrier or the decrease of the
+      drift, must be below ten times the drift: with little damping a motion changes slowly long before it has settled
     - `periods` of the lowest natural frequency: approximate length of a stretch; typical: 100 (the default)
     - `stretches`: their largest number; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-9)`, in single precision 1e-5

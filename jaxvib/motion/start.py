@@ -42,8 +42,8 @@ Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
 
 START_SEPARATION = math.radians(1.0)
-"""Angle between neighbouring loads at the start, rad, unless they lie side by side: loads at exactly one angle would stay at
-one angle, stable or not."""
+"""Angle between neighbouring loads at the start, rad, if they are not side by side. Loads at exactly one angle would stay at
+one angle, whether or not that is stable."""
 
 Turning = Literal["rolling", "still"]
 """Initial rotation of the loads about themselves: rolling on their track, or none in space."""
@@ -149,7 +149,7 @@ def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | N
 
 @cached
 def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: Array) -> State:
-    """State in the jam of the given row, with the loads at the given angles."""
+    """Return the state in the jam of the given row, with the loads at the given angles."""
     turned = displacement[row] * jnp.exp(1j * jnp.mean(angle))
     return State(turned.real, -omega[row] * turned.imag, (angle,), (jnp.full_like(angle, omega[row]),))
 

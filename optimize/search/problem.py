@@ -77,8 +77,8 @@ class Problem(eqx.Module):
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
     def easy(self) -> Problem | None:
-        """Problem of the first search: to leading order, without tolerances, and without demands that have no leading order.
-        None if it is the same problem, or if the objective has no leading order."""
+        """Return the problem of the first search: to leading order, without tolerances, and without demands that have no
+        leading order. None if it is the same problem, or if the objective has no leading order."""
         objective = self.objective.easy
         demands = [replace(d, quantity=d.quantity.easy, limit=d.limit.easy) for d in self.demands]
         held = tuple(Held(h.quantity.easy, h.value) for h in self.space.held)

@@ -100,7 +100,7 @@ class GradientCheck(Result):
     - `error` (r, n) of each route against the differences, relative
     - `steps` (k,) of the series, and `sweep` (n, k): the central differences at each
     - `tolerance` of the check
-    - `left_out`: numbers so near to a bound that no step can be made
+    - `left_out`: numbers too close to a bound for a step
     """
 
     status: GradientStatus
@@ -177,9 +177,9 @@ def check_gradients(
       differences is the possible error of E, the noise: truncation at large steps, rounding (eps |q|/h at least) and the
       quantity's own tolerance at small ones
     - A derivative differs if its distance from E is more than `tolerance` and three times the noise
-    - If steps of 1e-5 to 1e-7 change the quantity about as much as the largest does, and a derivative claims that the smallest
-      step alone would change it as much, disturbances have grown by more than 1e5 on the way: the status is `chaotic`, whatever
-      the routes agree on. `growth` gives the time after which a run comes to that
+    - The status is `chaotic`, even if the routes agree, if steps of 1e-5 to 1e-7 change the quantity about as much as the
+      largest step does, and by a derivative the smallest step alone would change it as much: disturbances have then grown by
+      more than 1e5. `growth` gives the time after which a run reaches that
 
     **Arguments**
 
@@ -192,7 +192,7 @@ def check_gradients(
     - `routes`: "forward" and "reverse" mode of JAX through the quantity; name those that it has (`simulate` has reverse unless
       it is given `diffrax.ForwardMode()`, and then forward)
     - `implicit`: a third route for a quantity that is computed from the solution of an equation, see `ImplicitRoute`
-    - `tolerance`: relative, of each derivative; of those below a thousandth of the largest (as p dq/dp) relative to that;
+    - `tolerance` of each derivative, relative to it, or to a thousandth of the largest derivative (as p dq/dp) if that is more;
       typical: 1e-4 to 1e-6 (default 1e-5)
 
     **Returns** `GradientCheck`; its `require()` is the assertion. **Raises** `InputError` for a scene in single precision, a

@@ -79,7 +79,7 @@ class Audit(Result):
         return [row.effect for row in self.effects if row.advice == advice]
 
     def summary(self) -> str:
-        """Text with the needed, negligible and missing effects of the scene."""
+        """Return the needed, negligible and missing effects of the scene as text."""
         lines = [f"{self.motion}: {self.kind}; {self.message}"]
         for row in self.effects:
             change = "no change is known" if math.isnan(row.change) else f"changes up to {100.0 * row.change:.3g} %"
@@ -167,7 +167,7 @@ def audit(
     repeated = RepeatedComparison(question, repeats)
     own = repeated.values(scene, repeated.tier(scene))
     until = question.until if isinstance(question, RunComparison) else None
-    # The scale of a machine that hardly moves is the unbalance radius of its loads.
+    # The scale of a machine that almost does not move is the unbalance radius of its loads.
     amplitude = [a * (own.magnified / MIN_AMPLITUDE_SHARE if own.magnified > 1.0 else 1.0) for a in own.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     status = "done"

@@ -42,7 +42,7 @@ class EffectRow(NamedTuple):
     - `name` of the effect, `present`: True if the scene has it (it was removed), False if not (it was added), `tier` of the
       computation
     - changes by the effect, relative to the scene's own value: `amplitude` (of the coordinate that changes most, in units of
-      the largest of its kind, and in a machine that hardly moves of a hundredth of the loads' unbalance radius),
+      the largest of its kind, or of a hundredth of the loads' unbalance radius if the machine almost does not move),
       `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN if unknown
     - `uncertainty` of these changes
     - cost of the effect, with it less without: `operations` of the equations of motion; `seconds` of a run of 100 turns;

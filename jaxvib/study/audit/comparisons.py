@@ -59,7 +59,7 @@ class MotionValues(NamedTuple):
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
     - `uncertainty`: relative uncertainty of these values
     - `closest`: smallest distance of two loads in units of their diameter, NaN for points and for coincident loads
-    - `magnified`: factor on these amplitudes and this force in relative changes, more than 1 if the machine hardly moves, see
+    - `magnified`: factor on these amplitudes and this force in relative changes, above 1 if the machine is almost at rest, see
       `MIN_AMPLITUDE_SHARE`
     """
 

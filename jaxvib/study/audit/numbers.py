@@ -59,7 +59,7 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
 
 
 def gravity_share(radius: float, omega: float, g: float = _G) -> float:
-    """g/(R Omega^2): the share of gravity in the radial load of a load at `radius` R m that turns at `omega` rad/s.
+    """Return g/(R Omega^2): the share of gravity in the radial load of a load at `radius` R m that turns at `omega` rad/s.
 
     >>> round(100.0 * gravity_share(0.08, 169.6), 3)      # per cent, of the published rotor's pendulums in their first jam
     0.426

@@ -141,7 +141,7 @@ def identify(
     - The frequency is free, because a pendulum's size is never known well enough for its phase; the factor g absorbs the
       difference, and J is taken from `pendulum`, so that mu1 is in proportion to it
     - Samples before the release and after the last clear turning point, when the pendulum rests or its swing is below the
-      noise, are left out: the side of the dead zone on which it comes to rest is no smooth function of the friction
+      noise, are left out: the side of the dead zone on which it comes to rest is not a smooth function of the friction
     - `width` is 0.005 of the smallest swing's speed: dry friction on it is 0.001 % too small, on larger ones less
 
     **Arguments**

@@ -64,7 +64,7 @@ class Capture(Result):
     - `speed` (S,), ascending, (psi')/w: -1 for loads at rest in space, 0 for loads that turn with the rotor
     - `captured` (S, starts): True if all loads turned with the rotor at the end
     - `finite` (S, starts): True if the motion stayed finite
-    - `detached` (S, starts): True if a load did not press on its wall at some time, although the equations kept it there
+    - `detached` (S, starts): True if a load lost contact with its wall at some time; the equations keep it on the wall
     - `threshold`: the least speed from which on all starts were captured, halfway to the next lower speed that was tried
     - `uncertainty`: half the distance to that speed or to the highest speed at which half of the starts fail, whichever is
       more, and at least the move; NaN if there is no threshold
@@ -166,7 +166,7 @@ def capture(
     doublings: int = DOUBLINGS,
     equations: Equations = vector_field,
 ) -> Capture:
-    """Find the initial speeds from which the balls of a torus come to turn with the rotor, and the least such speed.
+    """Find the initial speeds from which the balls of a torus reach the speed of the rotor, and the least such speed.
 
     - Each speed is tried from `starts` positions of the loads along the ring, and each run goes to its end: a run without
       progress may still be captured late, so none is cut short
@@ -182,8 +182,8 @@ def capture(
       default)
     - `turns` of the rotor that each run takes; typical: 1000 to 3000 (default 2000). A capture that needs more counts as a
       failure, and the time grows in proportion
-    - `starts` for each speed; typical: 1 (the default) to 32. All but the first are moved along the ring, each load by itself,
-      by up to `spread`
+    - `starts` for each speed; typical: 1 (the default) to 32. In all but the first each load is moved along the ring by a
+      separate angle of up to `spread`
     - `spread`, rad; typical: 1e-3 (the default)
     - `seed` of these moves
     - `resolution` of the threshold, relative to the rotor's speed; typical: 1e-2 to 1e-4. Each refinement takes a run of all
@@ -311,7 +311,7 @@ def _judged(
 
 
 def capture_time(run: Run, within: float = 0.05) -> Array:
-    """Time at which the last load comes to within a share of the rotor speed and stays there, s.
+    """Return the time, s, at which the last load comes to within a share of the rotor speed and stays there.
 
     It is the last time in the run's trajectory at which a load's speed differs from the rotor's by more than `within` times the
     rotor's speed, interpolated linearly between the stored states. It has forward and reverse derivatives. They are valid as

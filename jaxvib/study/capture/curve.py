@@ -66,7 +66,7 @@ class ThresholdCurve(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Thresholds with their uncertainty over the values, and the least captured speeds.
+        """Plot thresholds with their uncertainty over the values, and the least captured speeds.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
