@@ -36,7 +36,7 @@ def test_modes_json_has_the_promised_keys(typed):
 
 def test_modes_writes_table_and_picture(typed, tmp_path):
     code, out, _ = typed("modes", "machine.toml", "--out", "pictures")
-    assert code == 0 and "mode" in out and "by slope: of loads that stay together" in out and "wrote" in out
+    assert code == 0 and "mode" in out and "by slope: for loads that stay together" in out and "wrote" in out
     assert "stable (-" in out and "unstable (" in out
     assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0

@@ -63,7 +63,7 @@ def test_another_process_need_not_trace_an_ensemble(tmp_path):
         jv.ensemble(lambda value: make(value), values(), 5.0, stepsize_controller=jv.EqualSteps(200))
     finally:
         cache.keep_programs(None)
-    assert list(tmp_path.glob("_together-*.program"))
+    assert list(tmp_path.glob("_run_batch-*.program"))
 
 
 def test_nonfinite_run_leaves_the_errors_of_the_others():

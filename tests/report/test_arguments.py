@@ -17,6 +17,7 @@ UNITS = {
         "three_mass": LINKED,
         "network": LINKED,
         "planar_rotor": PLATFORMS,
+        "plane_body": {"mass": "kg", "inertia": "kg m^2"},
         "rotor": PLATFORMS | INERTIA | TERMS | {"position": "m", "stations": "m"},
     },
     "loads": {

@@ -90,7 +90,7 @@ class LoadContact(Effect):
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
     def validate_start(self, loads: Loads, u: Coordinates) -> None:
-        """**Raises** `InputError` if loads cannot start at the coordinates `u`.
+        """**Raises** `InputError` if the `loads` cannot start at the coordinates `u`.
 
         Loads on a circle must be in order within one turn. Other loads must not overlap.
         """

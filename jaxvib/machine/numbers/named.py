@@ -263,7 +263,10 @@ def read_value(name: str, value: Number) -> float:
 
 
 def spec_of(name: str) -> NumberSpec | None:
-    """Return the spec of a number from its name alone: that of the first kind of part with such a field, otherwise None."""
+    """Return the spec of a number from its name alone, None if no kind of part has such a field.
+
+    If several kinds have it, the spec is that of an array, if one of them is.
+    """
     part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
     part = part.removeprefix("exciters.")
     if part.startswith("effects."):
@@ -271,7 +274,8 @@ def spec_of(name: str) -> NumberSpec | None:
         kinds = [known] if known else [kind for kind in _subclasses(Effect) if kind not in EFFECTS.values()]
     else:
         kinds = [kind for name, of in _SECTIONS.items() if name == part for kind in (of, *_subclasses(of))]
-    return next((specs[last] for kind in kinds if last in (specs := number_specs(kind))), None)
+    found = [specs[last] for kind in kinds if last in (specs := number_specs(kind))]
+    return next((spec for spec in found if spec.each), next(iter(found), None))
 
 
 def _subclasses(kind: type) -> list[type]:
