@@ -76,7 +76,7 @@ class Exciter(Part):
             _require_part("loads", loads, Loads, "balls(...)" if unbalance is not None else "balls(...), or give an unbalance")
         if not isinstance(drive, Drive):
             raise InputError("drive", f'is {quoted(drive)}; it must be a Drive, for example ConstantSpeed("1500 rpm")')
-        if isinstance(direction, bool) or direction not in (1, -1):
+        if isinstance(direction, bool) or not isinstance(direction, (int, float, np.number)) or direction not in (1, -1):
             raise InputError("direction", f"is {quoted(direction)}; it must be 1 (anticlockwise) or -1 (clockwise)")
         effects = read_effects(effects)
         for effect in effects:
@@ -247,7 +247,7 @@ class Scene(Part):
 
 def _read_position(at: Any) -> Array:
     """Return a distance along an axis, or a point (x, y), in m."""
-    return numbers(at, "m", "at", 2) if isinstance(at, (list, tuple)) or np.ndim(at) > 0 else number(at, "m", "at")
+    return numbers(at, "m", "at", 2) if isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) > 0 else number(at, "m", "at")
 
 
 def _require_stations(machine: Machine, exciter: Exciter) -> None:

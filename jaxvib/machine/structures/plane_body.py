@@ -113,7 +113,8 @@ class PlaneBody(Machine):
         """Return the rows of the point (x, y) of the body, m from its centre of mass; None is the centre of mass."""
         if place is None:
             return _rows(jnp.zeros(2, self.mass.dtype))
-        if np.shape(place) != (2,):
+        size = len(place) if isinstance(place, (list, tuple)) else getattr(place, "size", 1)
+        if size != 2:
             raise InputError(name, f"is {quoted(place)}; on a body in a plane give (x, y), m from its centre of mass")
         return _rows(jnp.asarray(place, self.mass.dtype))
 
