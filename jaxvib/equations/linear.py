@@ -308,8 +308,8 @@ def peak_force(force: Array) -> Array:
 
 def circular_loads(scene: Scene) -> CircularLoads:
     """Return the loads of a scene, for a formula that holds only for loads on a circle at one point of the machine."""
-    loads = turning_loads(scene)
-    require_one_point(scene)
+    loads, mount = _turning_loads(scene, TURNING_TERMS)
+    _require_one_point(mount)
     return loads
 
 
@@ -318,8 +318,8 @@ def jammed_loads(scene: Scene) -> CircularLoads:
 
     Otherwise the requirements are those of `circular_loads`.
     """
-    loads = turning_loads(scene, JAM_TERMS)
-    require_one_point(scene)
+    loads, mount = _turning_loads(scene, JAM_TERMS)
+    _require_one_point(mount)
     return loads
 
 
@@ -335,7 +335,11 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 def require_one_point(scene: Scene) -> None:
     """**Raises** `InputError` if the loads have different stations along the machine's axis."""
-    if not scene.mounting().at_one_point:
+    _require_one_point(scene.mounting())
+
+
+def _require_one_point(mount: Mount) -> None:
+    if not mount.at_one_point:
         problem = (
             "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
         )
@@ -348,10 +352,16 @@ def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS
     **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`, and names the property; for
     effects with terms that are not `included`, and names these terms.
     """
+    return _turning_loads(scene, included)[0]
+
+
+def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[CircularLoads, Mount]:
+    """Return the loads and the shapes of their mount, see `turning_loads`."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     loads, drive = scene.loads, scene.drive
-    if scene.mounting().turn is not None:
+    mount = scene.mounting()
+    if mount.turn is not None:
         problem = "turns with the housing of its exciter, which this theory leaves out: simulate, settle or ensemble follow it"
         raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
     if not loads.circular:
@@ -363,7 +373,7 @@ def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS
             f"is {quoted(drive.kind)}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
         )
     require_terms(scene.all_effects, included)
-    return cast(CircularLoads, loads)
+    return cast(CircularLoads, loads), mount
 
 
 def require_terms(

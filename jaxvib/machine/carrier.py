@@ -18,7 +18,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import Part
 
-__all__ = ["Carrier", "Machine"]
+__all__ = ["Carrier", "Machine", "shapes_of"]
 
 
 class Carrier(eqx.Module):
@@ -156,14 +156,15 @@ class Machine(Part):
 
     def structure(self) -> Carrier:
         """Return the names, directions and shapes of the carrier, without its numbers."""
-        return _shapes(self)[0]
+        return shapes_of(self)[0]
 
     def mounting(self, at: Place = None) -> Mount:
         """Return the directions and shapes of the mount of an exciter at the place `at`, without its numbers."""
-        return _shapes(self, at)[1]
+        return shapes_of(self, at)[1]
 
 
-def _shapes(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
+def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
+    """Return the names, directions and shapes of the carrier, and of the mount of an exciter at `at`, without numbers."""
     platform, position = (at, None) if isinstance(at, int) else (None, at)
     leaves, rest = jax.tree.flatten((machine, position))
     return _structure(rest, tuple(map(_kind, leaves)), jnp.result_type(float), platform)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted, within
-from jaxvib.machine.carrier import Machine
+from jaxvib.machine.carrier import Machine, shapes_of
 from jaxvib.machine.drive import Clockwise, Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
@@ -201,7 +201,7 @@ class Scene(Part):
 
         **Raises** `InputError` for other scenes, which the theories that read this property do not include.
         """
-        exciter = self._anticlockwise()
+        exciter = _require_anticlockwise(self.exciter)
         if exciter.loads is None or not exciter.is_plain:
             problem = "has an unbalance; this is for loads on a balanced rotor, simulate others"
             raise InputError("scene.exciters[0]", problem)
@@ -210,12 +210,7 @@ class Scene(Part):
     @property
     def drive(self) -> Drive:
         """Drive of a scene with one exciter that turns anticlockwise. **Raises** `InputError` otherwise."""
-        return self._anticlockwise().drive
-
-    def _anticlockwise(self) -> Exciter:
-        if self.exciter.direction != 1:
-            raise InputError("scene.exciters[0].direction", "is -1; this is for anticlockwise rotors, simulate others")
-        return self.exciter
+        return _require_anticlockwise(self.exciter).drive
 
     def mount(self) -> Mount:
         """Return the mount of the only exciter."""
@@ -223,7 +218,7 @@ class Scene(Part):
 
     def mounting(self) -> Mount:
         """Return the directions and shapes of the only exciter's mount, without its numbers."""
-        return self.machine.mounting(self.exciter.at)
+        return shapes_of(self.machine, self.exciter.at)[1]
 
     def replace(self, **parts: Any) -> Scene:
         """Return the scene with other `parts`: its `machine`, or the `loads`, `drive` or `effects` of its only exciter.
@@ -243,6 +238,13 @@ class Scene(Part):
     def place_of(self, k: int) -> str:
         """Return the place of exciter `k` before the names of its parts: "exciters[1]." or, for the only one, ""."""
         return f"exciters[{k}]." if len(self.exciters) > 1 else ""
+
+
+def _require_anticlockwise(exciter: Exciter) -> Exciter:
+    # A method of an Equinox module costs 30 us a call, and each analysis reads this several times.
+    if exciter.direction != 1:
+        raise InputError("scene.exciters[0].direction", "is -1; this is for anticlockwise rotors, simulate others")
+    return exciter
 
 
 def _read_position(at: Any) -> Array:

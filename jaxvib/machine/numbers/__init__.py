@@ -45,8 +45,8 @@ class NumberSpec(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit, or units of the entries, for tables."""
-        return ", ".join(self.units)
+        """Unit, or different units of the entries, for tables."""
+        return ", ".join(dict.fromkeys(self.units))
 
     @property
     def zero_is_absent(self) -> bool:

@@ -175,7 +175,7 @@ def test_numbers_of_supports_and_places_have_names():
         (lambda: jv.plane_body(mass=1.0, inertia=1.0, supports=[]), r"machine.supports is \[\]; it must be a list"),
         (lambda: jv.plane_body(mass=1.0, inertia=0.0, supports=SUPPORTS), "machine.inertia is 0 kg m\\^2; it must be greater"),
         (lambda: jv.plane_body(mass=1.0, inertia=1.0, supports=[3]), r"machine.supports\[0\] is 3; it must be a support"),
-        (lambda: jv.support(at=1.0, stiffness=(1, 1), damping=(0, 0)), "at is 1.0; it must be a list of 2 numbers, in m, m"),
+        (lambda: jv.support(at=1.0, stiffness=(1, 1), damping=(0, 0)), "at is 1.0; it must be a list of 2 numbers, in m"),
         (lambda: jv.support(at=(0, 0), stiffness=(1, -1), damping=(0, 0)), r"stiffness\[1\] is -1 N/m; it must be at least 0"),
         (
             lambda: jv.Scene(SCREEN, exciters=[jv.Exciter(drive=DRIVES[0], unbalance=1.0, at=2)]),
