@@ -20,7 +20,7 @@ from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.scene import Exciter, Scene
-from jaxvib.machine.structures.plane_body import PlaneSupport, plane_body, support
+from jaxvib.machine.structures.plane_body import plane_body, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import TEMPLATES as ROTORS
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
@@ -63,6 +63,9 @@ DRIVES = {
     "induction_motor": InductionMotor,
 }
 SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
+
+_ENTRIES: Mapping[str, Callable[..., Any]] = {"supports": support}
+"""Constructors of the entries of arguments that are lists of parts, by the name of the argument."""
 
 T = TypeVar("T")
 
@@ -289,18 +292,19 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
-    return build(**{name: _built_list(value, prefix + name) if name == "supports" else value for name, value in values.items()})
+    entries = {name: _built_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
+    return build(**{**values, **entries})
 
 
-def _built_list(tables: object, section: str) -> object:
-    """Return the supports of a list of tables. Other values are returned unchanged; the constructor validates them."""
+def _built_entries(build: Callable[..., object], tables: object, section: str) -> object:
+    """Return the parts of a list of tables. Other values are returned unchanged; the constructor validates them."""
     if not isinstance(tables, list) or not all(isinstance(each, Mapping) for each in tables):
         return tables
-    supports = []
+    parts = []
     for k, table in enumerate(tables):
         with within(f"{section}[{k}]."):
-            supports.append(build_part(support, table, ""))
-    return supports
+            parts.append(build_part(build, table, ""))
+    return parts
 
 
 def rebuild_part(part: Any, section: str) -> Any:
@@ -371,7 +375,7 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
         if value is None:  # an option that is not set
             continue
         if isinstance(value, tuple):
-            fields[name] = [_fields(each, support) if isinstance(each, PlaneSupport) else list(each) for each in value]
+            fields[name] = [_fields(each, _ENTRIES[name]) if name in _ENTRIES else list(each) for each in value]
         elif isinstance(value, (int, str)):
             fields[name] = value
         else:
