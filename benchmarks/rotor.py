@@ -18,16 +18,17 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
-import jax
-import jax.numpy as jnp
-import numba
-import numpy as np
-from machines import published_rotor
-
 import jaxvib as jv
 
 jv.prepare_cpu()
+
+import diffrax  # noqa: E402
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numba  # noqa: E402
+import numpy as np  # noqa: E402
+from machines import published_rotor  # noqa: E402
+
 jax.config.update("jax_enable_x64", True)
 
 TABLEAU = diffrax.Dopri8.tableau
