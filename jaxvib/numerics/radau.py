@@ -24,7 +24,7 @@ def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
     """
     ends = np.zeros(stages + 1)
     ends[-2:] = -1.0, 1.0  # P_s - P_(s-1) has the nodes for roots, 1 among them
-    nodes = (1.0 + np.sort(legendre.legroots(ends))) / 2.0
+    nodes = (1.0 + np.sort(legendre.legroots(ends).real)) / 2.0  # complex since NumPy 2.5
     nodes[-1] = 1.0
     values = legendre.legvander(2.0 * nodes - 1.0, stages - 1)
     sums = [legendre.legval(2.0 * nodes - 1.0, legendre.legint(row, lbnd=-1.0)) / 2.0 for row in np.eye(stages)]

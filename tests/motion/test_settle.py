@@ -230,7 +230,7 @@ def test_the_slowest_decay_is_that_of_the_free_carrier():
     mass = 50.0 + 0.5
     np.testing.assert_allclose(_slowest_decay(s), 30.0 / (2.0 * mass), rtol=1e-9)
     heavy = eqx.tree_at(lambda s: s.machine.damping, s, jnp.array([1e5]))
-    np.testing.assert_allclose(_slowest_decay(heavy), min(-np.roots([mass, 1e5, 4e4])), rtol=1e-6)
+    np.testing.assert_allclose(_slowest_decay(heavy), min(-np.roots([mass, 1e5, 4e4]).real), rtol=1e-6)
     two = eqx.tree_at(lambda s: (s.machine.damping, s.machine.link_damping), scene("two_mass"), (jnp.zeros(2), jnp.zeros(1)))
     assert _slowest_decay(two) == 0.0
 

@@ -29,7 +29,7 @@ def test_runs_from_a_jam_last_sixty_lowest_periods(monkeypatch):
     evaluation.jam_run(3)
     evaluation.jam_run(3)
     k, m = np.array([[2.5e5, -2e5], [-2e5, 2.3e5]]), np.diag([120.0, 95.0 + 2.4])
-    lowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(m, k)).min())
+    lowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(m, k)).real.min())
     ((until, more),) = asked
     np.testing.assert_allclose(until, 60.0 * 2.0 * np.pi / lowest, rtol=1e-10)
     assert (more["start"], more["mode"], more["adjoint"]) == ("jam", 3, None)
