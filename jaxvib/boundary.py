@@ -111,7 +111,7 @@ def _require_known(arguments: Mapping[str, Any]) -> None:
     for name, value in arguments.items():
         if any(map(_is_traced, jax.tree.leaves(value))):
             holder = type(value).__name__ if name == "self" else name
-            problem = "has a number that JAX traces, and its value is needed here; call this outside of jit, grad and vmap"
+            problem = "contains a number that JAX traces, but its value is needed here; call this outside of jit, grad and vmap"
             raise InputError(holder, problem)
 
 
@@ -180,7 +180,7 @@ def call_user(function: Callable[..., Any], field: str, *arguments: object) -> A
     try:
         return function(*arguments)
     except _NEEDS_VALUE as error:
-        raise InputError(field, "needs the value of a number that JAX traces; compute with jax.numpy in it") from error
+        raise InputError(field, "needs the value of a number that JAX traces; use functions of jax.numpy in it") from error
     except TypeError as error:
         inside = error.__traceback__ and error.__traceback__.tb_next
         if inside is not None:  # raised inside the function, not by the call itself

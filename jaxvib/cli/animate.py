@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 @app.command("animate")
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option("--until", help="Length of the run if a scene is given, such as 20s.")
-@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Start of that run [rest].")
-@click.option("--mode", type=int, help="Jam mode of a scene; its exact motion is shown without --until.")
-@click.option("--begin", help="First time, such as 4.5s [four vibrations before the end].")
-@click.option("--end", help="Last time [the end].")
-@click.option("--seconds", help="Length of the film, s [10 pictures in a turn of the rotor].")
-@click.option("--fps", type=int, default=20, show_default=True, help="Pictures per second.")
-@click.option("--magnify", type=float, help="Scale of displacements relative to the circle of the loads.")
-@click.option("--width", type=float, default=6.4, show_default=True, help="Width of the picture, in hundreds of dots.")
+@click.option("--until", help="Duration of the simulation, if SOURCE is a scene file, such as 20s.")
+@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state of that simulation [rest].")
+@click.option("--mode", type=int, help="Number of the jam mode; without --until, the film shows its exact motion.")
+@click.option("--begin", help="First time of the film, such as 4.5s [four vibration periods before the end].")
+@click.option("--end", help="Last time of the film [end of the run].")
+@click.option("--seconds", help="Duration of the film, s [10 frames for each turn of the rotor].")
+@click.option("--fps", type=int, default=20, show_default=True, help="Frames per second.")
+@click.option("--magnify", type=float, help="Magnification of displacements, relative to the circle of the loads [automatic].")
+@click.option("--width", type=float, default=6.4, show_default=True, help="Width of the film, in hundreds of pixels.")
 @click.option("--format", "kind", type=click.Choice(["gif", "html", "both"]), default="both", show_default=True)
 @shared
 def animate(
@@ -50,14 +50,16 @@ def animate(
         source = source / "run.npz"
     if source.suffix == ".npz":
         if until is not None or start is not None or mode is not None:
-            raise InputError("--until", "goes, as --start and --mode, with a scene file; a kept run has its own")
+            raise InputError("--until", "and --start and --mode are for a scene file; a saved run already has its own")
         motion, scene = jv.Run.load(source), None
     else:
         loaded = jv.load_scene(source)
         if until is not None:
             motion, scene = jv.simulate(loaded, until, start=start or "rest", mode=mode, estimate=False), None
         elif mode is None:
-            raise InputError("--until", "is missing; say how long to simulate, or by --mode which jam to show")
+            raise InputError(
+                "--until", "is missing; give the duration of the simulation, or --mode with the number of a jam mode"
+            )
         else:
             motion, scene = jv.jam_orbit(loaded, mode=mode), loaded
     film = jv.animate(motion, scene=scene, begin=begin, end=end, seconds=seconds, fps=fps, magnify=magnify, width=width)
@@ -66,7 +68,7 @@ def animate(
             film.save(output.made(f"animation.{suffix}"))
     first, last = film.figure.axes[1].get_xlim()
     document = {"pictures": film.count, "fps": film.fps, "begin": first, "end": last}
-    output.done(document, lambda: f"{film.count} pictures of {first:.6g} to {last:.6g} s", "animate")
+    output.done(document, lambda: f"{film.count} frames from {first:.6g} to {last:.6g} s", "animate")
 
 
 @app.command("sketch")

@@ -39,7 +39,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
         scene = scene.replace(drive=ConstantSpeed(speed))
     elif constant and scene.drive.ideal and not scene.drive.constant:
         end = float(scene.drive.speed)
-        click.echo(f"at a constant speed of {end:.6g} rad/s, at which the drive ({scene.drive.kind}) ends", err=True)
+        click.echo(f"constant speed of {end:.6g} rad/s: the final speed of the drive ({scene.drive.kind})", err=True)
         scene = scene.replace(drive=ConstantSpeed(end))
     there = [effect.kind for effect in scene.all_effects]
     for kind in without:
@@ -58,7 +58,7 @@ SPEED = click.option("--speed", help="Constant rotor speed in place of the scene
 
 
 UNIT = click.option(
-    "--unit", type=click.Choice(["rad/s", "rpm", "Hz"]), default="rpm", show_default=True, help="Of speeds in figures."
+    "--unit", type=click.Choice(["rad/s", "rpm", "Hz"]), default="rpm", show_default=True, help="Unit of speeds in figures."
 )
 """Option of commands that plot speeds."""
 
@@ -85,14 +85,14 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 _GROUPS = {
     "To begin": {"new": "commands", "describe": "describe", "sketch": "animate", "explore": "explore"},
-    "How it can jam": {
+    "Steady states": {
         "modes": "modes",
         "criterion": "criterion",
         "whirl": "whirl",
         "stability-map": "motion.stability",
         "onset": "motion.stability",
     },
-    "How it moves": {
+    "Motion in time": {
         "simulate": "commands",
         "settle": "motion.settle",
         "envelope": "motion.settle",
@@ -101,13 +101,13 @@ _GROUPS = {
         "capture": "study.capture",
         "animate": "animate",
     },
-    "Designs and studies": {
+    "Design and studies": {
         "optimize": "optimize",
         "sweep": "study.sweep",
         "show": "study.sweep",
         "identify": "study.identify",
     },
-    "What an answer is worth": {"cost": "study.cost", "audit": "study.audit"},
+    "Accuracy": {"cost": "study.cost", "audit": "study.audit"},
     "Other tools": {"export": "export"},
 }
 """Commands by purpose, each with the module of `jaxvib.cli` that contains it."""
@@ -118,7 +118,7 @@ _ARGUMENTS = {
     "scene": "a scene file, such as `jaxvib new two-mass > machine.toml` makes",
     "design": "a design file, such as `jaxvib new design > design.toml` makes",
     "study": "a study file, such as `jaxvib new sweep > study.toml` makes",
-    "source": "a scene file, or a run.npz that `jaxvib simulate` kept",
+    "source": "a scene file, or a run.npz that `jaxvib simulate` saved",
 }
 """Descriptions of arguments of commands, for messages about missing ones."""
 
@@ -167,10 +167,12 @@ def app() -> None:
 def shared(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options --json, --out and --report to a command, which gets them as one `Output`."""
 
-    @click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout, nothing else.")
-    @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write pictures and data into this folder.")
+    @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
+    @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write figures and data into this folder.")
     @click.option(
-        "--report", type=click.Path(path_type=Path, dir_okay=False), help="Write one web page with all of it (.html)."
+        "--report",
+        type=click.Path(path_type=Path, dir_okay=False),
+        help="Write a report with inputs, results and figures to this file (.html).",
     )
     @functools.wraps(command)  # also copies the command's own options, which click stores on the function
     def wrapped(as_json: bool, out: Path | None, report: Path | None, **rest: Any) -> None:
@@ -202,7 +204,7 @@ def run(arguments: list[str]) -> int:
         return 1
     except OSError as error:
         name = str(error.filename or "a file")
-        message = f"{name} cannot be written or read ({error.strerror}); name another folder with --out"
+        message = f"{name} cannot be written or read ({error.strerror}); give another folder with --out"
         return _failed(wants_json, 2, {"kind": "input", "field": name, "message": message})
     except click.UsageError as error:
         field = error.ctx.command.name if error.ctx else "jaxvib"

@@ -44,7 +44,7 @@ def new(kind: str, output: Output) -> None:
         output.done({"kind": kind, "toml": text}, lambda: text.rstrip(), "new")
         return
     if path.exists():
-        raise InputError("--out", f"has a file {path.name} already, which is left as it is; name another folder")
+        raise InputError("--out", f"already contains {path.name}, which is not overwritten; give another folder")
     path.write_text(text, encoding="utf-8")
     output.done({"kind": kind, "toml": text}, lambda: f"a commented file for {kind}", "new")
 
@@ -57,11 +57,11 @@ def new(kind: str, output: Output) -> None:
 )
 @click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
 @SEPARATION
-@click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
-@click.option("--tolerance", type=float, help="Error a step may make [1e-8].")
-@click.option("--accuracy", type=float, help="Error the result may have, in place of a tolerance.")
-@click.option("--max-steps", type=int, help="Fail after so many steps.")
-@click.option("--window", is_flag=True, help="Keep no trajectory, only what is measured over the last turns.")
+@click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
+@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-8].")
+@click.option("--accuracy", type=float, help="Allowed error of the final state, in place of a tolerance.")
+@click.option("--max-steps", type=int, help="Largest number of time steps.")
+@click.option("--window", is_flag=True, help="Save no trajectory, only the measurements over the last turns.")
 @CSV
 @UNIT
 @shared
@@ -84,7 +84,7 @@ def simulate(
     from jaxvib.ode.progress import ProgressBar  # slow import, which --help does not need
 
     if csv is not None and window:
-        raise InputError("--csv", "needs a trajectory, which --window does not keep; leave one of them out")
+        raise InputError("--csv", "needs a trajectory, which --window does not save; leave one of them out")
     loaded = jv.load_scene(scene)
     run = jv.simulate(
         loaded,

@@ -12,7 +12,7 @@ __all__ = ["SEPARATION", "chosen_steps", "measured_document", "run_document"]
 
 SEPARATION = click.option(
     "--separation",
-    help="Angle between neighbouring loads at the start, e.g. '3 deg'; 0: one angle [side by side, or 1 deg].",
+    help="Initial angle between neighbouring loads, such as '3 deg'; 0 for equal angles [loads in contact, or 1 deg].",
 )
 
 

@@ -13,8 +13,8 @@ from jaxvib.cli.app import app
 
 @app.command("explore")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--port", type=click.IntRange(1, 65535), default=2718, show_default=True, help="Of this computer.")
-@click.option("--no-browser", is_flag=True, help="Open no browser; only say where the page is.")
+@click.option("--port", type=click.IntRange(1, 65535), default=2718, show_default=True, help="Network port of this computer.")
+@click.option("--no-browser", is_flag=True, help="Do not open a browser; only print the address of the page.")
 def explore(scene: Path, port: int, no_browser: bool) -> None:
     """Open a local page with sliders for SCENE; the diagrams follow the sliders, and the machine can be saved as TOML.
 
@@ -29,4 +29,4 @@ def explore(scene: Path, port: int, no_browser: bool) -> None:
     click.echo("compiling ...")
     prepare(loaded)
     threading.Thread(target=prepare_counts, args=(loaded,), daemon=True).start()
-    serve(scene, port, not no_browser, lambda address: click.echo(f"the page is at {address}; Ctrl-C ends it"))
+    serve(scene, port, not no_browser, lambda address: click.echo(f"the page is at {address}; press Ctrl-C to stop"))

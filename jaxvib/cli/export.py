@@ -17,23 +17,27 @@ _ONLY = {"fmi": "fmu", "drive": "fmu", "source_only": "fmu", "mode": "state-spac
 
 @app.command("export")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--to", type=click.Choice(_KINDS), required=True, help="Kind of file.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="The file that is written.")
+@click.option("--to", type=click.Choice(_KINDS), required=True, help="Format of the file.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="Path of the file to write.")
 @click.option("--fmi", type=click.Choice(["2.0", "3.0"]), help="Version of an FMU [2.0].")
-@click.option("--drive", type=click.Choice(["scene", "input"]), help="What turns the rotor of an FMU [the drive of SCENE].")
+@click.option("--drive", type=click.Choice(["scene", "input"]), help="Drive of the rotor in an FMU [the drive of SCENE].")
 @click.option("--source-only", is_flag=True, default=None, help="Do not compile an FMU.")
-@click.option("--mode", type=int, help="Jam mode whose state space is written [the machine at rest].")
+@click.option("--mode", type=int, help="Jam mode about which the state space is linearized [the machine at rest].")
 @click.option(
-    "--quantity", type=click.Choice(["displacement", "velocity", "acceleration"]), help="Responses in UFF [displacement]."
+    "--quantity",
+    type=click.Choice(["displacement", "velocity", "acceleration"]),
+    help="Quantity of the frequency responses in UFF [displacement].",
 )
-@click.option("--rotor-speed", help="Rotor speed of a machine at rest, such as '3000 rpm' [the drive's].")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout, nothing else.")
+@click.option(
+    "--rotor-speed", help="Rotor speed for the linear machine, without a jam, such as '3000 rpm' [speed of the drive]."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
 def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) -> None:
     """Write SCENE for other tools: an FMU, a state-space model (MAT) or a universal file (UFF)."""
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():
         if to not in ([_ONLY[name]] if _ONLY[name] else ["state-space", "uff"]):
-            raise InputError(f"--{name.replace('_', '-')}", f"is {value}, which does not go with --to {to}; leave it out")
+            raise InputError(f"--{name.replace('_', '-')}", f"is {value}, which is not an option of --to {to}; leave it out")
     loaded, output = loaded_scene(scene), Output(as_json, None, scene=scene)
     if to == "fmu":
         source_only = bool(given.pop("source_only", False))

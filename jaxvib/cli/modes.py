@@ -23,8 +23,10 @@ _RPM = 30.0 / math.pi
 @click.argument("scene", type=click.Path(path_type=Path))
 @SPEED
 @UNIT
-@click.option("--exact", is_flag=True, help="Exact periodic motions of the full equations, instead of jams of light loads.")
-@click.option("--phases", is_flag=True, help="Jams of light loads at any phases (always for a rotor without --exact).")
+@click.option("--exact", is_flag=True, help="Compute exact periodic motions of the full equations in place of light-load jams.")
+@click.option(
+    "--phases", is_flag=True, help="Compute light-load jams with unequal phases (default for a rotor without --exact)."
+)
 @WITHOUT
 @CSV
 @shared
@@ -51,13 +53,17 @@ def modes(
 
     loaded = loaded_scene(scene, without, speed)
     if exact and phases:
-        raise InputError("--phases", "was given with --exact; jams at unequal phases are computed for light loads only")
+        raise InputError(
+            "--phases", "cannot be combined with --exact; jams with unequal phases are computed for light loads only"
+        )
     if exact:
         _exact(loaded, unit, csv, output)
         return
     if phases or loaded.mounting().axes != (1,):
         if csv is not None:
-            raise InputError("--csv", "writes branches over the load speed; jams at any phases have none, see --json")
+            raise InputError(
+                "--csv", "writes branches over the load speed, which jams with unequal phases do not have; use --json"
+            )
         _phases(loaded, unit, output)
         return
     found = jax.device_get(jv.jam_modes(loaded))  # NumPy arrays, because indexing JAX arrays would compile programs
@@ -109,13 +115,13 @@ def modes(
         ]
         lines = [
             f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
-            table("jam modes of light loads; amplitudes zero to peak, foundation force in N", head, rows)
+            table("jam modes (light loads); amplitudes are zero to peak, the foundation force is in N", head, rows)
             if rows
-            else "no jam mode here",
+            else "no jam mode at this speed",
         ]
         if rows:
             lines.append(
-                "by slope: for loads that stay together; loads free: for loads that can separate (growth of a disturbance, 1/s)"
+                "by slope: loads that stay together; loads free: loads that can separate (growth rate of a disturbance, 1/s)"
             )
         if folds:
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
@@ -174,11 +180,11 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
         ]
         speed = float(scene.drive.speed)
         head = ["rad/s", "rpm", "", "loads stand", "at, degrees", "foundation force, N"]
-        title = f"jams of light loads at any phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
+        title = f"light-load jams with unequal phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
         if not rows:
             return f"no jam at {speed:.5g} rad/s"
         kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({sentence(jam.pattern)})" for jam in jams if jam.stable)
-        conclusion = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
+        conclusion = f"loads can stay jammed at {kept}" if kept else "none of them is stable: light loads cannot stay jammed"
         return "\n".join([table(title, head, rows), conclusion, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
@@ -198,7 +204,7 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
     document = {
         "rotor_speed": scene.drive.speed,
         "resonances": light.resonances,
-        "judged": "by the multipliers of the full equations",
+        "judged": "by Floquet multipliers of the full equations",
         "modes": [
             {
                 "mode": k,
@@ -229,11 +235,11 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
         points = [[p.kind.replace("_", " "), f"{p.omega:.6g}", f"{p.rotor_speed:.6g}"] for p in diagram.special]
         lines = [
             f"rotor {float(scene.drive.speed):.5g} rad/s ({_RPM * float(scene.drive.speed):.5g} rpm)",
-            table("exact jams; amplitudes and force zero to peak", head, rows),
+            table("exact jams; amplitudes and force are zero to peak", head, rows),
             *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in known),
         ]
         if points:
-            lines.append(table("where stability changes", ["", "loads, rad/s", "rotor, rad/s"], points))
+            lines.append(table("points where stability changes", ["", "loads, rad/s", "rotor, rad/s"], points))
         return "\n".join(lines)
 
     output.done(document, text, "modes", diagram)

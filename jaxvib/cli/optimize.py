@@ -20,9 +20,11 @@ if TYPE_CHECKING:
 @click.argument("design", type=click.Path(path_type=Path))
 @click.option("--starts", type=int, help="Number of random starts [as in DESIGN].")
 @click.option("--seed", type=int, help="Seed of the random starts [as in DESIGN].")
-@click.option("--searcher", type=click.Choice(["gradients", "cma"]), help="Adam from many starts, or CMA-ES [as in DESIGN].")
+@click.option(
+    "--searcher", type=click.Choice(["gradients", "cma"]), help="Method: Adam from many starts, or CMA-ES [as in DESIGN]."
+)
 @click.option("--resume", type=click.Path(path_type=Path), help="search.npz of an earlier search of this design to continue.")
-@click.option("--no-verify", is_flag=True, help="Skip the verification by exact motion and time integration.")
+@click.option("--no-verify", is_flag=True, help="Skip the verification by an exact periodic motion and time integration.")
 @shared
 def optimize(
     design: Path,
@@ -93,7 +95,7 @@ def _text(best: Synthesis) -> str:
     heads = ["", "before", "after", "exact", "verified"]
     columns = [k for k in range(len(heads)) if k < 3 or any(row[k] for row in rows)]
     drawn = table(objective_text(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
-    checked = "verified: measured on the full equations, integrated until they settled"
+    checked = "verified on the full equations, integrated until the motion settled"
     if best.verified is None:
         checked = f"not verified: {best.unverified}"
     return "\n".join([f"{best.message}\n{counted}", drawn, *(line.strip() for line in best.findings()), checked])

@@ -45,7 +45,7 @@ class Output:
         self.figures: list[tuple[str, Figure]] = []
         if report is not None:
             if report.suffix.lower() not in (".html", ".htm"):
-                raise InputError("--report", f"is {quoted(str(report))}; a report is a web page, name it .html")
+                raise InputError("--report", f"is {quoted(str(report))}; give a file name that ends in .html")
             self._make(report.parent, "--report")
         if folder is not None:
             self._make(folder, "--out")
@@ -56,7 +56,7 @@ class Output:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(option, f"is {quoted(str(folder))}, which cannot be made a folder ({error.strerror})") from error
+            raise InputError(option, f"is {quoted(str(folder))}, which cannot be created ({error.strerror})") from error
 
     def file(self, name: str) -> Path | None:
         """Return the path of a result file; None without --out."""

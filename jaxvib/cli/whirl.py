@@ -22,7 +22,7 @@ _RPM = 30.0 / math.pi
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--speed", help="Rotor speed, such as '3000 rpm' [the drive's].")
 @click.option(
-    "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Whether the loads' masses count."
+    "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Include the masses of the loads."
 )
 @UNIT
 @CSV
@@ -61,7 +61,7 @@ def whirl(
         moving = [[sense[w["forward"]], f"{w['speed']:.6g}", f"{_RPM * w['speed']:.5g}", f"{w['decay']:.4g}"] for w in whirls]
         return "\n".join(
             [
-                table("critical speeds: the whirl turns with the rotor", ["", "rad/s", "rpm"], rows),
+                table("critical speeds: whirl speed = rotor speed", ["", "rad/s", "rpm"], rows),
                 table(f"whirl at {rotor_speed:.5g} rad/s", ["", "rad/s", "rpm", "decay, 1/s"], moving),
             ]
         )

@@ -36,7 +36,7 @@ def test_modes_json_has_the_promised_keys(typed):
 
 def test_modes_writes_table_and_picture(typed, tmp_path):
     code, out, _ = typed("modes", "machine.toml", "--out", "pictures")
-    assert code == 0 and "mode" in out and "by slope: for loads that stay together" in out and "wrote" in out
+    assert code == 0 and "mode" in out and "by slope: loads that stay together" in out and "wrote" in out
     assert "stable (-" in out and "unstable (" in out
     assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
@@ -266,7 +266,7 @@ def test_refusal_of_an_effect_names_the_option_that_removes_it(typed, tmp_path):
         (["modes", "--exact"], "--without static_imbalance"),
         (
             ["settle", "--drift", "-1"],
-            "at a constant speed of 460 rad/s, at which the drive (run_up) ends\njaxvib: drift is -1",
+            "constant speed of 460 rad/s: the final speed of the drive (run_up)\njaxvib: drift is -1",
         ),
         (["growth", "--until", "2s", "--speed", "0"], "drive.speed is 0 rad/s; it must be greater than 0"),
     ):
@@ -285,7 +285,7 @@ def test_failure_with_json_is_one_document(typed):
 def test_new_never_overwrites(typed):
     assert typed("new", "two-mass", "--out", "here")[0] == 0
     code, _, err = typed("new", "two-mass", "--out", "here")
-    assert code == 2 and "left as it is" in err
+    assert code == 2 and "not overwritten" in err
 
 
 def test_installed_command_prints_json_alone(tmp_path):
@@ -318,8 +318,8 @@ def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
     ("words", "says"),
     [
         (["animate", ".", "--out", "a"], "there is no such file"),
-        (["animate", "machine.toml", "--out", "a"], "--until is missing; say how long to simulate, or by --mode"),
-        (["animate", "run.npz", "--mode", "3", "--out", "a"], "--until goes, as --start and --mode, with a scene file"),
+        (["animate", "machine.toml", "--out", "a"], "--until is missing; give the duration of the simulation, or --mode"),
+        (["animate", "run.npz", "--mode", "3", "--out", "a"], "--until and --start and --mode are for a scene file"),
         (["animate", "missing.npz", "--out", "a"], "there is no such file"),
     ],
 )

@@ -33,7 +33,7 @@ def test_a_run_as_csv_is_its_trajectory(typed, tmp_path, monkeypatch):
     np.testing.assert_allclose(numbers[:, 0], kept.trajectory.time, rtol=1e-8)
     np.testing.assert_allclose(numbers[:, head.index("angle 2 (rad)")], kept.trajectory.state.angle[0][:, 1], rtol=1e-8)
     code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "run.csv", "--window")
-    assert code == 2 and "--csv needs a trajectory, which --window does not keep" in err
+    assert code == 2 and "--csv needs a trajectory, which --window does not save" in err
     code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "none/run.csv")
     assert code == 2 and "none/run.csv" in err and "cannot be written" in err
     with pytest.raises(jv.InputError, match=r"axis is 'point'; the axes of Run are: .*time"):

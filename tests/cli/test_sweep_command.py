@@ -75,7 +75,7 @@ def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
 
     monkeypatch.setattr(command._Lines, "__call__", stop_once)
     code, _, err = typed("sweep", "study.toml")
-    assert code == 1 and "finished cases are kept in study.zarr; run the same command again to continue" in err
+    assert code == 1 and "finished cases are saved in study.zarr; run the same command again to continue" in err
     code, out, _ = typed("show", "study.zarr")
     assert code == 0 and "not every case was computed yet" in out and "6 missing" in out
     assert "6 of them in this call" in typed("sweep", "study.toml")[1]
@@ -111,6 +111,6 @@ def test_what_is_wrong_is_said(typed, tmp_path, old, new, words, says):
 def test_a_store_that_is_there_is_not_begun_anew(typed):
     assert typed("sweep", "study.toml")[0] == 0
     code, _, err = typed("sweep", "study.toml", "--no-resume")
-    assert code == 2 and "is there already; name another one with --store" in err
+    assert code == 2 and "exists already; give another folder with --store" in err
     code, _, err = typed("show", "machine.toml")
     assert code == 2 and "no store of a sweep" in err

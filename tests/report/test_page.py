@@ -124,4 +124,4 @@ def test_wrong_input(tmp_path, capsys):
     assert "--report is" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
     assert run(["describe", "--report", str(tmp_path / "file" / "r.html")]) == 2
-    assert "cannot be made a folder" in capsys.readouterr().err
+    assert "cannot be created" in capsys.readouterr().err

@@ -13,13 +13,13 @@ from jaxvib.cli.document import SEPARATION
 
 @app.command("run-ups")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--until", required=True, help="End time of each, such as 6s.")
-@click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [the scene's].")
-@click.option("--starts", type=int, help="So many random sets of angles [one, loads beside each other at the bottom].")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the random angles.")
+@click.option("--until", required=True, help="End time of each run-up, such as 6s.")
+@click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [value of SCENE].")
+@click.option("--starts", type=int, help="Number of random sets of initial angles [1: loads next to each other at the bottom].")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random angles.")
 @SEPARATION
-@click.option("--tolerance", type=float, help="Error a step may make [1e-7].")
-@click.option("--batch", type=int, default=16, show_default=True, help="So many go side by side.")
+@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-7].")
+@click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups computed in parallel.")
 @shared
 def run_ups(
     scene: Path,
@@ -56,6 +56,6 @@ def run_ups(
 
     def text() -> str:
         shares = [[f"{row['drag']:.5g}", *(f"{100.0 * row['shares'][kind]:.3g} %" for kind in kinds)] for row in rows]
-        return "\n".join([table("where loads end", ["drag, N s/m", *kinds], shares), found.summary()])
+        return "\n".join([table("final motion of the loads", ["drag, N s/m", *kinds], shares), found.summary()])
 
     output.done({"until": until, "starts": len(found.angle), "seed": seed, "run_ups": rows}, text, "run_ups", found)

@@ -27,9 +27,9 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 @_START
 @_MODE
 @SEPARATION
-@click.option("--drift", type=float, help="Relative change that counts as none [1e-6, or steady in the mean].")
-@click.option("--tolerance", type=float, help="Error a step may make [1e-9].")
-@click.option("--stretches", type=int, default=200, show_default=True, help="Give up after so many stretches.")
+@click.option("--drift", type=float, help="Largest relative change of a settled motion [1e-6, or steady in the mean].")
+@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-9].")
+@click.option("--stretches", type=int, default=200, show_default=True, help="Largest number of stretches.")
 @SPEED
 @shared
 def settle(
@@ -63,8 +63,8 @@ def settle(
 @_START
 @_MODE
 @SEPARATION
-@click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
-@click.option("--tolerance", type=float, help="Error a step may make [1e-4].")
+@click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
+@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-4].")
 @WITHOUT
 @CSV
 @shared
@@ -94,12 +94,12 @@ def envelope(
 
 @app.command("growth")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--until", required=True, help="How long all stretches are together, such as 60s.")
+@click.option("--until", required=True, help="Duration of the whole run, such as 60s.")
 @_START
 @_MODE
 @SEPARATION
 @SPEED
-@click.option("--stretches", type=int, default=40, show_default=True, help="Into how many stretches it is cut, 8 at least.")
+@click.option("--stretches", type=int, default=40, show_default=True, help="Number of stretches of the run, at least 8.")
 @shared
 def growth(
     scene: Path,
@@ -114,9 +114,7 @@ def growth(
     """Measure the growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and the time after which
     derivatives fail."""
     if start == "spin_up":
-        raise InputError(
-            "--start", "is 'spin_up'; the growth of disturbances needs a constant speed, start from rest or in a jam"
-        )
+        raise InputError("--start", "is 'spin_up'; the growth of disturbances needs a constant speed, use 'rest' or 'jam'")
     begin = ("rest" if mode is None else "jam") if start is None else start
     loaded = loaded_scene(scene, speed=speed, constant=True)
     found = jv.growth(loaded, until, start=begin, mode=mode, separation=separation, stretches=stretches)

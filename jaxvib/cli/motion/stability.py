@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
 
 _VARY = click.option(
-    "--vary", required=True, metavar="NAME", help="A number of the scene, such as loads.mass or machine.stiffness[0]."
+    "--vary", required=True, metavar="NAME", help="Name of a number of the scene, such as loads.mass or machine.stiffness[0]."
 )
 _OMEGA = click.option(
     "--omega", nargs=2, required=True, metavar="FROM TO", help="Range of load speeds, such as '20 rad/s' '60 rad/s'."
@@ -28,7 +28,7 @@ _POINTS_OPTION = click.option("--points", type=int, default=300, show_default=Tr
 @app.command("stability-map")
 @click.argument("scene", type=click.Path(path_type=Path))
 @_VARY
-@click.option("--value", "values", multiple=True, required=True, help="Of that number, with its unit, repeatable.")
+@click.option("--value", "values", multiple=True, required=True, help="Value of that number with its unit, repeatable.")
 @_OMEGA
 @_POINTS_OPTION
 @WITHOUT
@@ -70,11 +70,13 @@ def _special(points: list[dict]) -> str:
 @app.command("onset")
 @click.argument("scene", type=click.Path(path_type=Path))
 @_VARY
-@click.option("--kind", required=True, help="What begins: fold, torus, symmetry or another kind of special point.")
-@click.option("--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without it and one with it.")
+@click.option("--kind", required=True, help="Kind of special point that appears: fold, torus, symmetry or another one.")
+@click.option(
+    "--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without the special point and one with it."
+)
 @_OMEGA
 @_POINTS_OPTION
-@click.option("--accuracy", type=float, default=1e-3, show_default=True, help="Of the value, relative.")
+@click.option("--accuracy", type=float, default=1e-3, show_default=True, help="Relative accuracy of the value.")
 @WITHOUT
 @shared
 def onset(

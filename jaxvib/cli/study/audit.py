@@ -20,16 +20,21 @@ if TYPE_CHECKING:
 @app.command("audit")
 @click.argument("scene", type=click.Path(path_type=Path), required=False)
 @click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
-@click.option("--mode", type=int, help="Number of the jam mode [the last stable one below the rotor speed].")
-@click.option("--until", help="End of a run, such as 20s, without a jam [100 slow periods after the run-up].")
-@click.option("--start", type=click.Choice(["rest", "turning"]), help="Start of a run, in place of a jam.")
-@click.option("--add-missing/--no-add-missing", default=True, show_default=True, help="Add each effect that the scene lacks.")
-@click.option("--tiers/--no-tiers", default=True, show_default=True, help="Compute every tier.")
+@click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
+@click.option("--until", help="Duration of the run when no jam is given, such as 20s [100 slow periods after the run-up].")
+@click.option("--start", type=click.Choice(["rest", "turning"]), help="Initial state of a run, in place of a jam.")
 @click.option(
-    "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Number of timings; the fastest counts."
+    "--add-missing/--no-add-missing", default=True, show_default=True, help="Also add each effect that the scene does not have."
+)
+@click.option("--tiers/--no-tiers", default=True, show_default=True, help="Compare all tiers.")
+@click.option(
+    "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Number of timings; the fastest is reported."
 )
 @click.option(
-    "--operations", "count_operations", is_flag=True, help="In place of SCENE: operations of effects, drives and coordinates."
+    "--operations",
+    "count_operations",
+    is_flag=True,
+    help="Without SCENE: count the operations of effects, drives and coordinates.",
 )
 @WITHOUT
 @shared
@@ -55,7 +60,7 @@ def audit(
         from jaxvib.study.audit.operation_counts import operation_counts  # slow import, which --help does not need
 
         if scene is not None:
-            raise InputError("--operations", "was given with a scene; leave one of them out")
+            raise InputError("--operations", "cannot be combined with a scene; leave one of them out")
         rows = operation_counts()
         output.done({"operations": rows}, lambda: _operations_table(rows), "operations")
         return
@@ -101,7 +106,7 @@ def audit_text(found: jv.Audit) -> str:
         numbers = [[n.name, f"{n.value:.3g}", f"{n.limit:.3g}", n.advice] for n in found.numbers]
         lines.append(
             table(
-                "effects that are not in the scene, judged by dimensionless numbers",
+                "effects that are not in the scene, estimated by dimensionless numbers",
                 ["number", "value", "limit", "advice"],
                 numbers,
             )
@@ -129,5 +134,5 @@ def _seconds(value: float) -> str:
 
 def _operations_table(rows: list[OperationCount]) -> str:
     cells = [[f"{row.part}: {row.kind}", f"{row.operations}", f"{row.added:+d}", row.beside] for row in rows]
-    title = "operations of the traced equations of motion; an operation on a vector of any length counts once"
+    title = "operations of the traced equations of motion; an operation on a vector counts once"
     return table(title, ["part", "operations", "added", "compared with"], cells)

@@ -20,18 +20,26 @@ if TYPE_CHECKING:
 
 @app.command("capture")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--from", "low", type=float, default=-1.0, show_default=True, help="Least initial speed, relative to the rotor.")
-@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Greatest initial speed.")
-@click.option("--speeds", type=click.IntRange(min=2), default=32, show_default=True, help="How many speeds are tried.")
-@click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Perturbed starts at each speed.")
-@click.option("--turns", type=click.IntRange(min=1), default=2000, show_default=True, help="Turns of the rotor in each run.")
-@click.option("--resolution", type=float, help="Look for the threshold as finely as this.")
+@click.option("--from", "low", type=float, default=-1.0, show_default=True, help="Lowest initial speed, relative to the rotor.")
+@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Highest initial speed, relative to the rotor.")
+@click.option("--speeds", type=click.IntRange(min=2), default=32, show_default=True, help="Number of initial speeds.")
+@click.option(
+    "--starts",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Number of perturbed initial states at each speed.",
+)
+@click.option(
+    "--turns", type=click.IntRange(min=1), default=2000, show_default=True, help="Duration of each run, in turns of the rotor."
+)
+@click.option("--resolution", type=float, help="Resolution of the threshold.")
 @click.option(
     "--turning",
     type=click.Choice(["rolling", "still"]),
     default="rolling",
     show_default=True,
-    help="How balls start: rolling, or thrown without turning, so that they slide first (effect sliding).",
+    help="Initial rotation of the balls: rolling, or still, so that they slide at first (needs the effect sliding).",
 )
 @shared
 def capture(
@@ -49,7 +57,7 @@ def capture(
     import numpy as np  # slow import, which --help does not need
 
     if not -1.0 <= low < high <= 0.0:
-        raise jv.InputError("--from", f"is {low:g} with --to {high:g}; speeds go up from -1 at least to 0 at most")
+        raise jv.InputError("--from", f"is {low:g} with --to {high:g}; the speeds must ascend and lie between -1 and 0")
     loaded = jv.load_scene(scene)
     found = jv.capture(
         loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, turning=turning
@@ -77,7 +85,7 @@ def capture(
             [f"{v:.5f}", f"{f:.3f}", f"{e:.3f}"]
             for v, f, e in zip(found.speed, found.fraction, found.standard_error, strict=True)
         ]
-        head = ["initial speed, in the rotor's", "share captured", "standard error"]
+        head = ["initial speed / rotor speed", "share captured", "standard error"]
         return table("starts captured", head, rows) + "\n" + found.summary()
 
     document = {**found.as_dict(), **fields_of(found, "fraction", "standard_error")}

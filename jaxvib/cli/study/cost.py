@@ -22,15 +22,20 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
 
 @app.command("cost")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="What is computed.")
-@click.option("--mode", type=int, help="Number of the jam mode [the last stable one below the rotor speed].")
 @click.option(
-    "--until", help="End of the time integration, such as 20s [20 slow periods; for a jam until it forgets its start]."
+    "--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="Quantity that is computed."
+)
+@click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
+@click.option(
+    "--until",
+    help="Duration of the time integration, such as 20s [20 slow periods; for a jam until its transient has decayed].",
 )
 @click.option(
     "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration, repeatable [all]."
 )
-@click.option("--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Timings; the fastest counts.")
+@click.option(
+    "--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Number of timings; the fastest is reported."
+)
 @SPEED
 @shared
 def cost(
@@ -78,5 +83,5 @@ def cost_table(cost: Cost) -> str:
 
 def _named(row: CostRow | None) -> list[str]:
     if row is None:
-        return ["none of these, or below the error of the reference", ""]
+        return ["none of these methods, or below the error of the reference", ""]
     return [", ".join(part for part in (row.tier, row.method, row.dtype, row.setting) if part), f"{row.seconds:.2e}"]

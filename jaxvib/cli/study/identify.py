@@ -25,8 +25,8 @@ _NAMED = (
     ("bearing", "pendulum", "Diameter of the bearing, for --dry, such as '20 mm'."),
     ("g", "pendulum", "Gravity [9.81 m/s^2]."),
     ("angle-unit", "record", "Unit of the angle, such as deg [as in the header]."),
-    ("from", "record", "First time of the record that is used."),
-    ("until", "record", "Last time of the record that is used."),
+    ("from", "record", "Start of the part of the record to use."),
+    ("until", "record", "End of the part of the record to use."),
     ("instrument", "identify", "Relative uncertainty of the moment of inertia, such as 0.03, for the intervals."),
 )
 
@@ -92,7 +92,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
         rows.append(_row("frequency of small swings, rad/s", found.frequency))
         rows.append(_row("zero of the record, rad", found.offset))
         holds = found.status_name in ("found", "undetermined")
-        meaning = "an interval holds the number with 95 %" if holds else "intervals count noise alone"
+        meaning = "intervals are for a confidence of 95 %" if holds else "intervals include noise only"
         lines = [
             f"{swing.name}: {swing.samples} samples, noise {found.noise:.3g} rad",
             f"{found.status_name}: {found.message}",

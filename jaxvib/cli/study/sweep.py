@@ -22,11 +22,13 @@ _QUIET = 10.0
 
 @app.command("sweep")
 @click.argument("study", type=click.Path(path_type=Path))
-@click.option("--store", type=click.Path(path_type=Path), help="The folder to write to [STUDY with the ending .zarr].")
-@click.option("--resume/--no-resume", default=True, show_default=True, help="Go on with a store that is there already.")
-@click.option("--workers", type=click.IntRange(min=1), help="So many processes on this machine, by Dask.")
-@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://10.0.0.1:8786.")
-@click.option("--timeout", default="30 s", show_default=True, help="How long the scheduler and its workers have to answer.")
+@click.option("--store", type=click.Path(path_type=Path), help="Folder to write [name of STUDY with the ending .zarr].")
+@click.option("--resume/--no-resume", default=True, show_default=True, help="Continue a store that exists already.")
+@click.option("--workers", type=click.IntRange(min=1), help="Number of processes on this machine (Dask).")
+@click.option("--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786.")
+@click.option(
+    "--timeout", default="30 s", show_default=True, help="Time limit for the answer of the scheduler and its workers."
+)
 @shared
 def sweep(
     study: Path, store: Path | None, resume: bool, workers: int | None, scheduler: str | None, timeout: str, output: Output
@@ -40,14 +42,14 @@ def sweep(
 
     path = store or study.with_suffix(".zarr")
     if not resume and path.exists():
-        raise InputError("--no-resume", f"is given, and {quoted(str(path))} is there already; name another one with --store")
+        raise InputError("--no-resume", f"is given, but {quoted(str(path))} exists already; give another folder with --store")
     definition = load_study(study)
     show = _Lines()
     try:
         found = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
     except KeyboardInterrupt:
         show.end()
-        click.echo(f"stopped: finished cases are kept in {path}; run the same command again to continue", err=True)
+        click.echo(f"stopped: finished cases are saved in {path}; run the same command again to continue", err=True)
         raise
     show.end()
     _tell(found, output, "sweep")
@@ -55,8 +57,8 @@ def sweep(
 
 @app.command("show")
 @click.argument("store", type=click.Path(path_type=Path))
-@click.option("--measure", help="What is shown, by its name in STORE [regimes where they were measured, else the first].")
-@click.option("--over", nargs=2, metavar="X Y", help="The axes of the map.")
+@click.option("--measure", help="Name of the array to show [the regime if it was measured, otherwise the first array].")
+@click.option("--over", nargs=2, metavar="X Y", help="Names of the two axes of the map.")
 @click.option("--theory/--no-theory", default=True, show_default=True, help="Draw folds and torus points of exact jams.")
 @shared
 def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory: bool, output: Output) -> None:
