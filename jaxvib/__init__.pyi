@@ -39,6 +39,10 @@ from jaxvib.equations.forces import energy, foundation_force, normal_force, powe
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.motion.start import initial_state, with_spin
 
+# Motion of points
+from jaxvib.motion.analysis.points import PointMotion
+from jaxvib.steady.points import Deck, Ellipse, ellipse_of
+
 # Jams of light loads
 from jaxvib.steady.branches import Branches, branches
 from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
@@ -180,6 +184,11 @@ __all__ = [
     "power",
     "foundation_force",
     "normal_force",
+    # Motion of points
+    "ellipse_of",
+    "Ellipse",
+    "Deck",
+    "PointMotion",
     # Jams of light loads
     "jam_modes",
     "JamModes",

@@ -146,6 +146,19 @@ class Machine(Part):
             raise InputError(name, problem)
         return self.mount().rows[0]
 
+    @property
+    def body_count(self) -> int:
+        """Number of bodies on which a point is given by (x, y)."""
+        return 1
+
+    def require_body(self, body: int) -> int:
+        """Return the number `body` of a body, from 0. **Raises** `InputError` for a body that the machine does not have."""
+        if isinstance(body, bool) or not isinstance(body, (int, np.integer)) or not 0 <= body < self.body_count:
+            last = self.body_count - 1
+            allowed = f"bodies 0 to {last}" if last else "one body, number 0"
+            raise InputError("body", f"is {quoted(body)}; the machine has {allowed}")
+        return int(body)
+
     def shaft_supports(self) -> list[tuple[float, float, float]] | None:
         """Return the supports along a rotor's axis, for a drawing; None if the matrices contain everything for a drawing.
 

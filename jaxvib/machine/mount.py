@@ -3,17 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-__all__ = ["Mount", "Place", "scaled"]
+from jaxvib.units import Number, count, number, numbers
 
-Place = int | float | Sequence[float] | Array | None
+__all__ = ["BodyPoint", "Mount", "Place", "on_body", "read_place", "scaled"]
+
+
+class BodyPoint(eqx.Module):
+    """Point (x, y) of one of several bodies, m from its centre of mass (None: that centre); `body` is its number from 0."""
+
+    at: Array | None
+    body: int = eqx.field(static=True)
+
+
+Place = int | float | Sequence[float] | Array | BodyPoint | None
 """Place on a machine: the number of a platform, the distance along a rotor's axis from its mass centre, m, or the point (x, y)
 of a body in a plane, m; None is the default place of the machine."""
+
+
+def read_place(at: int | Number | Sequence[Number] | None, name: str) -> int | Array | None:
+    """Return a place from a user's argument `name`: the number of a platform, or a distance or a point in m.
+
+    **Raises** `InputError` for values that are no number, no list of two numbers, or not in m.
+
+    >>> read_place(["100 mm", 0.2], "at").tolist()
+    [0.1, 0.2]
+    """
+    if at is None:
+        return None
+    if isinstance(at, (int, np.integer)):
+        return count(at, name)
+    if isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) > 0:
+        return numbers(at, "m", name, 2)
+    distance: Any = at
+    return number(distance, "m", name)
+
+
+def on_body(at: int | Array | None, body: int) -> Place:
+    """Return the place `at` on the body with this number."""
+    return at if body == 0 or isinstance(at, int) else BodyPoint(at, body)
 
 
 class Mount(eqx.Module):

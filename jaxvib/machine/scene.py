@@ -17,9 +17,9 @@ from jaxvib.machine.drive import Clockwise, Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
 from jaxvib.machine.loads import Loads
-from jaxvib.machine.mount import Mount, Place
+from jaxvib.machine.mount import Mount, read_place
 from jaxvib.machine.numbers import Part, read_numbers, unit
-from jaxvib.units import Number, count, number, numbers
+from jaxvib.units import Number
 from jaxvib.units.known import when_known
 
 __all__ = ["Exciter", "Scene", "read_effects", "require_comparable"]
@@ -86,9 +86,8 @@ class Exciter(Part):
         self.loads, self.drive, self.effects, self.direction = loads, drive, effects, int(direction)
         self.unbalance = None if unbalance is None else read_numbers(Exciter, "", unbalance=unbalance)["unbalance"]
         self.carries = ("loads",) * (loads is not None) + ("unbalance",) * (unbalance is not None)
-        is_platform = isinstance(at, (int, np.integer))
-        self.platform = count(at, "at") if is_platform else None
-        self.position = None if at is None or is_platform else _read_position(at)
+        place = read_place(at, "at")
+        self.platform, self.position = (place, None) if isinstance(place, int) else (None, place)
 
     @property
     def is_plain(self) -> bool:
@@ -101,8 +100,8 @@ class Exciter(Part):
         return self.drive if self.direction == 1 else Clockwise(self.drive)
 
     @property
-    def at(self) -> Place:
-        """Place on the machine: a platform number, or a distance along the axis of a rotor, m; None for the default."""
+    def at(self) -> int | Array | None:
+        """Place on the machine: a platform number, a distance along a rotor's axis or a point, m; None for the default."""
         return self.position if self.platform is None else self.platform
 
 
@@ -245,11 +244,6 @@ def _require_anticlockwise(exciter: Exciter) -> Exciter:
     if exciter.direction != 1:
         raise InputError("scene.exciters[0].direction", "is -1; this is for anticlockwise rotors, simulate others")
     return exciter
-
-
-def _read_position(at: Any) -> Array:
-    """Return a distance along an axis, or a point (x, y), in m."""
-    return numbers(at, "m", "at", 2) if isinstance(at, (list, tuple)) or getattr(at, "ndim", 0) > 0 else number(at, "m", "at")
 
 
 def _require_stations(machine: Machine, exciter: Exciter) -> None:

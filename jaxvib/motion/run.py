@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
@@ -16,9 +17,11 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.forces import normal_force
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.mount import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory
+from jaxvib.motion.analysis.points import PointMotion, fit_harmonic, motion_of_point
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.separation import would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
@@ -27,6 +30,9 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import REFUSED
+from jaxvib.steady.points import Harmonic, PointAnswers
+from jaxvib.units import Number
+from jaxvib.units.known import when_known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,9 +72,14 @@ ENDS = ("done", "beating", "creeping", "would_separate")
 SETTLED_DRIFT = 1e-3
 """Drift below which a motion repeats itself."""
 
+_MIN_TURNS = 3
+"""Smallest number of turns of the exciters to which a harmonic is fitted."""
 
-class Run(AbstractMeasured, Result):
+
+class Run(AbstractMeasured, PointAnswers, Result):
     """Run of a scene: the quantities measured over its last turns (see `AbstractMeasured`), and the motion itself.
+
+    `ellipse` and `deck` describe the motion of points by the harmonic of `omega` that fits the window by least squares.
 
     Returned by `simulate` and `settle`.
 
@@ -211,6 +222,31 @@ class Run(AbstractMeasured, Result):
         return spectrum_of(self.scene, self.window, self.trajectory, parts)
 
     @validated
+    def point(
+        self, at: int | Number | Sequence[Number] | None = None, body: int = 0, *, part: Literal["window", "all"] = "window"
+    ) -> PointMotion:
+        """Return the motion of a point, see `PointMotion`.
+
+        **Arguments**: `at` and `body` as in `ellipse`; typical: (1.2, 0.3); `part`: "window", the end of the run, or "all".
+
+        **Returns** `PointMotion`. **Raises** `InputError` for a place that the machine does not have, and for "all" if the run
+        kept its window only.
+        """
+        kept = self.window if part == "window" else self.trajectory
+        if kept is None:
+            raise InputError("part", "is 'all', but the run kept its window only; simulate with save='all'")
+        return motion_of_point(self.scene.machine, kept, on_body(read_place(at, "at"), self.scene.machine.require_body(body)))
+
+    def harmonic(self) -> Harmonic:
+        """Return the harmonic of `omega` that fits the window by least squares, see `fit_harmonic`.
+
+        **Raises** `InputError` if the exciters make less than 3 turns in the window.
+        """
+        when_known(_require_turns, self.window.time, self.omega)
+        amplitude, rest = fit_harmonic(self.window.time, self.window.state.displacement, self.omega)
+        return Harmonic(self.scene.machine, self.omega, amplitude, rest)
+
+    @validated
     def plot_path(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the path of a rotor's axis across and up over the last three periods, mm; at every station if the rotor tilts.
 
@@ -233,6 +269,12 @@ class Run(AbstractMeasured, Result):
             named = {f"axis at {1e3 * s:+.4g} mm": machine.rows_at(jnp.asarray(s)) for s in stations}
         paths = {name: tuple((moved @ np.asarray(rows).T).T) for name, rows in named.items()}
         return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)
+
+
+def _require_turns(time: np.ndarray, speed: float) -> None:
+    turns = abs(speed) * (time[-1] - time[0]) / (2.0 * np.pi)
+    if not turns >= _MIN_TURNS:
+        raise InputError("run", f"has {turns:.2g} turns in its window; an ellipse needs {_MIN_TURNS}, simulate with more turns")
 
 
 def judged_by_separation(run: Run) -> Run:

@@ -1,0 +1,44 @@
+"""Ellipses of the points of a deck at their places."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from jaxvib.draw.style import COLORS, GUIDE, Drawn, panels
+
+__all__ = ["deck_chart", "ellipses"]
+
+
+def ellipses(points: np.ndarray, amplitude: np.ndarray, magnify: float) -> list[np.ndarray]:
+    """Return the path (97, 2) of each point (n, 2) with its complex amplitudes (n, 2), magnified; the first is at phase 0.
+
+    >>> ellipses(np.array([[1.0, 0.0]]), np.array([[0.01, -0.01j]]), 10.0)[0][0].tolist()
+    [1.1, 0.0]
+    """
+    phase = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 97))
+    return [at + magnify * np.real(phase[:, None] * each) for at, each in zip(points, amplitude, strict=True)]
+
+
+def magnification(points: np.ndarray, amplitude: np.ndarray) -> float:
+    """Return the magnification, of one digit, at which neighbouring ellipses do not overlap."""
+    size = max(float(np.max(np.abs(amplitude))), 1e-300)
+    away = np.linalg.norm(points[:, None] - points[None], axis=2)
+    nearest = float(np.min(away[away > 0.0], initial=np.inf))
+    return float(f"{0.4 * (nearest if np.isfinite(nearest) else 1.0) / size:.1g}")
+
+
+def deck_chart(points: np.ndarray, amplitude: np.ndarray, *, ax: Axes | None = None) -> Drawn:
+    """Draw the paths of points (n, 2) of a deck with complex amplitudes (n, 2), m, with a dot at a common time."""
+    figure, (axis,) = panels(1, size=(7.0, 3.2), ax=ax)
+    magnify = magnification(points, amplitude)
+    for k, path in enumerate(ellipses(points, amplitude, magnify)):
+        axis.plot(*path.T, color=COLORS[k % len(COLORS)], lw=1.4)
+        axis.plot(*path[0], "o", color=COLORS[k % len(COLORS)], ms=4)
+    axis.plot(*points.T, "+", color=GUIDE, ms=6)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x, m")
+    axis.set_ylabel("y, m")
+    note = f"amplitudes drawn {magnify:g} x as large"
+    axis.set_title(note, loc="left", fontsize="small")
+    return figure if ax is None else ax

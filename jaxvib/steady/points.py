@@ -1,0 +1,270 @@
+"""Motion of points of a machine: ellipses, throw, and their spread over a deck.
+
+A point moves by u = B q, where B are its rows (`Machine.rows_at`). If all coordinates vibrate at one speed,
+q = Re(Y e^{i w t}), the point moves on the ellipse with the complex amplitudes U = B Y.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.mount import Place, on_body, read_place
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.results.fields import in_unit, is_single, part
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
+from jaxvib.runtime.programs import cached
+from jaxvib.units import Number, known_number, numbers
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxvib.draw.style import Drawn
+
+__all__ = ["Deck", "Ellipse", "Harmonic", "PointAnswers", "ellipse_of", "rows_in_plane"]
+
+STANDARD_GRAVITY = 9.80665
+"""Acceleration 1 g, m/s^2."""
+
+_CIRCLE = 1e-12
+"""Smallest share of the semi-axes by which they differ, if the long axis has a direction."""
+
+
+class Ellipse(eqx.Module):
+    """Path of a point that vibrates at one speed.
+
+    **Attributes**
+
+    - `semi_major` a, m; typical: 1 to 10 mm for screens and feeders
+    - `semi_minor` b, m, positive if the point turns anticlockwise, negative if it turns clockwise, 0 on a straight line
+    - `direction` of the long axis, rad from x anticlockwise, above -pi/2 and at most pi/2; the throw angle of a point that
+      moves on a straight line. It is 0 for a circle, which has no long axis
+    - `acceleration`, in g: w^2 a / g, with g = 9.80665 m/s^2; typical: 3 to 6
+    - `throw_number`: the amplitude of the acceleration perpendicular to the deck, divided by that part of g; typical: 2 to 5
+    - `remainder`: root-mean-square displacement that is not on the ellipse, relative to that on it; 0 for averaged motions
+
+    >>> import jax.numpy as jnp
+    >>> path = ellipse_of(jnp.array([0.003 + 0.0j, 0.003 + 0.0j]), 100.0)        # 3 mm in x and in y, in phase
+    >>> round(1e3 * float(path.semi_major), 3), round(float(jnp.rad2deg(path.direction)), 3), float(path.sense)
+    (4.243, 45.0, 0.0)
+    """
+
+    semi_major: Array = eqx.field(metadata=in_unit("m"))
+    semi_minor: Array = eqx.field(metadata=in_unit("m"))
+    direction: Array = eqx.field(metadata=in_unit("rad"))
+    acceleration: Array = eqx.field(metadata=in_unit(""))
+    throw_number: Array = eqx.field(metadata=in_unit(""))
+    remainder: Array = eqx.field(metadata=in_unit(""))
+
+    @property
+    def is_circle(self) -> Array:
+        """True if the semi-axes are equal to rounding; `direction` is then 0 and has no meaning."""
+        return self.semi_major - jnp.abs(self.semi_minor) <= _CIRCLE * self.semi_major
+
+    @property
+    def sense(self) -> Array:
+        """Sense of rotation: 1 anticlockwise, -1 clockwise, 0 on a straight line (to rounding)."""
+        return jnp.where(jnp.abs(self.semi_minor) > _CIRCLE * self.semi_major, jnp.sign(self.semi_minor), 0.0)
+
+    def summary(self) -> str:
+        """Return the ellipse as a line of text."""
+        turn = {1: ", anticlockwise", -1: ", clockwise", 0: ""}[int(self.sense)]
+        axes = f"semi-axes {1e3 * float(self.semi_major):.4g} and {1e3 * abs(float(self.semi_minor)):.4g} mm{turn}"
+        along = "a circle" if bool(self.is_circle) else f"long axis at {np.rad2deg(float(self.direction)):.4g} deg"
+        numbers = f"{float(self.acceleration):.4g} g, throw number {float(self.throw_number):.4g}"
+        rest = f", remainder {float(self.remainder):.2g}" if float(self.remainder) > 0.0 else ""
+        return f"{axes}, {along}, {numbers}{rest}"
+
+    def __repr__(self) -> str:
+        return self.summary() if is_single(self) else super().__repr__()
+
+
+def ellipse_of(
+    amplitude: Array, speed: Array | float, *, slope: Array | float = 0.0, remainder: Array | float = 0.0
+) -> Ellipse:
+    """Return the ellipse of u = Re(U e^{i w t}).
+
+        x + i y = P e^{i w t} + N e^{-i w t},    P = (U_x + i U_y)/2,    N = conj(U_x - i U_y)/2
+        a = |P| + |N|,    b = |P| - |N|,    direction = arg(P N)/2
+
+    **Arguments**
+
+    - `amplitude` U (2,), m, complex
+    - `speed` w, rad/s; typical: 75 to 160
+    - `slope` of the deck, rad from x anticlockwise; typical: 0 to -0.4
+    - `remainder` of the motion, see `Ellipse`
+
+    **Returns** `Ellipse`. Derivatives are finite everywhere. At a circle, where the derivative of |P| or |N| does not exist, it
+    is 0.
+
+    >>> import jax.numpy as jnp
+    >>> print(ellipse_of(jnp.array([0.005, -0.005j]), 100.0).summary())
+    semi-axes 5 and 5 mm, anticlockwise, a circle, 5.099 g, throw number 5.099
+    """
+    x, y = amplitude[0], amplitude[1]
+    forward, backward = (x + 1j * y) / 2.0, jnp.conj(x - 1j * y) / 2.0
+    one, other = magnitude(forward), magnitude(backward)
+    is_circle = 2.0 * jnp.minimum(one, other) <= _CIRCLE * (one + other)
+    product = jnp.where(is_circle, 1.0, forward * backward)
+    normal = magnitude(-jnp.sin(slope) * x + jnp.cos(slope) * y)
+    factor = speed**2 / STANDARD_GRAVITY
+    return Ellipse(
+        semi_major=one + other,
+        semi_minor=one - other,
+        direction=0.5 * jnp.arctan2(product.imag, product.real),
+        acceleration=factor * (one + other),
+        throw_number=factor * normal / jnp.cos(slope),
+        remainder=jnp.asarray(remainder, one.dtype),
+    )
+
+
+class Deck(Result):
+    """Motion of several points of a body, such as those of a screening deck.
+
+    Returned by `Run.deck`, and by the same method of steady motions.
+
+    **Attributes** (n points)
+
+    - `points` (n, 2), m, of the body
+    - `amplitude` U (n, 2), m: complex amplitudes across and up
+    - `ellipses`: an `Ellipse` whose arrays are (n,)
+    - `straightness`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points move alike; typical:
+      0.01 to 0.3
+    """
+
+    status = Computed.done
+
+    points: Array = eqx.field(metadata=in_unit("m", "point", "direction"))
+    amplitude: Array = eqx.field(metadata=in_unit("m", "point", "direction"))
+    ellipses: Ellipse = eqx.field(metadata=part("point"))
+    straightness: Array = eqx.field(metadata=in_unit(""))
+
+    @property
+    def amplitude_spread(self) -> Array:
+        """Range of the semi-major axes divided by their mean."""
+        size = self.ellipses.semi_major
+        return (jnp.max(size) - jnp.min(size)) / jnp.mean(size)
+
+    @property
+    def direction_spread(self) -> Array:
+        """Range of the directions of the long axes about their mean direction, rad; a direction and its opposite are one."""
+        turn = jnp.exp(2j * self.ellipses.direction)
+        away = 0.5 * jnp.angle(turn / jnp.mean(turn))
+        return jnp.max(away) - jnp.min(away)
+
+    def summary(self) -> str:
+        """Return a line for each point, and the spread."""
+        each = [
+            f"({float(x):.4g}, {float(y):.4g}) m: {jax.tree.map(lambda leaf, k=k: leaf[k], self.ellipses).summary()}"
+            for k, (x, y) in enumerate(np.asarray(self.points))
+        ]
+        spread = (
+            f"spread over the deck: amplitude {100.0 * float(self.amplitude_spread):.3g} %, "
+            f"direction {np.rad2deg(float(self.direction_spread)):.3g} deg, straightness {float(self.straightness):.3g}"
+        )
+        return "\n".join([*each, spread])
+
+    @validated
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """Plot the ellipses at their points, magnified; a dot marks the phase at one common time.
+
+        **Arguments**: `ax`: axes to draw onto. **Returns** a matplotlib figure, or the given `ax`.
+        """
+        from jaxvib.draw.machine.deck import deck_chart  # slow import
+
+        return deck_chart(np.asarray(self.points), np.asarray(self.amplitude), ax=ax)
+
+
+class Harmonic(NamedTuple):
+    """Vibration of all coordinates at one speed, q = Re(Y e^{i w t}).
+
+    **Attributes**
+
+    - `machine` that moves
+    - `speed` w, rad/s
+    - `amplitude` Y (nd,), complex
+    - `rest` (nd, nd): mean of r r^T, where r is the motion about its mean that is not in the harmonic; None if there is none
+    """
+
+    machine: Machine
+    speed: Array
+    amplitude: Array
+    rest: Array | None = None
+
+
+class PointAnswers(eqx.Module):
+    """Base of results whose motion at the points of a machine is known."""
+
+    @abc.abstractmethod
+    def harmonic(self) -> Harmonic:
+        """Return the vibration of the coordinates at the speed of the exciters."""
+
+    @validated
+    def ellipse(self, at: int | Number | Sequence[Number] | None = None, body: int = 0, *, slope: Number = 0.0) -> Ellipse:
+        """Return the path of a point, see `Ellipse`.
+
+        **Arguments**
+
+        - `at`: the place on the machine, see `Exciter`: (x, y) of a body, m, the number of a platform, or a distance along a
+          rotor's axis, m; default: the centre of mass
+        - `body`: number of the body from 0, on machines with several; typical: 0 (the default)
+        - `slope` of the deck, rad or text from x anticlockwise, for the throw number; typical: "-15 deg" to 0 (the default)
+
+        **Returns** `Ellipse`. **Raises** `InputError` for a place that the machine does not have.
+        """
+        motion = self.harmonic()
+        place = on_body(read_place(at, "at"), motion.machine.require_body(body))
+        return _ellipse(motion, place, known_number(slope, "rad", "slope"))
+
+    @validated
+    def deck(self, points: Sequence[Sequence[Number]], body: int = 0, *, slope: Number = 0.0) -> Deck:
+        """Return the paths of several points of a body and their spread, see `Deck`.
+
+        **Arguments**: `points`: a list of (x, y), m; `body` and `slope` as in `ellipse`; typical: 3 to 10 points.
+
+        **Returns** `Deck`. **Raises** `InputError` for points that the machine does not have.
+        """
+        if not (isinstance(points, (list, tuple)) or getattr(points, "ndim", 0) == 2) or len(points) == 0:
+            raise InputError("points", f"is {quoted(points)}; it must be a list of points, [(x, y), ...]")
+        places = jnp.stack([numbers(point, "m", f"points[{k}]", 2) for k, point in enumerate(points)])
+        motion = self.harmonic()
+        return _deck(motion, places, known_number(slope, "rad", "slope"), motion.machine.require_body(body))
+
+
+def rows_in_plane(machine: Machine, place: Place, name: str = "at") -> Array:
+    """Return the rows (2, nd) of a point, across and up. A machine that moves up only has zeros across."""
+    rows = machine.rows_at(place, name)
+    return rows if rows.shape[0] == 2 else jnp.concatenate([jnp.zeros_like(rows), rows])
+
+
+@cached
+def _ellipse(motion: Harmonic, place: Place, slope: Array) -> Ellipse:
+    return _at_rows(motion, rows_in_plane(motion.machine, place), slope)[1]
+
+
+@cached
+def _deck(motion: Harmonic, points: Array, slope: Array, body: int) -> Deck:
+    rows = jnp.stack([rows_in_plane(motion.machine, on_body(point, body), "points") for point in points])
+    amplitude, ellipses = jax.vmap(lambda each: _at_rows(motion, each, slope))(rows)
+    mean = jnp.mean(amplitude, axis=0, keepdims=True)
+    away = jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1)
+    return Deck(points, amplitude, ellipses, jnp.sqrt(jnp.mean(away) / jnp.sum(jnp.abs(mean) ** 2)))
+
+
+def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellipse]:
+    """Return the complex amplitudes (2,) and the ellipse of the point with these rows."""
+    amplitude = rows @ motion.amplitude
+    on = 0.5 * jnp.sum(jnp.abs(amplitude) ** 2)
+    off = jnp.zeros_like(on) if motion.rest is None else jnp.sum((rows @ motion.rest) * rows)
+    return amplitude, ellipse_of(amplitude, motion.speed, slope=slope, remainder=jnp.sqrt(off / on))

@@ -1,0 +1,185 @@
+"""Ellipses of points: closed forms, circles, lines, decks, and the harmonic of a run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.motion.analysis.points import fit_harmonic
+from jaxvib.steady.points import Harmonic, PointAnswers
+
+SPEED, G = 90.0, 9.80665
+
+
+def turned(a, b, angle, phase, sense):
+    """Complex amplitudes of an ellipse with known axes: written as a rotation of (a cos, sense b sin)."""
+    c, s = np.cos(angle), np.sin(angle)
+    own = np.exp(1j * phase) * np.array([a, -1j * sense * b])
+    return jnp.asarray(np.array([[c, -s], [s, c]]) @ own)
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("angle", [-1.4, -0.3, 0.0, 0.7, 1.5])
+def test_ellipse_has_the_axes_it_was_made_of(angle, sense):
+    found = jv.ellipse_of(turned(4e-3, 1e-3, angle, 0.9, sense), SPEED)
+    np.testing.assert_allclose([found.semi_major, found.semi_minor], [4e-3, sense * 1e-3], rtol=1e-12)
+    np.testing.assert_allclose(found.direction, angle, atol=1e-12)
+    assert float(found.sense) == sense and not bool(found.is_circle)
+    np.testing.assert_allclose(found.acceleration, SPEED**2 * 4e-3 / G, rtol=1e-12)
+
+
+def test_axes_are_extremes_of_the_path():
+    rng = np.random.default_rng(1)
+    amplitude = rng.normal(size=2) + 1j * rng.normal(size=2)
+    found = jv.ellipse_of(jnp.asarray(amplitude), SPEED)
+    phase = np.linspace(0.0, 2.0 * np.pi, 200001)
+    path = np.real(np.exp(1j * phase)[:, None] * amplitude)
+    away = np.hypot(*path.T)
+    np.testing.assert_allclose([np.max(away), np.min(away)], [found.semi_major, abs(found.semi_minor)], rtol=1e-8)
+    across, up = path[np.argmax(away)]
+    np.testing.assert_allclose(np.tan(found.direction), up / across, rtol=1e-4)
+    area = 0.5 * np.sum(path[:-1, 0] * path[1:, 1] - path[1:, 0] * path[:-1, 1])
+    np.testing.assert_allclose(area, np.pi * found.semi_major * found.semi_minor, rtol=1e-8)
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_circle_has_no_direction_and_finite_derivatives(sense):
+    amplitude = jnp.array([2e-3 + 0.0j, -2e-3j * sense])
+    found = jv.ellipse_of(amplitude, SPEED)
+    assert bool(found.is_circle) and float(found.direction) == 0.0 and float(found.sense) == sense
+    assert "a circle" in found.summary()
+
+    def axes(parts):
+        each = jv.ellipse_of(parts[0] + 1j * parts[1], SPEED)
+        return jnp.stack([each.semi_major, each.semi_minor, each.direction, each.throw_number])
+
+    parts = jnp.stack([amplitude.real, amplitude.imag])
+    assert np.all(np.isfinite(jax.jacrev(axes)(parts))) and np.all(np.isfinite(jax.jacrev(axes)(0.0 * parts)))
+
+
+def test_derivatives_equal_finite_differences():
+    def axes(parts):
+        each = jv.ellipse_of(parts[:2] + 1j * parts[2:], SPEED, slope=-0.2)
+        return jnp.stack([each.semi_major, each.semi_minor, each.direction, each.throw_number])
+
+    x = jnp.array([1.0, 0.4, -0.3, 0.9])
+    steps = [(axes(x + 1e-6 * e) - axes(x - 1e-6 * e)) / 2e-6 for e in jnp.eye(4)]
+    np.testing.assert_allclose(jax.jacfwd(axes)(x), np.stack(steps, 1), rtol=1e-7, atol=1e-7)
+
+
+def test_throw_number_is_normal_to_the_deck():
+    """A point that moves along a deck that falls by 15 degrees does not throw; one normal to it throws by w^2 a/(g cos)."""
+    slope = np.radians(-15.0)
+    for angle, expected in ((slope, 0.0), (slope + np.pi / 2, SPEED**2 * 4e-3 / (G * np.cos(slope)))):
+        amplitude = 4e-3 * jnp.array([np.cos(angle), np.sin(angle)]) * (1.0 + 0.0j)
+        np.testing.assert_allclose(jv.ellipse_of(amplitude, SPEED, slope=slope).throw_number, expected, atol=1e-12)
+
+
+SPRINGS = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e4, 4e4)) for x in (-1.2, 1.2)]
+SCREEN = jv.plane_body(mass=2000.0, inertia=600.0, supports=SPRINGS)
+
+
+class Known(PointAnswers):
+    """Result with given complex amplitudes, as steady motions have."""
+
+    amplitude: jax.Array
+
+    def harmonic(self):
+        return Harmonic(SCREEN, jnp.asarray(SPEED), self.amplitude)
+
+
+def test_deck_of_a_translation_is_straight():
+    deck = Known(jnp.array([3e-3 + 0j, 3e-3, 0.0])).deck([(-1.0, 0.2), (0.0, 0.2), (1.0, 0.2)])
+    np.testing.assert_allclose(deck.straightness, 0.0, atol=1e-15)
+    np.testing.assert_allclose([deck.amplitude_spread, deck.direction_spread], 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.rad2deg(deck.ellipses.direction), 45.0, rtol=1e-12)
+
+
+def test_deck_of_a_body_that_turns_has_its_spread():
+    """U_p = (0, y + psi x_p): the mean is y, the root mean square of the rest psi x_p."""
+    y, psi, x = 2e-3, 1e-3j, np.array([-1.0, 0.0, 1.0])
+    deck = Known(jnp.array([0.0, y, psi])).deck([(each, 0.0) for each in x])
+    np.testing.assert_allclose(deck.straightness, abs(psi) * np.sqrt(2.0 / 3.0) / y, rtol=1e-12)
+    np.testing.assert_allclose(deck.ellipses.semi_major, np.abs(y + psi * x), rtol=1e-12)
+    assert len(deck.summary().splitlines()) == 4
+
+
+def test_directions_spread_across_the_vertical():
+    """80 and 100 degrees, that is -80, are 20 degrees apart, not 160."""
+    angle = np.radians(80.0)
+    y, psi = np.sin(angle), 1j * 0.0
+    deck = Known(jnp.array([0.0, y + 0j, np.cos(angle) + psi])).deck([(0.0, -1.0), (0.0, 1.0)])
+    np.testing.assert_allclose(np.rad2deg(deck.direction_spread), 20.0, rtol=1e-10)
+
+
+def test_harmonic_is_found_beside_others_and_an_offset():
+    t = jnp.linspace(0.0, 1.3, 4000)
+    first, second = np.array([1.0 - 2.0j, 0.5j]), np.array([0.2 + 0.1j, -0.3])
+    phase = SPEED * (t - 0.65)
+    q = 0.7 + np.real(np.exp(1j * phase)[:, None] * first) + np.real(np.exp(2j * phase)[:, None] * second)
+    amplitude, rest = fit_harmonic(t, jnp.asarray(q), jnp.asarray(SPEED))
+    np.testing.assert_allclose(amplitude, first, atol=1e-10)
+    np.testing.assert_allclose(jnp.diagonal(rest), 0.5 * np.abs(second) ** 2, rtol=1e-3)
+
+
+def run_of(*exciters):
+    return jv.simulate(jv.Scene(SCREEN, exciters=list(exciters)), 8.0, save="window")
+
+
+def exciter(at, direction=1):
+    return jv.Exciter(drive=jv.ConstantSpeed(SPEED), unbalance=5.0, at=at, direction=direction)
+
+
+def steady(exciters):
+    """q = w^2 (K - w^2 M + i w C)^-1 sum B^T (1, -i s) S for rotors that all pass the angle 0 at the same time."""
+    carrier = SCREEN.carrier()
+    matrix = np.asarray(carrier.stiffness) - SPEED**2 * np.asarray(carrier.mass) + 1j * SPEED * np.asarray(carrier.damping)
+    force = sum(5.0 * np.array([1.0, -1j * s, -y - 1j * s * x]) for (x, y), s in exciters)
+    return jnp.asarray(SPEED**2 * np.linalg.solve(matrix, force))
+
+
+def test_run_has_the_ellipses_of_the_steady_motion():
+    places = [((-0.3, 0.5), 1), ((0.4, 0.5), -1)]
+    run, expected = run_of(*(exciter(*each) for each in places)), Known(steady(places))
+    points = [(-1.2, 0.3), (0.1, 0.2), (1.0, -0.2)]
+    found, wanted = run.deck(points, slope="-10 deg"), expected.deck(points, slope="-10 deg")
+    for name in ("semi_major", "semi_minor", "direction", "acceleration", "throw_number"):
+        np.testing.assert_allclose(getattr(found.ellipses, name), getattr(wanted.ellipses, name), rtol=1e-6)
+    np.testing.assert_allclose(found.straightness, wanted.straightness, rtol=1e-6)
+    assert np.max(found.ellipses.remainder) < 1e-4  # what is left of the start
+    one = run.ellipse(points[0], slope="-10 deg")
+    np.testing.assert_allclose(one.semi_major, found.ellipses.semi_major[0], rtol=1e-12)
+    moved, (x, y, psi) = run.point(at=points[0]), np.asarray(run.window.state.velocity).T
+    np.testing.assert_allclose(moved.velocity, np.stack([x - 0.3 * psi, y - 1.2 * psi], 1), rtol=1e-12)
+    np.testing.assert_allclose(np.max(np.hypot(*moved.velocity.T)), SPEED * one.semi_major, rtol=1e-3)
+
+
+def test_ellipse_of_a_run_is_differentiable():
+    def throw(unbalance):
+        scene = jv.Scene(SCREEN, exciters=[jv.Exciter(drive=jv.ConstantSpeed(SPEED), unbalance=unbalance, at=(0.3, 0.5))])
+        return jv.simulate(scene, 4.0, save="window").ellipse((1.0, 0.0)).throw_number
+
+    value, slope = jax.value_and_grad(throw)(5.0)
+    np.testing.assert_allclose(slope, value / 5.0, rtol=1e-6)  # ideal drive: proportional to the unbalance
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda r: r.ellipse((0.0, 0.0), body=1), "body is 1; the machine has one body, number 0"),
+        (lambda r: r.ellipse(2), "at is 2; on a body"),
+        (lambda r: r.ellipse((0.0, 1.0, 2.0)), "at has 3 values; 2 are needed"),
+        (lambda r: r.deck([]), "points is .*; it must be a list of points"),
+        (lambda r: r.deck([(0.0, "1 kg")]), r"points\[0\].*not in m"),
+    ],
+)
+def test_wrong_points_end_in_one_sentence(ask, says):
+    with pytest.raises(jv.InputError, match=says):
+        ask(Known(jnp.array([0.0, 1e-3 + 0j, 0.0])))
+
+
+def test_run_without_a_trajectory_refuses_its_whole_motion():
+    run = run_of(exciter((0.0, 0.5)))
+    with pytest.raises(jv.InputError, match="part is 'all', but the run kept its window only"):
+        run.point(part="all")
