@@ -26,8 +26,6 @@ import numpy.typing as np_typing
 
 from jaxvib.errors import InputError, quoted, require_path
 
-__all__ = ["call_user", "is_real", "is_whole", "validated"]
-
 _MAX_ENTRIES = 10**7
 """Largest length of a list; longer lists are refused, since each entry is checked."""
 

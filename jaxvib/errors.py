@@ -11,20 +11,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
-__all__ = [
-    "CONTROL",
-    "MAX_TEXT_BYTES",
-    "ComputationError",
-    "InputError",
-    "legible",
-    "open_regular",
-    "quoted",
-    "read_text",
-    "require_one_of",
-    "require_path",
-    "written",
-]
-
 MAX_TEXT_BYTES = 2**24
 """Largest size, bytes, of a text file that is read."""
 

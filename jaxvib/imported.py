@@ -23,8 +23,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple, TypeAlias
 
-__all__ = ["CodeState", "clear_derived", "code_state", "digest_of_sources", "watch"]
-
 PACKAGES = ("jaxvib", "optimize")
 
 _CHANGING = {"__abstractmethods__", "__annotate_func__", "__annotations__", "__annotations_cache__", "__doc__"}

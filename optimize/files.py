@@ -19,8 +19,6 @@ from optimize.search.find import require_searcher
 from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
 
-__all__ = ["TEMPLATE", "Design", "load_design", "quantity_from_table"]
-
 _QUANTITIES = {
     name: getattr(module, name) for module in (jams, machine, motion) for name in module.__all__ if name != "between"
 }

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["Front", "pareto"]
-
-
 _ALIKE = 1e-6
 """Difference of quantities, relative to the range of the front, below which two machines count as one point."""
 

@@ -16,8 +16,6 @@ from optimize.result import Synthesis
 from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
 
-__all__ = ["anti_resonance", "antiphase", "lightest_exciter", "retune", "widest_range"]
-
 
 def _platforms(scene: Scene, least: int) -> Platforms:
     if not isinstance(scene, Scene) or not isinstance(scene.machine, Platforms):

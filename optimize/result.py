@@ -23,18 +23,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = [
-    "Influence",
-    "Limit",
-    "Machine",
-    "Outcome",
-    "Row",
-    "Synthesis",
-    "SynthesisStatus",
-    "amplitude_names",
-    "objective_text",
-]
-
 _TELLING = 1000.0
 """Largest change that is shown in per cent; larger ones are shown in the unit of the objective."""
 

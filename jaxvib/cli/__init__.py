@@ -10,8 +10,6 @@ import sys
 import warnings
 from types import FrameType
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Run the command `jaxvib`. The exit code is 0 for success, 1 for a failed computation, 2 for bad input."""

@@ -8,8 +8,6 @@ import jaxvib as jv
 from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
 
-__all__ = ["SEPARATION", "chosen_steps", "measured_document", "run_document"]
-
 SEPARATION = click.option(
     "--separation",
     help="Initial angle between neighbouring loads, such as '3 deg'; 0 for equal angles [loads in contact, or 1 deg].",

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from jaxvib.results.fields import Plain
     from jaxvib.results.result import Result
 
-__all__ = ["CSV", "Output", "fields_of"]
-
 CSV = click.option("--csv", type=click.Path(path_type=Path, dir_okay=False), help="Write the curves into this CSV file.")
 """Option of commands that have curves."""
 

@@ -8,8 +8,6 @@ from matplotlib.ticker import MultipleLocator
 
 from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, Onto, legend_above, panels
 
-__all__ = ["curve_chart", "threshold_chart", "torus_paths"]
-
 
 def threshold_chart(
     speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float, *, ax: Axes | None = None

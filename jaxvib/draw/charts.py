@@ -27,19 +27,6 @@ from jaxvib.draw.style import (
 )
 from jaxvib.errors import InputError, quoted
 
-__all__ = [
-    "PARTS",
-    "before_after",
-    "branch_diagram",
-    "convergence",
-    "crossings",
-    "front_chart",
-    "log_limits",
-    "solid_and_dashed",
-    "stretches",
-]
-
-
 PARTS = ("speed", "amplitude", "force")
 """Names of the panels of a branch diagram over the rotor speed."""
 

@@ -14,16 +14,6 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
 
-__all__ = [
-    "CostPanel",
-    "audit_chart",
-    "convergence_chart",
-    "cost_chart",
-    "stability_chart",
-    "steps_chart",
-    "tiers_chart",
-]
-
 
 def tiers_chart(
     mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray, *, ax: Axes | None = None

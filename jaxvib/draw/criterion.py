@@ -11,8 +11,6 @@ from matplotlib.patches import Patch
 
 from jaxvib.draw.style import GUIDE, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
 
-__all__ = ["agreement_maps", "pull_chart"]
-
 _KINDS = (
     ("loads gather, both say", "#ececec"),
     ("loads balance, both say", "#9bd3c7"),

@@ -23,8 +23,6 @@ from jaxvib.draw.style import (
     speed_scale,
 )
 
-__all__ = ["drag_diagram"]
-
 _WIDTHS = (2.2, 1.0)
 """Widths of stable and unstable lines, which differ because overlapping dashes could otherwise look like a stable line."""
 

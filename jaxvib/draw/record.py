@@ -6,8 +6,6 @@ import numpy as np
 
 from jaxvib.draw.style import COLORS, GUIDE, Drawn, Onto, legend_above, panels
 
-__all__ = ["record_chart"]
-
 
 def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:
     """Draw the recorded and the fitted angle over time, and their difference in a second panel, in degrees.

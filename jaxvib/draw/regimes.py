@@ -8,9 +8,6 @@ import numpy as np
 
 from jaxvib.draw.style import COLORS, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
 
-__all__ = ["regime_chart"]
-
-
 HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
 """Hatches that distinguish neighbouring areas in greyscale."""
 

@@ -22,17 +22,6 @@ from jaxvib.draw.style import (
     speed_scale,
 )
 
-__all__ = [
-    "growth_chart",
-    "modes_chart",
-    "multiplier_chart",
-    "phase_circles",
-    "points_chart",
-    "shapes_chart",
-    "signals_chart",
-    "speeds_chart",
-]
-
 
 def modes_chart(
     mode: np.ndarray,

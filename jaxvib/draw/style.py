@@ -15,28 +15,6 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from jaxvib.errors import InputError, quoted
 
-__all__ = [
-    "COLORS",
-    "GUIDE",
-    "MARKERS",
-    "OPERATING",
-    "STROKES",
-    "UNSTABLE",
-    "Drawn",
-    "Look",
-    "Onto",
-    "SpeedUnit",
-    "legend_above",
-    "legend_outside",
-    "load_names",
-    "log_places",
-    "log_ticks",
-    "numbered",
-    "panels",
-    "speed_scale",
-    "together",
-]
-
 SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
 """Unit in which speeds are drawn."""
 

@@ -12,8 +12,6 @@ from matplotlib.patches import Patch
 
 from jaxvib.draw.style import COLORS, Drawn, log_ticks, panels
 
-__all__ = ["distribution_chart", "label_map", "points_over", "shares_chart", "tornado_chart", "value_map"]
-
 _NO_ANSWER_COLOR = "#f4f4f4"
 """Colour of cases without a result."""
 

@@ -7,8 +7,6 @@ from matplotlib.axes import Axes
 
 from jaxvib.draw.style import COLORS, GUIDE, OPERATING, Drawn, SpeedUnit, legend_above, panels, speed_scale
 
-__all__ = ["campbell_diagram", "critical_groups", "whirl_lines"]
-
 
 def campbell_diagram(
     rotor_speed: np.ndarray,

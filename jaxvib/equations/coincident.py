@@ -16,8 +16,6 @@ from jaxvib.machine.effects.terms import ContactFriction, LoadPotential, RotorIm
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
-__all__ = ["COINCIDENT_TERMS", "CoincidentModel", "Points", "coincident_model", "light_friction", "require_coincident"]
-
 COINCIDENT_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
 """Terms that exact jams include. Forces between loads cancel in the torque on coincident loads."""
 

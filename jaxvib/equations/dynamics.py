@@ -30,8 +30,6 @@ from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
 
-__all__ = ["Dynamics", "dynamics_of", "vector_field"]
-
 
 class _Support(eqx.Module):
     """Place of a `SupportForce`: `rows` (k, nd) of its displacements; `input_matrix` (nd, k), accelerations per force there."""

@@ -45,8 +45,6 @@ from jaxvib.machine.loads import DrillingSpin, Loads
 from jaxvib.machine.mount import scaled
 from jaxvib.numerics.linalg import small_inverse
 
-__all__ = ["Eliminated", "ExciterDynamics", "Motion", "RotorDynamics"]
-
 Axes = dict[int, Array]
 """Vectors (count,) by axis: 0 across, 1 up."""
 

@@ -10,8 +10,6 @@ from jax import Array
 
 from jaxvib.numerics.linalg import eigenvectors_in_turn, solve_in_turn
 
-__all__ = ["ModalResponse", "modal_response"]
-
 
 class ModalResponse(eqx.Module):
     """Modal form of a symmetric dynamic stiffness D(w) = K - w^2 M + i w C of nd coordinates.

@@ -15,8 +15,6 @@ from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 
-__all__ = ["Model", "assemble"]
-
 
 class Model(eqx.Module):
     """Scene with its matrices.

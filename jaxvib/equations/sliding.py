@@ -14,8 +14,6 @@ from jax import Array
 from jaxvib.machine.effects.terms import Coordinates, Friction, SlipRelease
 from jaxvib.machine.loads import Loads, NormalForce
 
-__all__ = ["ContactSolution", "Kinematics", "contact_force", "dot", "kinematics", "resolve_contact", "slip_rates", "total"]
-
 
 class Kinematics(NamedTuple):
     """Kinematics of loads: `columns` of J = dp/du, and `curvature` c = (dJ/dt) u'.

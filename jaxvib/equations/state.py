@@ -10,8 +10,6 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.results.fields import in_unit, part
 
-__all__ = ["ExciterState", "Spin", "State"]
-
 
 class Spin(eqx.Module):
     """Free rotation of rolling loads, if effects release it (`FreeSpin`, `Sliding`); also the time derivative of one.

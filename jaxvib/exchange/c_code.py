@@ -15,8 +15,6 @@ import numpy as np
 from jaxvib.errors import InputError
 from jaxvib.runtime.compat import ClosedJaxpr, JaxprEqn, Literal, Var
 
-__all__ = ["Written", "number_text", "write_program"]
-
 _CALLS = ("exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
 _CALLS += ("asinh", "acosh", "atanh", "erf", "erfc", "floor", "ceil")
 

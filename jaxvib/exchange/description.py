@@ -9,8 +9,6 @@ from xml.sax.saxutils import quoteattr
 
 from jaxvib.errors import CONTROL
 
-__all__ = ["Fmi", "Variable", "base_units", "describe_model"]
-
 Fmi = Literal["2.0", "3.0"]
 """Versions of the functional mock-up interface."""
 

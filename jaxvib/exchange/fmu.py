@@ -36,8 +36,6 @@ from jaxvib.motion.stiffness import fastest_decay, steps_of
 from jaxvib.ode.scalarize import NotScalarizable, scalar_program
 from jaxvib.runtime.compat import HAS_JAXPRS
 
-__all__ = ["Fmu", "export_fmu"]
-
 _STEPS_PER_RADIAN = 16.0
 """Steps of co-simulation per radian of the fastest motion, which give a phase error of 1e-7 per radian."""
 

@@ -24,8 +24,6 @@ from jaxvib.machine.numbers.named import NamedNumber, numbers_of
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import solve_definite
 
-__all__ = ["DriveBy", "Equations", "equations_of", "has_events", "named_entries", "state_signals"]
-
 DriveBy = Literal["scene", "input"]
 """Source of the rotor's motion: the drive of the scene, or inputs."""
 

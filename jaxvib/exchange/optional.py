@@ -8,8 +8,6 @@ from typing import Any
 
 from jaxvib.errors import InputError, quoted
 
-__all__ = ["optional_module", "require_writable"]
-
 
 def optional_module(name: str, extra: str) -> Any:
     """Import a module of an optional package. **Raises** `InputError` with the command that installs it, if it is missing."""

@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from jaxvib.machine.carrier import Carrier
 
-__all__ = ["Signal", "coordinate_signals", "force_inputs", "foundation_forces", "signals_of"]
-
 _RATES = ("", "/s", "/s^2")
 
 

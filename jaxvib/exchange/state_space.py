@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     import control
     import scipy.signal
 
-__all__ = ["StateSpace", "state_space"]
-
 _MAX_RESIDUAL = 1e-6
 """Largest residual acceleration of a load in a jam, relative to the acceleration by its drag alone."""
 

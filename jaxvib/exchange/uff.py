@@ -24,8 +24,6 @@ from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.run import Run
 from jaxvib.units import Number, Numbers, numbers
 
-__all__ = ["UffFile", "UffFunction", "export_uff", "read_uff"]
-
 Quantity = Literal["displacement", "velocity", "acceleration"]
 
 _ORDERS: dict[str, tuple[int, str]] = {"displacement": (8, "m"), "velocity": (11, "m/s"), "acceleration": (12, "m/s^2")}

@@ -11,8 +11,6 @@ from jaxvib.draw.whirl import critical_groups, whirl_lines
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
 from jaxvib.steady.whirl import Whirl
 
-__all__ = ["campbell"]
-
 _FORWARD = {"color": COLORS[0], "lw": 1.5}
 _BACKWARD = {"color": COLORS[1], "lw": 1.5, "ls": "--"}
 _CRITICAL = {"fc": "white", "ec": "black", "lw": 1.2, "zorder": 4.0}

@@ -13,8 +13,6 @@ from jaxvib.steady.branches import Branches
 from jaxvib.steady.jams.branch_plot import MARKS
 from jaxvib.steady.jams.jam import STABILITY_CRITERION
 
-__all__ = ["chart"]
-
 _STABLE = {"color": COLORS[0], "lw": 1.5}
 _UNSTABLE = {"color": COLORS[0], "lw": 1.2, "ls": "--"}
 _RESONANCE = {"color": GUIDE, "lw": 0.8, "ls": ":"}

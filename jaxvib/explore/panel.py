@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike
 from jaxvib.draw.machine.parts import Part, Text, box, circle
 from jaxvib.draw.style import GUIDE, Look, log_places
 
-__all__ = ["APART", "FIRST", "LAST", "OPERATING", "ROTOR", "TALL", "WIDE", "Panel", "dot", "legend"]
-
 WIDE, TALL, FIRST, APART, LAST = 6.3, 3.6, 0.75, 1.1, 0.25
 """Width and height of a panel, and the space left of the first, between two and right of the last panel, in units of the
 drawing."""

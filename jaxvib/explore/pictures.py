@@ -20,23 +20,6 @@ from jaxvib.steady.branches import branches
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
 
-__all__ = [
-    "ABOUT",
-    "SceneOrProblem",
-    "diagram",
-    "has_branches",
-    "heading",
-    "image",
-    "machine",
-    "modes_of",
-    "prepare",
-    "prepare_counts",
-    "readings",
-    "scene_or_problem",
-    "text",
-    "toml",
-]
-
 ABOUT = """Springs and dampers, masses and drags of loads: a tenth to ten times the file's. Arrow keys move a slider by a
 step. Each number of loads is a program of its own: the seven next to the file's are compiled while the page is open, any
 other takes a second or two the first time. Afterwards it is stored.

@@ -20,8 +20,6 @@ from typing import Any, TypeAlias
 
 from jaxvib.errors import InputError
 
-__all__ = ["guarded", "leave", "require_free", "require_marimo", "serve", "served_path"]
-
 _Message: TypeAlias = "MutableMapping[str, Any]"
 _Send: TypeAlias = "Callable[[_Message], Awaitable[None]]"
 _Receive: TypeAlias = "Callable[[], Awaitable[_Message]]"

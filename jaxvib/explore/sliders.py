@@ -16,8 +16,6 @@ from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.units import shown_unit
 
-__all__ = ["COUNT", "Slider", "scene_at", "sliders_of"]
-
 COUNT = "loads.count"
 """Name of the slider that changes the number of loads."""
 

@@ -18,8 +18,6 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import Part
 
-__all__ = ["Carrier", "Machine", "shapes_of"]
-
 
 class Carrier(eqx.Module):
     """Linear structure of a machine.

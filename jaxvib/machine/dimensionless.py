@@ -17,8 +17,6 @@ from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.units import Number, Numbers, number, numbers
 from jaxvib.units import count as whole
 
-__all__ = ["Dimensionless"]
-
 _LINKS: dict[int, tuple[tuple[int, int], ...]] = {1: (), 2: ((1, 2),), 3: ((1, 2), (1, 3), (2, 3))}
 _KINDS = {1: "one_mass", 2: "two_mass", 3: "three_mass"}
 

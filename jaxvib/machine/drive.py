@@ -12,9 +12,6 @@ from jax import Array
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = ["Clockwise", "ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
-
-
 _SPEED = unit("rad/s", low=0.0, open_low=True, words="rotor speed")
 _INERTIA = unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the rotor")
 

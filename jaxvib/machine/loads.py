@@ -17,23 +17,6 @@ from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number, Numbers, count
 from jaxvib.units.known import when_known
 
-__all__ = [
-    "BALL_RADIUS",
-    "DRAG",
-    "MASS",
-    "CircularLoads",
-    "DrillingSpin",
-    "Loads",
-    "NormalForce",
-    "ball_radius",
-    "balls",
-    "pendulums",
-    "require_side_by_side",
-    "rollers",
-    "side_by_side",
-]
-
-
 MASS = unit("kg", low=0.0, open_low=True, each="load")
 DRAG = unit("N s/m", low=0.0, each="load")
 BALL_RADIUS = unit("m", low=0.0, open_low=True, words="radius of each {load}")

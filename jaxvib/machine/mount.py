@@ -13,8 +13,6 @@ from jax import Array
 
 from jaxvib.units import Number, count, number, numbers
 
-__all__ = ["BodyPoint", "Mount", "Place", "on_body", "read_place", "scaled"]
-
 
 class BodyPoint(eqx.Module):
     """Point (x, y) of one of several bodies, m from its centre of mass (None: that centre); `body` is its number from 0."""

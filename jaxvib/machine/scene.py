@@ -22,8 +22,6 @@ from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 from jaxvib.units.known import when_known
 
-__all__ = ["Exciter", "Scene", "read_effects", "require_comparable"]
-
 _MIN_RATIO = 1e-15
 """Ratio of two numbers below which a sum in double precision loses the smaller one."""
 

@@ -9,8 +9,6 @@ from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import as_text
 
-__all__ = ["SCENE"]
-
 
 def _labels(scene: Scene) -> dict[str, Sequence[Any]]:
     structure, counts = scene.machine.structure(), [0 if e.loads is None else e.loads.count for e in scene.exciters]

@@ -16,8 +16,6 @@ from jaxvib.units import Number
 from jaxvib.units import count as whole
 from jaxvib.units.known import when_known
 
-__all__ = ["TEMPLATE", "TorusBalls", "in_torus", "torus_balls"]
-
 _ROLLING = 0.4
 """kappa - 1 of a solid ball: its moment of inertia is 2/5 m r^2."""
 

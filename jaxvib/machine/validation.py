@@ -21,8 +21,6 @@ from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
 
-__all__ = ["allowed_unknowns", "make_scene", "validate_scene"]
-
 _VALID_SCENES: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
 """Validated scenes by their `id`. Scenes are immutable, therefore a validated scene stays valid."""
 

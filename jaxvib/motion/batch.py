@@ -23,8 +23,6 @@ from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as Held
 from jaxvib.runtime.compat import fast_diffrax_loop_end
 
-__all__ = ["BATCH_SIZE", "PARTS", "BatchPlan", "BatchRun", "advance", "pack_batch", "run_in_batch", "stretches"]
-
 BATCH_SIZE = 64
 """Number of runs in a batch on a core: enough to fill its vectors, few enough for its cache."""
 

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
-
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """Results of `_run`, for one run or for many."""
 

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["Growth", "GrowthStatus", "growth"]
-
 _THOUSANDFOLD, _DOUBLED = math.log(1e3), math.log(2.1)
 """Logarithms of growth over the later half of a run: smallest value that is certainly exponential; largest value of growth in
 proportion to time, with a margin."""

@@ -29,18 +29,6 @@ from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-__all__ = [
-    "PER_TURN",
-    "WINDOW",
-    "IntegrationPlan",
-    "StepControl",
-    "effects_rate",
-    "frequency_bounds",
-    "integrate",
-    "is_finite",
-    "whole_turns",
-]
-
 WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
 

@@ -36,19 +36,6 @@ from jaxvib.steady.outcome import unknown_is_positive
 from jaxvib.units import Number, count, known_number
 from jaxvib.units.known import is_known, when_known
 
-__all__ = [
-    "ENSEMBLE_PARTS",
-    "MAX_STEPS",
-    "Control",
-    "EnsemblePlan",
-    "RunPlan",
-    "enough_steps",
-    "plan_ensemble",
-    "plan_run",
-    "plan_stretch",
-    "start_state",
-]
-
 Control = StepControl | diffrax.AbstractStepSizeController
 
 MAX_STEPS = 2**31 - 1

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["ENDS", "SETTLED_DRIFT", "Run", "RunStatus", "judged_by_separation"]
-
 
 @cached
 def _detached(scene: Scene, kept: Trajectory) -> Array:

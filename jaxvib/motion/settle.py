@@ -30,8 +30,6 @@ from jaxvib.steady.jams.jam import jam_modes, jams_of
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 
-__all__ = ["settle"]
-
 _REMEMBERED = 32
 """Number of stretches, of 100 slow periods each, on which the decision about a steady mean is based."""
 

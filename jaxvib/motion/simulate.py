@@ -34,8 +34,6 @@ from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number
 
-__all__ = ["last_state", "prepare_run", "run_planned", "simulate"]
-
 
 @validated
 def simulate(

@@ -27,17 +27,6 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, known_number, numbers
 from jaxvib.units.known import when_known
 
-__all__ = [
-    "START_SEPARATION",
-    "Start",
-    "Turning",
-    "initial_state",
-    "require_start",
-    "validate_state",
-    "with_spin",
-    "with_spin_up_drive",
-]
-
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
 

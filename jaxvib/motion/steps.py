@@ -11,15 +11,6 @@ from jax import Array
 from jaxvib.errors import InputError, quoted
 from jaxvib.units import require_real
 
-__all__ = [
-    "Accuracy",
-    "EqualSteps",
-    "StepChoice",
-    "Tolerance",
-    "require",
-    "small_number",
-]
-
 
 @dataclass(frozen=True)
 class Tolerance:

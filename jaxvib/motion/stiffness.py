@@ -19,8 +19,6 @@ from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.runtime.programs import cached
 
-__all__ = ["IMPLICIT_PER_RADIAN", "advice", "fastest_decay", "is_unresolved", "steps_of", "stiff_solver"]
-
 _RESOLVED = 3.0
 """Largest product of decay rate and explicit step for which the method is accurate; above about 6 it diverges."""
 

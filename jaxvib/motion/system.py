@@ -22,8 +22,6 @@ from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program
 from jaxvib.ode.types import Args, RealScalarLike
 from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
 
-__all__ = ["PackedSystem"]
-
 Held: TypeAlias = PyTree[Array]
 """State of the integrator: the numbers of a state, or if angles are wrapped a pair of these and the counted turns."""
 

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["NODES", "extremum_value", "greatest", "locate_extrema"]
-
 NODES = 4
 """Number of neighbouring samples whose values and slopes a polynomial interpolates."""
 

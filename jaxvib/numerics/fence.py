@@ -14,8 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["fence", "hidden_one", "through_memory"]
-
 
 def fence(value: Array, one: Array) -> Array:
     """Fence a floating-point value, which XLA then computes once for any number of uses; `one` is a `hidden_one`.

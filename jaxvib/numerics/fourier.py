@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["Grid", "analyzed", "deviation_analysis", "deviation_synthesis", "grid_of", "resampling", "synthesized"]
-
 
 class Grid(NamedTuple):
     """Points on a period of theta = Omega t and the matrices of trigonometric interpolation between them.

@@ -13,26 +13,6 @@ from jax import Array
 
 from jaxvib.runtime.compat import custom_vmap
 
-__all__ = [
-    "TRUSTED",
-    "eigenvalues_in_turn",
-    "eigenvectors_in_turn",
-    "eliminate",
-    "hermitian_error",
-    "hermitian_modes",
-    "magnitude",
-    "refined",
-    "relative_to",
-    "root_or_zero",
-    "small_inverse",
-    "small_solve",
-    "solve_definite",
-    "solve_in_turn",
-    "times",
-    "written_inverse",
-]
-
-
 _WRITTEN = 8
 """Largest number of equations for which `eliminate` is as fast as a library call for each system of a batch."""
 

@@ -11,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["bracketed_root", "known_root", "next_share"]
-
 Numbers = TypeVar("Numbers", np.ndarray, Array)
 
 

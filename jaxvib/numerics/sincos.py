@@ -22,8 +22,6 @@ from jax import Array
 
 from jaxvib.numerics.fence import fence, hidden_one
 
-__all__ = ["sine_and_cosine", "unfenced_sine_and_cosine"]
-
 _Both: TypeAlias = Callable[[Array], tuple[Array, Array]]
 
 _PI = Fraction(

@@ -14,8 +14,6 @@ from jaxtyping import PyTree
 from jaxvib.ode.types import Mapped, Tangents
 from jaxvib.runtime.compat import custom_vmap
 
-__all__ = ["VECTOR", "batch_last", "flat_tangents", "multi_tangent_jvp"]
-
 VECTOR = 8
 """Width of vectors of a processor; the number of tangents is padded to a multiple of it."""
 

@@ -15,8 +15,6 @@ from jaxtyping import PyTree
 
 from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, RealScalarLike, Terms, Y
 
-__all__ = ["Decision", "PIController", "WrappedController"]
-
 Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, PyTree[Array], diffrax.RESULTS]
 """Acceptance of a step, beginning and end of the next one, True if the field jumps there, new state of the controller, True if
 the run can go on."""

@@ -20,19 +20,6 @@ from jaxvib.numerics.fence import fence, hidden_one, through_memory
 from jaxvib.ode.interpolation import StepInterpolation
 from jaxvib.ode.types import VF, Args, BoolScalarLike, RealScalarLike, StepResult, Terms, Y
 
-__all__ = [
-    "ERROR",
-    "NODES",
-    "ROWS",
-    "AbstractDopri8",
-    "Dopri8Interpolation",
-    "UnrolledDopri8",
-    "dense_stages",
-    "linear_combination",
-    "ravel",
-    "unravel",
-]
-
 Tree = TypeVar("Tree")
 
 _TABLEAU = diffrax.Dopri8.tableau

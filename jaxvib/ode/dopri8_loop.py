@@ -27,8 +27,6 @@ from jaxvib.ode.dopri8 import (
 )
 from jaxvib.ode.types import VF, Args, BoolScalarLike, Mapped, RealScalarLike, Tangents, Terms, Y
 
-__all__ = ["LoopDopri8"]
-
 _Known: TypeAlias = "tuple[Array, Array] | None"
 """Last stage of the previous step (n,), and the number of stages that it provides: 1, or 0 without a previous step. None if
 each step computes all of its stages."""

@@ -12,8 +12,6 @@ from jax import Array
 
 from jaxvib.ode.types import RealScalarLike, Y
 
-__all__ = ["StepInterpolation"]
-
 
 class StepInterpolation(diffrax.AbstractLocalInterpolation):
     """States within a step from `t0` to `t1`, by the fraction of the step, which is 0 for a step of length 0."""

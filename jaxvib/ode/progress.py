@@ -14,8 +14,6 @@ from jaxvib.ode.types import RealScalarLike
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-__all__ = ["ProgressBar"]
-
 _open: list[Progress] = []
 
 

@@ -16,8 +16,6 @@ from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, Y
 from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks
 
-__all__ = ["solve"]
-
 _Inputs: TypeAlias = tuple[Array, Array | None, Y, Args, diffrax.SaveAt, diffrax.ODETerm]
 """Differentiated arguments: the end, the first step, the initial state, the arguments, the saved times, the equations."""
 

@@ -18,8 +18,6 @@ from jaxvib.ode.batching import VECTOR
 from jaxvib.ode.interpolation import StepInterpolation
 from jaxvib.ode.types import Args, BoolScalarLike, RealScalarLike, StepResult, Terms
 
-__all__ = ["Rodas4"]
-
 _A = np.array(
     [
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],

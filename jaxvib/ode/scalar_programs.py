@@ -24,8 +24,6 @@ from jaxvib.runtime.compat import (
     rewritten,
 )
 
-__all__ = ["fenced", "is_floating", "substituted", "without_repeats"]
-
 _MAX_RECOMPUTED = 8
 """Largest number of operations of a value with several uses that is not fenced, see `fenced`."""
 

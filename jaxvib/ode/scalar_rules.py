@@ -16,19 +16,6 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import Primitive
 
-__all__ = [
-    "NotScalarizable",
-    "Scalar",
-    "Scalars",
-    "elementwise",
-    "inlined",
-    "is_known",
-    "joined",
-    "primitive_of",
-    "rules",
-    "to_scalars",
-]
-
 Scalars: TypeAlias = np.ndarray
 """Array of dtype object whose entries are traced scalars, or NumPy scalars that are constants of the program."""
 

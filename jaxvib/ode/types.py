@@ -10,21 +10,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-__all__ = [
-    "VF",
-    "Args",
-    "BoolScalarLike",
-    "DenseInfo",
-    "IntScalarLike",
-    "Mapped",
-    "Norm",
-    "RealScalarLike",
-    "StepResult",
-    "Tangents",
-    "Terms",
-    "Y",
-]
-
 RealScalarLike: TypeAlias = int | float | Array | np.ndarray
 """A time, a tolerance, an order: a number, or an array ()."""
 

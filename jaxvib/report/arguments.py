@@ -11,8 +11,6 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import EFFECTS, SECTIONS, suggest_name
 from jaxvib.machine.numbers import PLAIN, number_specs
 
-__all__ = ["GROUPS", "Argument", "arguments_of", "described", "part_of"]
-
 GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
     "machines": SECTIONS["machine"],
     "loads": SECTIONS["loads"],

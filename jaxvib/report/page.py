@@ -25,8 +25,6 @@ from jaxvib.results.result import Result
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Report", "html_report", "units_of"]
-
 _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy")
 
 

@@ -12,8 +12,6 @@ from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.results.fields import Plain
 
-__all__ = ["Units", "escaped", "parameters", "results", "worth"]
-
 Units: TypeAlias = Mapping[str, str]
 """Units of numbers by their names."""
 

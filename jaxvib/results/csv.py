@@ -14,8 +14,6 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, written
 from jaxvib.results.fields import Labels, columns, labels_of
 
-__all__ = ["main_axis", "table_along", "write_csv"]
-
 
 @validated
 def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:

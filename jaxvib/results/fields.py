@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     import xarray
     from _typeshed import DataclassInstance
 
-__all__ = ["as_dict", "as_text", "columns", "in_unit", "is_named_tuple", "is_single", "labels_of", "part", "plain", "to_xarray"]
-
 EACH = "*"
 """Placeholder for the `outer_axes` of the class to which a field belongs."""
 

@@ -30,8 +30,6 @@ from jaxvib.results.fields import Plain, is_named_tuple
 from jaxvib.results.status import is_status, member, status_names
 from jaxvib.runtime.compat import enumeration_of
 
-__all__ = ["load", "save"]
-
 _LAYOUT, _DIGEST = "result", "digest"
 """Names of archive entries: the layout, which is a JSON text, and the digest of the layout and all arrays."""
 

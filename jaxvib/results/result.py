@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
-__all__ = ["Result"]
-
 
 class Result(eqx.Module):
     """Base of all results: numbers with a status.

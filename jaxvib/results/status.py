@@ -12,9 +12,6 @@ from jaxvib.errors import ComputationError
 from jaxvib.runtime.compat import enumeration_names, enumeration_of
 from jaxvib.runtime.devices import on_device
 
-__all__ = ["Computed", "failure", "is_status", "member", "sentence", "status_name", "status_names"]
-
-
 Status = TypeVar("Status", bound=eqx.Enumeration)
 
 

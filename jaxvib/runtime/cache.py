@@ -14,8 +14,6 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.runtime.compat import user_folder
 
-__all__ = ["compiled_anew", "default_folder", "use_cache"]
-
 _folder: list[Path] = []
 
 

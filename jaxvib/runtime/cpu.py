@@ -13,8 +13,6 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import accepted_flags, backend_started, loops_need_a_flag, wide_vectors_are_right
 
-__all__ = ["has_flags", "prepare_cpu", "processor"]
-
 _EXTRA = "--xla_backend_extra_options="
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 _COMPILING = "--xla_cpu_use_fusion_emitters=false"

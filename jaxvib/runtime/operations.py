@@ -10,8 +10,6 @@ from jax import Array
 
 from jaxvib.runtime.compat import HAS_JAXPRS, jaxpr_as_fun, rewritten
 
-__all__ = ["operations", "pruned"]
-
 
 def operations(function: Callable[..., Any], *arguments: Any) -> int:
     """Count the operations of the program of a function; those of loop bodies and called programs count once.

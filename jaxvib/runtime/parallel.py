@@ -24,8 +24,6 @@ from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import shared_devices
 from jaxvib.runtime.stored import is_debugging
 
-__all__ = ["cores", "in_background", "in_chunks", "in_parallel", "in_threads"]
-
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 

@@ -11,8 +11,6 @@ from jax import Array
 
 from jaxvib.runtime.compat import HAS_JAXPRS, Primitive
 
-__all__ = ["HAS_RULES", "apply_pullback", "is_zero", "primitive", "zero_of"]
-
 
 def _module(name: str) -> Any:
     try:

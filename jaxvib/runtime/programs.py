@@ -28,8 +28,6 @@ from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
 from jaxvib.runtime.structure import Skeleton, Undescribable, describe
 
-__all__ = ["CachedFunction", "cached"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 

@@ -11,8 +11,6 @@ from jaxvib.runtime.cache import use_cache
 from jaxvib.runtime.compat import backend_started
 from jaxvib.runtime.cpu import has_flags, prepare_cpu
 
-__all__ = ["start"]
-
 
 @functools.cache
 def start() -> None:

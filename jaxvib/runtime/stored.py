@@ -36,8 +36,6 @@ from jaxvib.runtime.cpu import processor
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
-__all__ = ["StoredFunction", "is_debugging"]
-
 T = TypeVar("T")
 
 _PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")

@@ -17,8 +17,6 @@ import equinox as eqx
 import jax
 import numpy as np
 
-__all__ = ["KNOWN_PACKAGES", "Description", "Skeleton", "Slot", "Undescribable", "describe", "leaf_key", "rebuild"]
-
 Description: TypeAlias = "bool | int | float | str | list[Description] | dict[str, Description] | None"
 """Values of JSON."""
 

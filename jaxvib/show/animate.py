@@ -25,8 +25,6 @@ from jaxvib.show.wheel import Pose
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.units import Number, number
 
-__all__ = ["animate"]
-
 _TURN = 0.42
 """Largest rotation between pictures, turns. Near half a turn, the rotor seems to turn at another speed or backward."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["Tie", "lanes"]
-
 
 class Tie(NamedTuple):
     """Link between two platforms, or support of a platform.

@@ -14,8 +14,6 @@ from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.run import Run
 from jaxvib.steady.orbits.describe import Orbit
 
-__all__ = ["Stretch", "of_orbit", "of_run"]
-
 _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
 """Largest rotation of a load between two samples of a run, rad, for which interpolation is accurate enough."""
 

@@ -12,8 +12,6 @@ from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, at_rest, caption, places_of
 from jaxvib.steady.jams.jam import Jam
 
-__all__ = ["moving", "still"]
-
 _FRAMES = 20
 """Poses in a period. Browsers interpolate linearly between them; circular paths are accurate to about 1 %."""
 

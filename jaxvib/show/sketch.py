@@ -13,8 +13,6 @@ from jaxvib.show.views import View, view_of
 from jaxvib.show.wheel import at_rest, caption
 from jaxvib.units.known import require_known
 
-__all__ = ["checked_scene", "fit", "sketch"]
-
 _INCH = 0.62
 """Inches per unit of a drawing."""
 

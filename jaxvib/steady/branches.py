@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
     from jaxvib.steady.orbits.diagram import ExactBranches
 
-__all__ = ["Branches", "branches"]
-
 
 class Branches(AbstractJam):
     """Branch diagram: the arrays of `AbstractJam` along the load speed Omega, ascending, with a leading axis over the points.

@@ -22,8 +22,6 @@ from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import enumeration_of
 from jaxvib.units.known import is_known, when_known
 
-__all__ = ["REFUSED", "outcome", "unknown_is_positive", "without_numbers"]
-
 REFUSED = "a number that was not known while the program was built is not allowed: ask outside of jit, grad and vmap to see it"
 """Sentence of the status `refused`."""
 

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["Deck", "Ellipse", "Harmonic", "PointAnswers", "ellipse_of", "rows_in_plane"]
-
 STANDARD_GRAVITY = 9.80665
 """Acceleration 1 g, m/s^2."""
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["ModeShapes", "mode_shapes"]
-
 
 class ModeShapes(Result):
     """Undamped free vibrations, by ascending frequency.

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["CriticalSpeeds", "Whirl", "WhirlStatus", "critical_speeds", "whirl"]
-
 Weights = Literal["fixed", "none"]
 
 _TIE, _TIE_ROUNDINGS = 1e-9, 100.0

@@ -19,22 +19,6 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.units import Number, count, number
 
-__all__ = [
-    "SAMPLE",
-    "SAMPLINGS",
-    "Axis",
-    "AxisSpec",
-    "Grid",
-    "Spot",
-    "axis_of",
-    "corners",
-    "put",
-    "put_start",
-    "require_apart",
-    "samples",
-    "tile_of",
-]
-
 SAMPLE = "sample"
 """Name of the dimension of the samples."""
 

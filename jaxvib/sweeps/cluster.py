@@ -17,8 +17,6 @@ from jaxvib.sweeps.program import Chunk, compute
 from jaxvib.sweeps.store import versions
 from jaxvib.units import Number, number
 
-__all__ = ["on_a_cluster"]
-
 _AHEAD = 2
 """Number of submitted chunks for each worker: one in computation, one waiting."""
 

@@ -21,8 +21,6 @@ from jaxvib.sweeps.identity import UnknownIdentity, digest, identity
 from jaxvib.sweeps.measures import Measure
 from optimize.quantities.quantity import Tier
 
-__all__ = ["CASE_STATUSES", "UNKNOWN", "CaseStatus", "Study", "SweepStatus", "identify"]
-
 UNKNOWN = "unknown"
 """Key of the reason in the identity of a value that cannot be compared."""
 

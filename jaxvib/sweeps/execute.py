@@ -10,8 +10,6 @@ from jaxvib.runtime.parallel import in_parallel
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.program import Chunk, compute
 
-__all__ = ["Progress", "Report", "in_this_process", "timed"]
-
 
 class Progress(NamedTuple):
     """Progress of a sweep.

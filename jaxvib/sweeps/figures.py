@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, Look
 
-__all__ = ["figures", "plot_distribution", "plot_map", "plot_shares", "plot_sweep", "plot_tornado", "wilson"]
-
 _MAX_DOTS = 1500
 """Maximum number of cases along an axis of a figure; of more cases only every k-th one is drawn."""
 

@@ -32,8 +32,6 @@ import numpy as np
 
 from jaxvib.results.fields import Plain
 
-__all__ = ["UnknownIdentity", "difference", "digest", "identity"]
-
 _MAX_VALUES = 100_000
 """Maximum number of values in one description."""
 

@@ -16,8 +16,6 @@ from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.batch import BatchRun
 from optimize.quantities.quantity import Quantity
 
-__all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "measure_of"]
-
 _SETTLED_SPEED_SHARE = 0.01
 """Largest difference between a mean load speed and the final one, relative to the rotor speed, at which loads are settled."""
 

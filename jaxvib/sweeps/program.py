@@ -21,8 +21,6 @@ from jaxvib.sweeps.definition import CASE_STATUSES, Study
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
 
-__all__ = ["Chunk", "compute", "planned", "shapes"]
-
 _SAMPLES = 1024
 """Number of states in the measuring window of a run."""
 

@@ -18,8 +18,6 @@ from pathlib import Path
 
 from jaxvib.errors import InputError, open_regular, read_text, written
 
-__all__ = ["FOLDER", "changed_layout", "is_locked", "is_sealed", "locked", "seal", "seal_layout", "seal_of"]
-
 FOLDER = ".seals"
 
 _LAYOUT, _LOCK = "layout", "lock"

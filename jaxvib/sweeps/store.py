@@ -35,8 +35,6 @@ from jaxvib.sweeps.identity import difference
 from jaxvib.sweeps.measures import RunMeasure
 from jaxvib.sweeps.program import Chunk
 
-__all__ = ["ChunkState", "Store", "require_zarr", "versions"]
-
 _FORMAT = 2
 """Version number of the layout of the store."""
 

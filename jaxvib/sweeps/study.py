@@ -23,8 +23,6 @@ from jaxvib.units import Number, count, number
 from optimize.files import quantity_from_table
 from optimize.quantities.quantity import TIERS, Quantity, Tier
 
-__all__ = ["TEMPLATE", "Measures", "load_study", "study"]
-
 Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
 """Type of measures: a list, or a mapping from names to measures."""
 

@@ -35,9 +35,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["CaseCount", "Sweep", "open_sweep", "run_study", "sweep"]
-
-
 _MAX_WORKERS = 16
 """Maximum number of worker processes on a machine with few cores; with more than four cores, four for each core."""
 

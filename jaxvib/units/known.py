@@ -12,8 +12,6 @@ from jaxtyping import PyTree
 from jaxvib.errors import InputError
 from jaxvib.runtime.compat import traced
 
-__all__ = ["is_known", "require_known", "when_known"]
-
 T = TypeVar("T")
 
 

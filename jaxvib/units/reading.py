@@ -14,8 +14,6 @@ from jax import Array
 from jaxvib.boundary import is_real
 from jaxvib.errors import InputError, quoted
 
-__all__ = ["Number", "Numbers", "Quantity", "in_own_unit", "require_real", "to_float", "unit_name", "unit_ratio"]
-
 
 @runtime_checkable
 class Quantity(Protocol):

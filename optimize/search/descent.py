@@ -17,8 +17,6 @@ from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from optimize.search.problem import Point, Problem, derive
 
-__all__ = ["STRETCH", "Descended", "descend"]
-
 STRETCH = 25
 """Number of steps of the descent in one call of its program."""
 

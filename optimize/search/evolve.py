@@ -16,8 +16,6 @@ from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from optimize.search.problem import Known, Point, Problem, evaluate, looked_up
 
-__all__ = ["Evolved", "Followed", "evolve", "require_cma"]
-
 _PRICE = 10.0
 """Penalty of a demand that is violated by its own size, in typical values of the objective."""
 

@@ -19,8 +19,6 @@ from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, 
 from optimize.search.problem import Point, Problem, evaluate, looked_up
 from optimize.space import DesignSpace
 
-__all__ = ["Found", "Options", "Searcher", "choose", "find", "require_searcher"]
-
 _NODES = 400
 """Maximum number of bounds in a branch-and-bound search."""
 

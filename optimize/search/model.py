@@ -9,18 +9,6 @@ import numpy as np
 from optimize.search.problem import Point, Problem, evaluate
 from optimize.search.quadratic import Solved, elastic
 
-__all__ = [
-    "Step",
-    "at_kink",
-    "curvatures",
-    "kink_residuals",
-    "least_norm",
-    "predicted_decrease",
-    "second_derivatives",
-    "solve_model",
-    "transposed",
-]
-
 _DIFFERENCE_STEP = 1e-5
 """Step of central differences, as a fraction of the range of a free number."""
 

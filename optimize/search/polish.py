@@ -21,8 +21,6 @@ from optimize.search.model import (
 )
 from optimize.search.problem import Point, Problem, evaluate
 
-__all__ = ["FEASIBLE", "Polished", "Starts", "draw_starts", "optimality", "polish", "restore", "violation"]
-
 FEASIBLE = 1e-8
 """Largest violation of held quantities and demands in the end, relative to their values."""
 

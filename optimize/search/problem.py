@@ -26,8 +26,6 @@ from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, gues
 from optimize.quantities.quantity import BuiltinQuantity, Demand, Quantity, walk
 from optimize.space import DesignSpace, Held
 
-__all__ = ["Known", "Point", "Problem", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
-
 _CHUNK = 64
 """Number of designs in a batch on a core."""
 

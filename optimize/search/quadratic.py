@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Solved", "elastic"]
-
 _MAX_NEWTON_STEPS = 60
 
 _STEPS_WITHOUT_PROGRESS, _NEAR_OPTIMUM = 8, 1e-6

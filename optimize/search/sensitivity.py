@@ -13,8 +13,6 @@ from optimize.search.find import Found
 from optimize.search.polish import FEASIBLE
 from optimize.search.problem import Problem
 
-__all__ = ["influences_of", "limits_of", "machines_of", "neighbours"]
-
 _STEP = 0.01
 """Relative change of a free number for its influence."""
 

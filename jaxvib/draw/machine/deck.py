@@ -7,8 +7,6 @@ from matplotlib.axes import Axes
 
 from jaxvib.draw.style import COLORS, GUIDE, Drawn, panels
 
-__all__ = ["deck_chart", "ellipses"]
-
 
 def ellipses(points: np.ndarray, amplitude: np.ndarray, magnify: float) -> list[np.ndarray]:
     """Return the path (97, 2) of each point (n, 2) with its complex amplitudes (n, 2), magnified; the first is at phase 0.

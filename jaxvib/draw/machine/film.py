@@ -18,8 +18,6 @@ from PIL import Image
 
 from jaxvib.errors import written
 
-__all__ = ["Film"]
-
 _COLORS = 64
 """Maximum number of colours of a film."""
 

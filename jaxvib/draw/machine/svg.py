@@ -10,8 +10,6 @@ from matplotlib.colors import to_hex
 
 from jaxvib.draw.machine.parts import Part, Text
 
-__all__ = ["svg"]
-
 _DOTS = 62.0
 """SVG units per unit of the drawing."""
 

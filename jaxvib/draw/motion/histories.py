@@ -9,8 +9,6 @@ from matplotlib.axes import Axes
 
 from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, SpeedUnit, legend_above, load_names, panels, speed_scale
 
-__all__ = ["amplitude_histories", "band", "last_periods", "period_of", "time_histories"]
-
 _BINS = 300
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
 

@@ -10,8 +10,6 @@ from matplotlib.colors import LogNorm
 
 from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, SpeedUnit, legend_above, panels, speed_scale
 
-__all__ = ["path_chart", "spectrum_chart", "waterfall_chart"]
-
 _DECADES = 1e-4
 """Lower end of the amplitude scale, relative to the largest amplitude."""
 

@@ -18,19 +18,6 @@ from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = [
-    "BALANCE_GRADE",
-    "Effect",
-    "Gravity",
-    "MomentImbalance",
-    "StaticImbalance",
-    "Typical",
-    "has_half_turn",
-    "has_term",
-    "terms_of",
-    "total_gravity",
-]
-
 T = TypeVar("T", bound=Term)
 
 BALANCE_GRADE = 6.3e-3

@@ -19,8 +19,6 @@ from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 from jaxvib.units.known import when_known
 
-__all__ = ["LoadContact", "damping_ratio"]
-
 
 class LoadContact(Effect):
     """Contact forces between loads with a size, while they overlap.

@@ -17,8 +17,6 @@ from jaxvib.machine.loads import CircularLoads, Loads
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = ["DryFriction", "dry_lever", "sliding_sign"]
-
 Reaction = Literal["exact", "run_up", "steady"]
 
 

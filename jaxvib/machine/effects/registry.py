@@ -9,8 +9,6 @@ from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.effects.spin import FreeSpin, Sliding
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 
-__all__ = ["EFFECTS"]
-
 EFFECTS = {
     "gravity": Gravity,
     "static_imbalance": StaticImbalance,

@@ -19,8 +19,6 @@ from jaxvib.machine.loads import Loads, ball_radius
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = ["RollingFriction"]
-
 Direction = Literal["along", "each"]
 
 

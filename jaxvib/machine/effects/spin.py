@@ -15,8 +15,6 @@ from jaxvib.machine.loads import Loads, ball_radius
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = ["FreeSpin", "Sliding"]
-
 
 class FreeSpin(Effect):
     """Free drilling spin of balls in a torus, about the normal of their point of contact.

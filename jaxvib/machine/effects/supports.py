@@ -16,8 +16,6 @@ from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = ["CubicSupport", "Stop"]
-
 Side = Literal["above", "below", "both"]
 
 

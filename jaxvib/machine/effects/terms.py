@@ -18,22 +18,6 @@ from jax import Array
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.loads import Loads, NormalForce
 
-__all__ = [
-    "ContactFriction",
-    "Coordinates",
-    "DrillingSpinRelease",
-    "Friction",
-    "GravityField",
-    "Imbalance",
-    "LoadInteraction",
-    "LoadPotential",
-    "LoadResistance",
-    "RotorImbalance",
-    "SlipRelease",
-    "SupportForce",
-    "Term",
-]
-
 Coordinates: TypeAlias = tuple[Array, ...]
 """Arrays (count,), one for each coordinate of a load."""
 

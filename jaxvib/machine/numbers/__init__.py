@@ -20,8 +20,6 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.units import Bounds, Numbers, number, numbers
 from jaxvib.units.known import when_known
 
-__all__ = ["PLAIN", "NumberSpec", "Part", "number_specs", "read_numbers", "unit"]
-
 _KEY = "number"
 
 

@@ -26,8 +26,6 @@ from jaxvib.machine.numbers import PLAIN, NumberSpec, number_specs
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.units import Number, number
 
-__all__ = ["NamedNumber", "find_number", "numbers_of", "present_numbers", "put_numbers", "put_present", "read_value", "spec_of"]
-
 _Path = tuple[str | int, ...]
 _SECTIONS: dict[str, type[eqx.Module]] = {"machine": Machine, "loads": Loads, "drive": Drive, "exciters": Exciter}
 

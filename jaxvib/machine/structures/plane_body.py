@@ -15,8 +15,6 @@ from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
-__all__ = ["PlaneBody", "PlaneSupport", "plane_body", "support"]
-
 
 class PlaneSupport(Part):
     """Pair of springs and dampers between a point of a body and the foundation, at right angles to each other.

@@ -16,8 +16,6 @@ from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, Numbers, count
 
-__all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
-
 
 class Platforms(Machine):
     """Platforms that translate vertically, on supports and with links between them.

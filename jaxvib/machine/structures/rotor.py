@@ -18,9 +18,6 @@ from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, Numbers
 from jaxvib.units.known import when_known
 
-__all__ = ["TEMPLATES", "PlanarRotor", "Rotor", "planar_rotor", "rotor"]
-
-
 _MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
 
 

@@ -19,18 +19,6 @@ from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 
-__all__ = [
-    "LEAST",
-    "AbstractMeasured",
-    "Measured",
-    "Trajectory",
-    "mean_speeds",
-    "measure",
-    "turning_angles",
-    "turning_directions",
-    "unmeasured",
-]
-
 LEAST = 1e-4
 """Smallest scale of changes, as a share of the unbalance radius S/M for amplitudes and of S n^2 for forces. It is needed
 because the amplitude and the force of a balanced rotor are almost zero."""

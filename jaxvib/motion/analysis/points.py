@@ -14,8 +14,6 @@ from jaxvib.results.fields import in_unit
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.points import rows_in_plane
 
-__all__ = ["PointMotion", "fit_harmonic", "motion_of_point"]
-
 _HARMONICS = 3
 """Number of fitted harmonics. The second and the third take their share of the motion out of the first."""
 

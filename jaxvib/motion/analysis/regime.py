@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["REGIMES", "Regime", "RegimeName", "regime"]
-
 _SAME_SPEED = 3e-3
 """Relative difference below which two speeds count as equal: of two loads, of a load and the rotor, or of one load in the first
 and the second half."""

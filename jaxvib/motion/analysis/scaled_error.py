@@ -16,8 +16,6 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.runtime.devices import numpy_of
 from jaxvib.runtime.programs import cached
 
-__all__ = ["error_scale", "estimated_error", "natural_units", "scaled_error", "turned"]
-
 
 @cached
 def natural_units(scene: Scene) -> State:

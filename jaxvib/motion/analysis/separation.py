@@ -31,8 +31,6 @@ from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 
-__all__ = ["GROWTH", "NEARLY_ONE_ANGLE", "is_nearly_one_angle", "prepare_separation", "separation_rate", "would_separate"]
-
 NEARLY_ONE_ANGLE = 0.2
 """Largest angle between loads that count as loads at one angle, rad."""
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["Spectrum", "spectrum_of"]
-
 _FINER = 4
 """Ratio of the resolution of a piece and the spacing of frequencies; the heights of peaks are then accurate to 2 %."""
 

@@ -49,8 +49,6 @@ from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known
 
-__all__ = ["envelope"]
-
 _WINDOW = 512
 """Number of samples in the measuring window at the end: 25 in a beat of the slowest resonance."""
 

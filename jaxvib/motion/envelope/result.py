@@ -21,8 +21,6 @@ from jaxvib.steady.outcome import REFUSED
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["Envelope", "EnvelopeStatus", "Envelopes"]
-
 
 class EnvelopeStatus(eqx.Enumeration):
     """Outcomes of an averaged run. Each member is the sentence shown to the user."""

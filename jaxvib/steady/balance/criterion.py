@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["Criterion", "criterion", "criterion_functional", "criterion_table"]
-
 
 class Criterion(Result):
     """Result of the criterion for one machine with its loads.

@@ -21,8 +21,6 @@ from jaxvib.numerics import radau
 from jaxvib.runtime.programs import cached
 from jaxvib.units import count
 
-__all__ = ["BATCH", "at_constant_speed", "balanced_motion", "checked_steps", "fine_and_coarse", "monodromies", "monodromy"]
-
 BATCH = 16
 """Number of rotor speeds in a batch of monodromy matrices."""
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["CharacteristicSpeeds", "CriterionStatus", "characteristic_speeds", "port_receptance"]
-
 _GRID_POINTS = 24
 """Number of grid points on each side of each resonance in the search for sign changes of the damped machine."""
 

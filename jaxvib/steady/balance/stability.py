@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["BalancedStability", "StabilityStatus"]
-
 
 class StabilityStatus(eqx.Enumeration):
     """Stability of a balanced motion; the members are the sentences a user reads."""

@@ -39,8 +39,6 @@ from jaxvib.units import count
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["BalanceStatus", "BalancedStates", "balanced_growth", "balanced_intervals", "balanced_stability", "balanced_states"]
-
 
 class BalanceStatus(eqx.Enumeration):
     """Outcomes of the balance of loads; the members are the sentences a user reads."""

@@ -15,8 +15,6 @@ from jaxvib.machine.scene import Scene
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["MARKS", "branch_summary", "plot_branch"]
-
 
 class _Branch(Protocol):
     """Plotted arrays of a branch, with one entry for each point along the load speed."""

@@ -22,8 +22,6 @@ from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
 
-__all__ = ["Folds", "branch_slope", "branch_tangent", "jam_rotor_speed", "light_rotor_speed", "rotor_speed_at"]
-
 _GRID_POINTS = 64
 """Number of grid points on each side of each pole in the search for folds."""
 

@@ -13,8 +13,6 @@ from jaxvib.equations.linear import JammedModel
 from jaxvib.steady.jams.folds import branch_slope, rotor_speed_at
 from jaxvib.steady.jams.jam import Jam, jam_at
 
-__all__ = ["follow_fold", "follow_jam"]
-
 _NEWTON_STEPS = 6
 """Number of Newton steps; the method converges quadratically from a similar machine. The result is NaN without convergence."""
 

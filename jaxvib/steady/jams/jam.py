@@ -39,8 +39,6 @@ from jaxvib.units.known import when_known
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["STABILITY_CRITERION", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_at", "jam_modes"]
-
 STABILITY_CRITERION = "by slope, for light loads that stay together"
 """Criterion of the stability of a jam mode, and its condition."""
 

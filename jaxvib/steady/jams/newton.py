@@ -17,8 +17,6 @@ from jaxvib.ode.scalar_programs import fenced
 from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of
 from jaxvib.runtime.compat import jaxpr_as_fun
 
-__all__ = ["damped_newton"]
-
 Given = TypeVar("Given", bound=PyTree[Array])
 Beside = TypeVar("Beside", bound=PyTree[Array])
 _State: TypeAlias = tuple[Array, Beside, Array, Array, Array, Array]

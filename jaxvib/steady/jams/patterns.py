@@ -6,8 +6,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["PhasePattern", "phase_pattern"]
-
 
 class PhasePattern(eqx.Enumeration):
     """Relative phases of loads that turn at one speed. Each member is the sentence shown to the user."""

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["PhaseBranch", "drag_curve"]
-
 _PHASE_JUMP = 0.3
 """Change of a phase, rad, from one load speed to the next above which a figure shows another pattern."""
 

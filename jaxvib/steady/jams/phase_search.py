@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["PhaseJams", "phase_branch", "phase_jams"]
-
 _SHOWN_DRAG_FACTOR = 30.0
 """Drag range of a figure of all jams: from the scene's drag divided by this factor to the drag times it."""
 

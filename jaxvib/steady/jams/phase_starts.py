@@ -18,18 +18,6 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import TorqueBalance, influence_of, solve_balance, torques_at
 
-__all__ = [
-    "LOAD_SPEEDS",
-    "AtSpeed",
-    "at_speed",
-    "distinct_rows",
-    "equal_loads",
-    "load_speeds",
-    "phases_near",
-    "solved_clusters",
-    "starts_of",
-]
-
 LOAD_SPEEDS = 240
 """Number of load speeds at which phases are searched, besides those near resonances."""
 

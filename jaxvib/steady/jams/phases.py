@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "degrees", "growth_of_free_loads", "phase_jam", "phase_torques"]
-
 _SAME_JAM_DISTANCE = 0.02
 """Relative difference of load speeds up to which jams of two theories count as the same."""
 

@@ -33,8 +33,6 @@ from jaxvib.units import Number, count, number
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
-
 _ORBITS_PER_BATCH = 32
 """Number of orbits in a batch: enough to fill vector registers, few enough for the cache."""
 

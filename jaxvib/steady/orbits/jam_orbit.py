@@ -31,8 +31,6 @@ from jaxvib.steady.orbits.stability import steps_for
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number
 
-__all__ = ["jam_orbit"]
-
 _MAX_SPEED_DIFFERENCE = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 

@@ -15,8 +15,6 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
-__all__ = ["branch_at", "exact_mode_speeds"]
-
 _BRANCH_POINTS, _POINTS_PER_BATCH = 800, 100
 """Number of points of the exact branch, and of points in a batch."""
 

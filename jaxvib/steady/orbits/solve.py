@@ -14,8 +14,6 @@ from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling, synthesized
 from jaxvib.numerics.linalg import small_solve, solve_in_turn
 
-__all__ = ["BranchTangent", "Harmonics", "Parameter", "PeriodicSolution", "branch_tangent", "harmonics_of", "periodic_motion"]
-
 Parameter = Literal["omega", "rotor_speed"]
 
 _MAX_NEWTON_STEPS = 60

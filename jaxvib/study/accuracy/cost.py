@@ -19,8 +19,6 @@ from jaxvib.results.status import Computed
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["WANTED", "Cost", "CostRow", "cost_figure", "relative", "row_of", "timed"]
-
 T = TypeVar("T")
 
 WANTED = (1e-2, 1e-4, 1e-6)

@@ -15,9 +15,6 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 
-__all__ = ["SLOW_PERIODS", "ExactJam", "collocation_points", "exact_jam", "slow_period", "unstable", "usual_mode"]
-
-
 SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
 """Measuring window at the end of a run, and longest run, in slow periods."""
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["GradientCheck", "GradientStatus", "ImplicitRoute", "check_gradients"]
-
 _RATIO = math.sqrt(10.0)
 _DIFFERENCE_STEPS = tuple(float(h) for h in np.logspace(-2.0, -7.0, 11))
 """Relative steps of the sweep; each is `_RATIO` times the next."""

@@ -23,9 +23,6 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import Cost, relative, row_of
 from jaxvib.study.accuracy.exact_reference import ExactJam, collocation_points, unstable
 
-__all__ = ["gradient_precision"]
-
-
 _GRADIENT_TOLERANCE = 1e-8
 
 _MOST_NOTED = 2**17

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["HarmonicConvergence", "harmonic_convergence"]
-
 
 class HarmonicConvergence(Result):
     """Errors of jams with a limited number of harmonics.

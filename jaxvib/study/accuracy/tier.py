@@ -17,8 +17,6 @@ from jaxvib.motion.settle import settle
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 
-__all__ = ["TIERS", "JamValues", "Tier"]
-
 
 class JamValues(Protocol):
     """Common quantities of the results of all tiers."""

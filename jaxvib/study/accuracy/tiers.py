@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["TierValues", "Tiers", "compare_tiers"]
-
 
 class TierValues(eqx.Module):
     """Results of one tier, NaN for missing ones: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,

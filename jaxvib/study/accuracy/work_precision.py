@@ -33,8 +33,6 @@ from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, ExactJam, colloc
 from jaxvib.study.accuracy.gradient_precision import gradient_precision
 from jaxvib.units import Number, count, number
 
-__all__ = ["QUANTITIES", "SOLVERS", "work_precision"]
-
 Tree = TypeVar("Tree")
 Quantity = Literal["amplitude", "foundation_force", "final_state", "gradient"]
 QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")

@@ -30,8 +30,6 @@ from jaxvib.units import Number, count, number
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["Audit", "AuditStatus", "audit"]
-
 
 class AuditStatus(eqx.Enumeration):
     """Outcomes of an audit. Each member is the sentence shown to the user."""

@@ -25,8 +25,6 @@ from jaxvib.study.accuracy.cost import timed
 from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison, without_excluded_effects
 from jaxvib.study.audit.variants import Variant
 
-__all__ = ["CHANGES", "EffectRow", "RepeatedComparison", "effect_row", "field_operations", "relative_changes"]
-
 CHANGES = ("amplitude", "foundation_force", "omega", "fold")
 """Compared quantities, by their names in `EffectRow`."""
 

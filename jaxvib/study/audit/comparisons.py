@@ -26,17 +26,6 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.search import branch_at
 from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 
-__all__ = [
-    "MIN_AMPLITUDE_SHARE",
-    "JamComparison",
-    "MotionValues",
-    "RunComparison",
-    "fold_speed",
-    "mean_torque",
-    "turning_state",
-    "without_excluded_effects",
-]
-
 _MIN_UNCERTAINTY = 1e-9
 
 _WINDOW_PERIODS = 100

@@ -15,8 +15,6 @@ from jaxvib.machine.effects.terms import ContactFriction, LoadInteraction, Suppo
 from jaxvib.machine.scene import Scene
 from jaxvib.study.audit.comparisons import MotionValues, mean_torque
 
-__all__ = ["NumberRow", "dimensionless_numbers", "gravity_share"]
-
 _G = 9.81
 _STEEL = 7850.0
 _ROLLING, _BEARING, _BEARING_WIDTH = 3e-5, 0.0015, 0.2

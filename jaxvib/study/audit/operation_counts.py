@@ -19,8 +19,6 @@ from jaxvib.machine.torus import torus_balls
 from jaxvib.study.audit.compared import field_operations
 from jaxvib.units import Numbers
 
-__all__ = ["OperationCount", "operation_counts"]
-
 T = TypeVar("T")
 
 

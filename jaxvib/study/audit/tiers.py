@@ -17,8 +17,6 @@ from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 from jaxvib.study.accuracy.tier import TIERS, JamValues, Tier
 from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunComparison
 
-__all__ = ["TierRow", "tier_rows"]
-
 
 class TierRow(NamedTuple):
     """One tier of an audit.

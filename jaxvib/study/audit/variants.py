@@ -18,8 +18,6 @@ from jaxvib.machine.files import EFFECTS
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.scene import Scene
 
-__all__ = ["Variant", "possible_variants", "present_variants"]
-
 _DROOP = 0.015
 """Relative decrease of the speed of an induction motor twice as strong as needed: half of a usual rated slip of 3 %."""
 

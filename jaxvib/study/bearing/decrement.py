@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_points"]
-
-
 _LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
 """Amplitude, rad, above which the averaged formula and the fitted arcs have a relative error, and that error."""
 

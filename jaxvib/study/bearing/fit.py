@@ -19,8 +19,6 @@ from jaxvib.study.bearing.decrement import TurningPoints, period_stretch
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
 
-__all__ = ["TOLERANCE", "Fit", "Unknowns", "first_guess", "fit_swing", "steps_for"]
-
 _MOST_ITERATIONS = 64
 
 TOLERANCE = 1e-9

@@ -31,8 +31,6 @@ from jaxvib.study.bearing.swing import BearingPendulum
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["Identified", "IdentifyStatus", "identify"]
-
 _AT_REST = 1.3
 """Number of half periods without a turning point before the first or after the last one that ends a swing; a swinging pendulum
 has at most 1.2."""

@@ -13,9 +13,6 @@ from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number, number
 
-__all__ = ["TEMPLATE", "Measurement", "measurement_from_tables"]
-
-
 _FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "from": "from_", "until": "until"}
 """Names of a record's fields in a file, and in Python, in which `from` is a keyword."""
 

@@ -14,8 +14,6 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, read_text
 from jaxvib.results.fields import in_unit
 
-__all__ = ["Record", "read_record"]
-
 _MAX_BYTES, _MAX_LINE = 2**26, 10_000
 """Largest number of bytes of a record (some million samples), and of characters of a line."""
 

@@ -28,8 +28,6 @@ from jaxvib.units.known import when_known
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
-
 
 class BearingPendulum(eqx.Module):
     """Pendulum on a bearing at rest, its angle f counted from hanging.

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["CAUGHT", "Capture", "CaptureStatus", "capture", "capture_time", "thrown_state"]
-
 CAUGHT = 3e-3
 """Relative difference of speeds below which a load turns with the rotor, as in `regime`."""
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["ThresholdCurve", "threshold_curve"]
-
 
 class ThresholdCurve(Result):
     """Threshold of capture over a number of the scene.

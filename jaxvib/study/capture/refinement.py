@@ -24,8 +24,6 @@ from jaxvib.motion.integrate import effects_rate
 from jaxvib.motion.start import with_spin
 from jaxvib.runtime.programs import cached
 
-__all__ = ["DOUBLINGS", "Refined", "refine", "steps_per_second"]
-
 DOUBLINGS = 2
 """Default number of times that steps are doubled at most."""
 

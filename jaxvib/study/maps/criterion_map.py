@@ -24,8 +24,6 @@ from jaxvib.steady.balance.states import balanced_growth, stability_changes
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["CriterionMap", "criterion_map"]
-
 
 class CriterionMap(Result):
     """Comparison of the criterion with exact stability for a machine with lighter or heavier loads and weaker or stronger drag.

@@ -35,8 +35,6 @@ from jaxvib.units import Number, count, number, numbers, random_numbers
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["RunUps", "run_ups"]
-
 _FAILED = "failed"
 """Name of the outcome of a run that did not reach its end and has no regime."""
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["StabilityMap", "stability_map", "stability_onset"]
-
 
 class StabilityMap(Result):
     """Exact jams over a design number x.
