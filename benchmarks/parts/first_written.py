@@ -38,7 +38,7 @@ def single(end: float, error: float, exact: list[float]) -> list[list[Any]]:
     for name, solver in (("Tsit5", diffrax.Tsit5()), ("Dopri8", diffrax.Dopri8())):
         run = jax.jit(lambda t, solver=solver: solved(SCENE, solver, end, t))
         chosen, found, compiling = reach(lambda t, run=run: np.asarray(run(t)), TOLERANCES[8:], np.asarray(exact), error)
-        rows.append([f"diffrax {name} as first written", best(lambda run=run, c=chosen: run(c), 2), found, compiling])
+        rows.append([f"diffrax {name} as documented", best(lambda run=run, c=chosen: run(c), 2), found, compiling])
     return rows
 
 
@@ -49,7 +49,7 @@ def ensemble(end: float, error: float, exact: list[list[float]], speeds: list[fl
     many = jax.jit(jax.vmap(one, in_axes=(0, None)))
     values = jnp.asarray(speeds)
     chosen, found, compiling = reach(lambda t: np.asarray(many(values, t)), TOLERANCES[4:], np.asarray(exact), error)
-    return [["vmap(diffrax Dopri8) as first written", best(lambda: many(values, chosen), 2), found, compiling]]
+    return [["vmap(diffrax Dopri8) as documented", best(lambda: many(values, chosen), 2), found, compiling]]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""An ensemble of runs over rotor speeds: jaxvib against native loops and vmap(diffrax) as first written.
+"""An ensemble of runs over rotor speeds: jaxvib against native loops and vmap(diffrax) as its documentation shows.
 
 Run by engine.py. The machine and its start are those of single.py, rotor speeds from 3 to 6; the error is the largest one
 in all states at the end. diffrax runs a share of them only, spread over the same speeds, and its time is scaled up.
@@ -40,7 +40,7 @@ def ensemble(quick: bool = False, error: float = 1e-5) -> None:
     chosen, found, _ = reach(lambda n: simd(y0, speeds, par, end, int(n)), settings, exact, error)
     base = best(lambda: simd(y0, speeds, par, end, int(chosen)))
     steps = f"{chosen:g} steps"
-    say(group, "native, vector instructions by hand (numba)", base, base, found, native_compile, steps)
+    say(group, "native, hand-written vector instructions (numba)", base, base, found, native_compile, steps)
     _, found, compiling = reach(ours, [chosen], exact, error)
     seconds = best(lambda: jv.ensemble(make, values, end, stepsize_controller=jv.EqualSteps(int(chosen)), estimate=False).state)
     say(group, "jaxvib.ensemble", seconds, base, found, compiling, steps)

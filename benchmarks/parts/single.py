@@ -85,7 +85,7 @@ def single(quick: bool = False, error: float = 1e-6) -> None:
         return flat(jax.tree.map(lambda leaf: leaf[-1], run.window.state))
 
     chosen, found, compiling = reach(whole, TOLERANCES, exact, error)
-    rows.append(("jaxvib.simulate, measured over its window", found, compiling, told(chosen, found, error)))
+    rows.append(("jaxvib.simulate, with measurements", found, compiling, told(chosen, found, error)))
     seconds = best_in_turn([*calls, lambda c=chosen: whole(c)])
     base = seconds[0]
     for each, (name, found, compiling, note) in zip(seconds, rows, strict=True):

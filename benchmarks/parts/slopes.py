@@ -34,7 +34,7 @@ def gradient(quick: bool = False) -> None:
 
     for how, steps in (("tolerance 1e-8", jv.Tolerance(1e-8)), ("equal steps", jv.EqualSteps(int(5 * end)))):
         group = f"gradient, {how}"
-        print(f"{group}: the end state of simulate by 6 numbers, T = {end:g}")
+        print(f"{group}: the end state of simulate with respect to 6 parameters, T = {end:g}")
         run = jax.jit(lambda x, steps=steps: value(x, steps=steps))
 
         def differences(x: jax.Array, run: Any = run) -> jax.Array:
@@ -42,7 +42,7 @@ def gradient(quick: bool = False) -> None:
             return jnp.stack([(run(x + m) - run(x - m)) / (2e-5 * x[k]) for k, m in enumerate(moves)])
 
         ways: list[tuple[str, Any]] = [
-            ("the run itself, jitted", run),
+            ("the run itself, under jit", run),
             ("forward mode", jax.jit(jax.jacfwd(lambda x, s=steps: value(x, diffrax.ForwardMode(), s)))),
             ("reverse mode", jax.jit(jax.grad(lambda x, s=steps: value(x, steps=s)))),
             ("finite differences, 12 runs", differences),
