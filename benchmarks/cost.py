@@ -57,7 +57,10 @@ def dry_friction() -> jv.Scene:
 
 SCENES: dict[str, tuple[str, Callable[[], jv.Cost]]] = {
     "jam": ("two-mass jam", lambda: jv.work_precision(jam(), mode=3)),
-    "fold": ("two-mass jam, at 0.999 times the rotor speed of its fold", lambda: jv.work_precision(near_a_fold(), mode=3, tolerances=COARSE)),
+    "fold": (
+        "two-mass jam, at 0.999 times the rotor speed of its fold",
+        lambda: jv.work_precision(near_a_fold(), mode=3, tolerances=COARSE),
+    ),
     "run_up": (
         "rotor with four pendulums, run-up of 6 s",
         lambda: jv.work_precision(published_rotor(9.2e-4, "uncoupled"), until=6.0, tolerances=COARSE),
