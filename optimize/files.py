@@ -105,7 +105,7 @@ def load_design(path: str | Path) -> Design:
     allowed = ["starts", "seed", "iterations", "rate", "polishing", "searcher"]
     for name, value in search.items():
         if name not in allowed:
-            raise InputError(f"search.{name}", f"is no field here; {suggest_name(name, allowed)}")
+            raise InputError(f"search.{name}", f"is not a field here; {suggest_name(name, allowed)}")
         if name == "searcher":
             require_searcher(value)
             continue
@@ -121,7 +121,7 @@ def load_design(path: str | Path) -> Design:
 def _demands(table: object, section: str) -> list[Demand]:
     quantity, more = quantity_from_table(table, section, ("at_most", "at_least"))
     if not more:
-        raise InputError(section, "has no limit; give at_most or at_least, or both")
+        raise InputError(section, "has no limit; give at_most, at_least or both")
     made = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
     return [made[name](limit) for name, limit in more.items()]
 

@@ -19,7 +19,7 @@ from optimize.synthesize import synthesize
 
 def _platforms(scene: Scene, least: int) -> Platforms:
     if not isinstance(scene, Scene) or not isinstance(scene.machine, Platforms):
-        raise InputError("scene", "has no machine of platforms; this recipe is for those")
+        raise InputError("scene", "needs a machine of platforms for this recipe")
     if scene.machine.mass.shape[0] < least:
         raise InputError("scene", f"has {scene.machine.mass.shape[0]} platforms; this recipe needs {least}")
     return scene.machine
@@ -33,7 +33,7 @@ def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[
             if value > 0.0:
                 found[f"machine.{kind}[{k}]"] = (float(value / range_), float(value * range_))
     if not found:
-        raise InputError("scene", "has no springs that could be changed")
+        raise InputError("scene", "has no springs that can be changed")
     return found
 
 
@@ -106,7 +106,7 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
     del machine
     mass = np.asarray(scene.loads.mass)
     if mass.ndim:
-        raise InputError("loads.mass", "differs from load to load; this recipe is for loads that share every number")
+        raise InputError("loads.mass", "differs from load to load; this recipe needs equal loads")
     space = DesignSpace(scene, {"loads.mass": (float(mass) / 10.0, float(mass) * 10.0)})
     return Design(space, total_mass(), subject_to=(amplitude(mode=mode, of=of) > least,))
 

@@ -37,10 +37,10 @@ _LEAST_MOVE = 1e-6
 class SynthesisStatus(eqx.Enumeration):
     """Outcomes of a search; the members are the sentences a user reads."""
 
-    done = "the search ended where no free number can improve the objective"
-    not_converged = "the best design that was found could still be improved: allow more polishing or more iterations"
-    contradictory = "no design in the bounds meets all demands at once"
-    interrupted = "the search was interrupted: this is the best it had"
+    done = "the search converged: no change of a free number improves the objective"
+    not_converged = "the search has not converged: allow more polishing or more iterations"
+    contradictory = "no design in the bounds meets all demands"
+    interrupted = "the search was interrupted: this is its best design"
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Limit(NamedTuple):
     def shortfall(self) -> str:
         """Return the distance of the machine from a violated limit as text."""
         if not math.isfinite(self.broken):
-            return "the nearest machine found has no such value"
+            return "the nearest machine does not have this quantity"
         unit, factor = shown_unit(self.unit, max(abs(self.value), abs(self.limit)))
         return f"at best {f'{self.value * factor:.5g} {unit}'.rstrip()}, {100.0 * self.broken:.3g} % off"
 

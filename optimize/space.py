@@ -63,7 +63,7 @@ def hold(quantity: Quantity, value: Number | None = None) -> Held:
         return Held(quantity, None)
     held = float(number(value, quantity.unit, f"hold.{quantity.name}"))
     if held == 0.0:
-        raise InputError(f"hold.{quantity.name}", "is 0; a quantity can be held at a value other than 0 only")
+        raise InputError(f"hold.{quantity.name}", "is 0; a held value must differ from 0")
     return Held(quantity, held)
 
 
@@ -155,14 +155,14 @@ class DesignSpace(eqx.Module):
         ranges = [(name, *_bounds(scene, name, bounds)) for name, bounds in free.items()]
         for name, values in chosen.items():
             if name in free:
-                raise InputError(f"choices.{name}", "is free already; name it once, as free or as a choice")
+                raise InputError(f"choices.{name}", "is free already; give it once, as free or as a choice")
             wide = values[-1] / values[0] >= 10.0 if values[0] > 0.0 else False
             ranges.append((name, find_number(scene, name, "choices"), values[0], values[-1], wide))
         taken: set = set()
         numbers, lows, highs, logs, choices_ = [], [], [], [], []
         for name, whole, low, high, log in ranges:
             if whole.entries & taken:
-                raise InputError(f"free.{name}", "frees a number that is free already; name each one once")
+                raise InputError(f"free.{name}", "frees a number that is free already; give each number once")
             taken |= whole.entries
             for each in present_numbers(scene, whole, "choices" if name in chosen else "free"):
                 if name in chosen:
@@ -180,7 +180,9 @@ class DesignSpace(eqx.Module):
         self.held = tuple(_with_value(held, scene) for held in hold)
         if len(self.held) >= self.size:
             raise InputError(
-                "hold", f"holds {len(self.held)} quantities with {self.size} free numbers; more must be free than held"
+                "hold",
+                f"holds {len(self.held)} quantities with {self.size} free numbers; there must be more "
+                "free numbers than held quantities",
             )
 
     @property
@@ -304,7 +306,7 @@ def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict
         one = find_number(scene, name, "choices")
         given = sorted({one.value(v, f"choices.{name}[{k}]") for k, v in enumerate(values)})
         if len(given) < 2:
-            raise InputError(f"choices.{name}", "has one value; put it into the scene, or give several")
+            raise InputError(f"choices.{name}", "has one value; put the value into the scene, or give several values")
         found[name] = tuple(given)
     return found, counts
 
@@ -314,7 +316,7 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
     for name, given in ties.items():
         target = find_number(scene, name, "ties")
         if target.entries & taken:
-            raise InputError(f"ties.{name}", "is free as well; a number that follows another cannot be free")
+            raise InputError(f"ties.{name}", "is free as well; a tied number cannot be free")
         pair = isinstance(given, (list, tuple)) and len(given) == 2
         source_name, factor = given if pair else (given, 1.0)
         if not isinstance(source_name, str):
@@ -334,7 +336,7 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
         if target.keeps_zeros(scene):  # an absent part of the machine stays absent
             ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):
-            raise InputError(f"ties.{name}", f"keeps its ratio to {source_name}, which is 0 in the scene; give a factor")
+            raise InputError(f"ties.{name}", f"has no ratio to {source_name}, which is 0 in the scene; give a factor")
         taken = taken | target.entries
         found.append(Tie(target, source, tuple(map(float, ratio))))
     return tuple(found)
@@ -345,7 +347,5 @@ def _with_value(held: Held, scene: Scene) -> Held:
         return Held(held.quantity, np.asarray(held.value))
     value = float(held.quantity(scene))
     if not (np.isfinite(value) and value != 0.0):
-        raise InputError(
-            f"hold.{held.quantity.name}", f"is {value} in the scene the search begins with; give the value it shall be held at"
-        )
+        raise InputError(f"hold.{held.quantity.name}", f"is {value} in the initial scene; give the value at which it is held")
     return Held(held.quantity, np.asarray(value))

@@ -199,10 +199,12 @@ def _checked(space: DesignSpace, objective: Quantity, subject_to: Demand | Seque
     validate_scene(space.scene)
     between(space.scene, objective.of)
     if not space.scene.drive.constant:
-        raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a design is sought at one speed, give a ConstantSpeed")
+        raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a search needs a constant speed, use ConstantSpeed")
     if space.scene.drive.speed.dtype != jnp.float64:
         raise InputError(
-            "scene", 'is in float32; a search needs jax.config.update("jax_enable_x64", True) before the scene is built'
+            "scene",
+            'is in float32; a search needs double precision: call jax.config.update("jax_enable_x64", '
+            "True) before the scene is created",
         )
     return demands
 
@@ -261,7 +263,7 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
     """Return the design space with another number of loads. **Raises** `InputError` for loads with individual numbers."""
     now = space.scene.loads
     if not getattr(now, "alike", False):
-        raise InputError("choices.loads.count", "needs loads that share every number; give one mass, radius and drag for all")
+        raise InputError("choices.loads.count", "needs equal loads; give one mass, radius and drag for all")
     scene = eqx.tree_at(lambda s: s.loads, space.scene, dataclasses.replace(now, count=loads))
     return eqx.tree_at(lambda s: s.scene, space, validate_scene(scene))
 
@@ -274,7 +276,7 @@ def _mode_of(objective: Quantity, demands: Sequence[Demand]) -> int | None:
 def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
     """Integrate the full equations until they have settled in a jam mode; return the run, or the reason why there is none."""
     if mode is None:
-        return None, "the objective and the demands belong to no jam mode that could be integrated"
+        return None, "neither the objective nor the demands have a jam mode to integrate"
     if not verify:
         return None, "not requested"
     try:  # a failed verification must not lose the machine

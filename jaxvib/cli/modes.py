@@ -142,7 +142,7 @@ def _left_out(scene: jv.Scene) -> list[str]:
     from jaxvib.machine.effects.terms import RotorImbalance
 
     named = " and ".join(effect.kind.replace("_", " ") for effect in scene.all_effects if has_term([effect], RotorImbalance))
-    return [f"amplitudes and forces are the loads' alone: the {named} shakes at the rotor's own speed, on top"] if named else []
+    return [f"amplitudes and forces are the loads' alone: the {named} adds a vibration at the rotor speed"] if named else []
 
 
 def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
@@ -155,7 +155,7 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     jams = [found.select(k) for k in range(found.omega.shape[0])]
     document = {
         "rotor_speed": scene.drive.speed,
-        "judged": "by the growth of small disturbances, for light loads of which each moves for itself",
+        "judged": "by the growth rate of small disturbances, for light loads that move independently",
         "phase_jams": [
             {
                 **fields_of(jam, "omega", "stable", "growth"),

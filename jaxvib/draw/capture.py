@@ -25,7 +25,7 @@ def threshold_chart(
     axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0], label="share, with its standard error")
     if np.isfinite(threshold):
         axis.axvline(threshold, color=COLORS[1], ls="--", label=f"threshold {threshold:.3f}")
-    axis.set_xlabel("initial speed relative to the rotor, in the rotor's speed")
+    axis.set_xlabel("initial speed relative to the rotor / rotor speed")
     axis.set_ylabel("share of starts captured")
     axis.set_ylim(-0.05, 1.05)
     legend_above(axis)
@@ -42,16 +42,14 @@ def curve_chart(
     1
     """
     figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
-    axis.fill_between(value, threshold, 0.0, color=COLORS[0], alpha=0.12, lw=0.0, label="every start captured")
+    axis.fill_between(value, threshold, 0.0, color=COLORS[0], alpha=0.12, lw=0.0, label="all starts captured")
     axis.errorbar(value, threshold, uncertainty, marker="o", ms=4.0, capsize=3.0, color=COLORS[0], label="threshold")
     apart = np.where(least < threshold - uncertainty, least, np.nan)
     if np.any(np.isfinite(apart)):
-        axis.plot(value, apart, "v", color=COLORS[1], label="least captured speed")
+        axis.plot(value, apart, "v", color=COLORS[1], label="lowest captured speed")
     missing = np.isnan(threshold)
     if np.any(missing):
-        axis.plot(
-            value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not every start captured"
-        )
+        axis.plot(value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not all starts captured")
     axis.set_xlabel("value")
     axis.set_ylabel("initial speed relative to the\nrotor, in the rotor's speed")
     axis.set_ylim(-1.03, 0.0)

@@ -30,7 +30,7 @@ def tiers_chart(
     log_ticks(axes, "x")
     log_ticks(axes)
     axes.set_xlabel("mass of a load, kg")
-    axes.set_ylabel("leading order against exact, relative")
+    axes.set_ylabel("relative error of the leading order")
     legend_above(axes)
     return figure if ax is None else ax
 
@@ -75,7 +75,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[
         Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"),
         Patch(color=_FLOOR),
     ]
-    extra_labels = ["cheapest within " + ", ".join(f"{error:.0e}" for error in error_levels), "reference's own error"]
+    extra_labels = ["cheapest within " + ", ".join(f"{error:.0e}" for error in error_levels), "error of the reference"]
     if ax is None:
         labels, place = [*names, *extra_labels], "outside upper left"
         figure.legend(handles, labels, loc=place, ncols=3 * columns, frameon=False, fontsize="small")
@@ -101,7 +101,7 @@ def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], loo
     axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([floor, *errors, 1e-2]))
     for error in error_levels:
         axes.axhline(error, color="black", ls=":", lw=1.0, zorder=0.5)
-    axes.set_xlabel("time, once compiled")
+    axes.set_xlabel("time without compilation")
     low, high = axes.get_xlim()
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100.0 * low else (1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(EngFormatter(unit="s"))
@@ -181,7 +181,7 @@ def audit_chart(
 
     >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01, np.array([0.05]))
     >>> figure.axes[0].get_xlabel()
-    'changes by, %'
+    'change, %'
     """
     n = len(labels)
     figure, (left, right) = panels(1, 2, size=(6.0, 1.6 + 0.34 * max(n, 3)), ax=ax)
@@ -202,7 +202,7 @@ def audit_chart(
     left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="requested accuracy")
     left.set_yticks(place, labels)
     left.set_ylim(n - 0.4, -0.6)
-    left.set_xlabel("changes by, %")
+    left.set_xlabel("change, %")
     legend_above(left, 3)
     right.barh(place, 100.0 * added, color=COLORS[0], height=0.55)
     right.set_yticks(place, [])
@@ -232,7 +232,7 @@ def steps_chart(
     for color, name, line, x, y in zip(itertools.cycle(COLORS), names, off, best, at_best, strict=False):
         axes.loglog(steps, np.maximum(line, floor), color=color, label=name)
         axes.loglog([x], [max(y, floor)], "o", color=color, mfc="none", ms=8)
-    axes.axhline(tolerance, color="black", ls=":", lw=1.2, label="tolerance; rings: the best step")
+    axes.axhline(tolerance, color="black", ls=":", lw=1.2, label="tolerance; rings: best step")
     axes.set_xlabel("step, relative")
     axes.set_ylabel(f"differences against {route} mode")
     legend_above(axes)

@@ -12,9 +12,9 @@ from matplotlib.patches import Patch
 from jaxvib.draw.style import GUIDE, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
 
 _KINDS = (
-    ("loads gather, both say", "#ececec"),
-    ("loads balance, both say", "#9bd3c7"),
-    ("balance foretold, not so", "#d55e00"),
+    ("loads gather (both agree)", "#ececec"),
+    ("loads balance (both agree)", "#9bd3c7"),
+    ("criterion predicts balance, wrongly", "#d55e00"),
     ("balance missed", "#004488"),
 )
 

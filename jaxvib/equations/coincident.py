@@ -126,7 +126,7 @@ def require_coincident(scene: Scene) -> CircularLoads:
 
 
 def _require_balance(effects: tuple[Effect, ...]) -> None:
-    problem = "shakes|shake the machine at the rotor's own speed, so that no motion repeats"
+    problem = "excites|excite the machine at the rotor speed as well, so that no motion is periodic"
     require_terms(effects, COINCIDENT_TERMS, problem, "or simulate")
 
 

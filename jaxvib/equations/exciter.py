@@ -417,7 +417,7 @@ class ExciterDynamics(RotorDynamics):
         if not self.can_slide:
             return None
         if state.spin is None or state.spin.slip is None:
-            raise InputError("state.spin", "has no slip, which an effect of the scene releases; see with_spin(scene, state)")
+            raise InputError("state.spin", "has no slip, but an effect of the scene needs it; use with_spin(scene, state)")
         return state.spin.slip
 
     def _drilling_spin(self, state: ExciterState, speed: Array) -> DrillingSpin | None:
@@ -425,7 +425,7 @@ class ExciterDynamics(RotorDynamics):
             return None
         if state.spin is None or state.spin.drilling is None:
             raise InputError(
-                "state.spin", "has no drilling spin, which an effect of the scene releases; see with_spin(scene, state)"
+                "state.spin", "has no drilling spin, but an effect of the scene needs it; use with_spin(scene, state)"
             )
         return self.loads.drilling_spin(state.angle, state.rate, speed, state.spin.slip)
 

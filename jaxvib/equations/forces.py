@@ -291,7 +291,7 @@ def _normal_force(scene: Scene, t: Array, state: State) -> Array:
             continue
         found = exciter.loads.normal_force(own.angle, own.rate, total_gravity(scene.effects))
         if found is None:
-            problem = f"is {exciter.loads.kind!r}; nothing says how they press on their track (Loads.normal_force)"
+            problem = f"is {exciter.loads.kind!r}, whose normal force on the track is not defined (Loads.normal_force)"
             raise InputError("loads.kind", problem)
         forces.append(found.at(mount.load_rates(acceleration)))
     return forces[0] if len(forces) == 1 else jnp.concatenate([jnp.zeros(0, acceleration.dtype), *forces])

@@ -82,8 +82,8 @@ _DIRECT = 3
 class FrequencyStatus(eqx.Enumeration):
     """Outcome of a computation of natural frequencies; each member is the sentence that a user reads."""
 
-    done = "the answer was computed"
-    lost_digits = "rounding hides a natural frequency: use double precision, or stiffnesses and masses that differ less"
+    done = "the result was computed"
+    lost_digits = "rounding errors hide a natural frequency: use double precision, or stiffnesses and masses that differ less"
 
 
 class LinearModel(Model):
@@ -174,7 +174,7 @@ class JammedModel(LinearModel):
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
         """Return `steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
         if self.mount.gyroscopic is not None and speed is None:
-            problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
+            problem = "jam modes are defined for platforms; use phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
         modal = self.modal
         if modal is None:
@@ -328,7 +328,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
     def check(drag: np.ndarray | float) -> None:
         if not (np.all if each else np.any)(np.asarray(drag) > 0.0):
-            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, use a drag greater than 0")
 
     when_known(check, loads.drag)
 
@@ -341,7 +341,7 @@ def require_one_point(scene: Scene) -> None:
 def _require_one_point(mount: Mount) -> None:
     if not mount.at_one_point:
         problem = (
-            "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
+            "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, or simulate"
         )
         raise InputError("machine.stations", problem)
 
@@ -362,15 +362,18 @@ def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[Circ
     loads, drive = scene.loads, scene.drive
     mount = scene.mounting()
     if mount.turn is not None:
-        problem = "turns with the housing of its exciter, which this theory leaves out: simulate, settle or ensemble follow it"
+        problem = (
+            "rotates with the housing of its exciter, which this function does not include: use simulate, settle or ensemble"
+        )
         raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
     if not loads.circular:
-        holds = "this holds for loads on a circle (property circular): ball, roller, pendulum"
-        raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {holds}; simulate others")
+        holds = "this function needs loads on a circle (property circular): ball, roller, pendulum"
+        raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {holds}; use simulate for others")
     if not drive.ideal:
         raise InputError(
             "drive.kind",
-            f"is {quoted(drive.kind)}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
+            f"is {quoted(drive.kind)}; this function needs a prescribed rotor speed (property ideal): "
+            "use ConstantSpeed, or simulate",
         )
     require_terms(scene.all_effects, included)
     return cast(CircularLoads, loads), mount
@@ -379,7 +382,7 @@ def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[Circ
 def require_terms(
     effects: Sequence[Effect],
     included: tuple[type[Term], ...],
-    problem: str = "is|are not part of this theory",
+    problem: str = "is|are not included in this function",
     advice: str = "here, or simulate",
 ) -> None:
     """Require that a theory includes every term of the `effects`.

@@ -88,7 +88,7 @@ class State(eqx.Module):
         exciters: Sequence[ExciterState] | None = None,
     ):
         if exciters is not None and (angle or rate or rotor is not None or spin is not None):
-            raise InputError("exciters", "are given beside angle, rate, rotor or spin; give these to an ExciterState")
+            raise InputError("exciters", "are given together with angle, rate, rotor or spin; give these to an ExciterState")
         self.displacement, self.velocity = displacement, velocity
         self.exciters = (ExciterState(angle, rate, rotor, spin),) if exciters is None else tuple(exciters)
 

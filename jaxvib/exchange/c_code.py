@@ -156,7 +156,7 @@ class _Writer:
         if (rule := _SPECIAL.get(name)) is not None:
             return [rule(values, params, equation)]
         if name not in _RULES or (name == "div" and not _is_real(equation)):
-            problem = f"needs the operation {name!r} of JAX, which has no rule in C; leave out the part that needs it"
+            problem = f"needs the operation {name!r} of JAX, for which there is no C code; remove the part that needs it"
             raise InputError("scene", problem)
         return [_RULES[name].format(*values)]
 

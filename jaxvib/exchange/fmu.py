@@ -121,9 +121,7 @@ def export_fmu(
     require_one_of(fmi, ("2.0", "3.0"), "fmi")
     require_one_of(drive, ("scene", "input"), "drive")
     if isinstance(start, str) and start == "spin_up":
-        raise InputError(
-            "start", "is 'spin_up', which is a drive of its own; give the scene a drive SpinUp and start at 'rest'"
-        )
+        raise InputError("start", "is 'spin_up', which replaces the drive; give the scene a SpinUp drive and start at 'rest'")
     scene = validate_scene(scene)
     state = validate_state(scene, start, mode) if isinstance(start, State) else initial_state(scene, start, mode=mode)
     path = Path(path)
@@ -191,8 +189,8 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
     try:
         programs = scalar_program(equations.rates, *given), scalar_program(tangent, *given, *given[2:])
     except NotScalarizable as error:
-        problem = f"needs the operation {str(error)!r} of JAX, which has no rule on single numbers"
-        raise InputError("scene", f"{problem}; leave out the part that needs it") from error
+        problem = f"needs the operation {str(error)!r} of JAX, which is not available for single numbers"
+        raise InputError("scene", f"{problem}; remove the part that needs it") from error
     numbers = [f"p[{k}]" for k in range(parameters)]
     count = {"x": len(equations.state_signals), "u": len(equations.input_signals), "y": len(equations.output_signals)}
     moving = [f"{name}[{k}]" for name in "xu" for k in range(count[name])]

@@ -159,7 +159,7 @@ def state_space(
     scene = validate_scene(scene)
     if isinstance(at, (Jam, PhaseJam)):
         if rotor_speed is not None:
-            raise InputError("rotor_speed", f"is {quoted(rotor_speed)}, but a jam has its own; leave it out")
+            raise InputError("rotor_speed", f"is {quoted(rotor_speed)}, but a jam has its own rotor speed; leave it out")
         return _in_jam(scene, at)
     if at != "rest":
         raise InputError("at", f"is {quoted(at)}; it must be 'rest' or a jam, for example jam_modes(scene).select(3)")
@@ -202,19 +202,19 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
 
 def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
     if not np.ndim(jam.omega) == 0 or not np.isfinite(jam.omega):
-        raise InputError("at", f"is no single jam that exists ({jam.message}); take one that does, with select(mode)")
+        raise InputError("at", f"must be one existing jam ({jam.message}); choose one with select(mode)")
     scene = scene.replace(drive=ConstantSpeed(jam.rotor_speed))
     phase = jam.phase if isinstance(jam, PhaseJam) else jnp.zeros(scene.loads.count)
     if phase.shape != (scene.loads.count,) or jam.displacement.shape != scene.machine.structure().mass.shape[:1]:
         raise InputError(
-            "at", "is the jam of a machine with other coordinates or another number of loads; take one of this scene"
+            "at", "is the jam of a machine with other coordinates or another number of loads; use a jam of this scene"
         )
     averaged_field(scene)  # raises errors for effects outside the averaged equations before anything is compiled
     found = jax.tree.map(np.asarray, _jam_matrices(scene, jam.omega, phase, jam.displacement))
     (a, b, c, d), x0, y0, residual = found
     if not residual < _MAX_RESIDUAL:
-        problem = f"is no equilibrium of the averaged equations of this scene (relative residual {float(residual):.1e})"
-        raise InputError("at", f"{problem}; take a jam of this scene, of loads that differ one from phase_jams(scene)")
+        problem = f"is not an equilibrium of the averaged equations of this scene (relative residual {float(residual):.1e})"
+        raise InputError("at", f"{problem}; use a jam of this scene, or for different loads one from phase_jams(scene)")
     carrier, loads = scene.machine.structure(), range(1, scene.loads.count + 1)
     parts = [("displacement", 0), ("velocity", 1)]
     states = [signal for name, order in parts for part in ("real", "imaginary")

@@ -138,9 +138,9 @@ def export_uff(
         given = {"frequencies": frequencies, "rotor_speed": rotor_speed}
         for name, value in given.items():
             if value is not None:
-                raise InputError(name, f"is {quoted(value)}, which goes with a scene, not with a run; leave it out")
+                raise InputError(name, f"is {quoted(value)}, which is an option for a scene, not for a run; leave it out")
         if quantity == "acceleration":
-            raise InputError("quantity", "is 'acceleration', which a run does not keep; give 'displacement' or 'velocity'")
+            raise InputError("quantity", "is 'acceleration', which a run does not save; use 'displacement' or 'velocity'")
         scene, content = source.scene, _histories(source, quantity)
     pyuff = optional_module("pyuff", "uff")
     with written(path) as part:
@@ -352,7 +352,9 @@ def read_uff(path: str | Path) -> UffFile:
     functions = tuple(_read_function(each, length, force) for each in sets if each.get("type") == 58)
     if not functions:
         raise InputError(
-            "path", f"is {quoted(str(path))}, which has no function (dataset 58); give a file with histories or FRFs"
+            "path",
+            f"is {quoted(str(path))}, which contains no function (dataset 58); give a file with time "
+            "histories or frequency response functions",
         )
     nodes = {}
     for each in sets:

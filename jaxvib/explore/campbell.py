@@ -21,7 +21,7 @@ _LETTER = 0.11
 _LEGEND = {
     "forward whirl": _FORWARD,
     "backward whirl": _BACKWARD,
-    "whirl as fast as the rotor": ROTOR,
+    "whirl speed = rotor speed": ROTOR,
     "operating speed": OPERATING,
     "critical speeds (no damping), rpm": _CRITICAL,
 }

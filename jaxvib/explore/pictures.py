@@ -72,7 +72,7 @@ def _shown(make: Callable[[], str], scene: SceneOrProblem) -> str:
             return make()
         except (InputError, ComputationError) as error:
             problem = str(error)
-    return f"<p><b>Nothing to show here:</b> {html.escape(problem)}</p>"
+    return f"<p><b>No figure:</b> {html.escape(problem)}</p>"
 
 
 def toml(scene: SceneOrProblem) -> str:

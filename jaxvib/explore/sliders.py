@@ -95,7 +95,7 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
     loads = scene.loads
     for name, value in values.items():
         if name not in sliders:
-            raise InputError(name, f"is no slider of this scene; there are: {', '.join(sliders)}")
+            raise InputError(name, f"is not a slider of this scene; the sliders are: {', '.join(sliders)}")
         slider = sliders[name]
         if value == slider.start:
             continue

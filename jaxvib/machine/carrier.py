@@ -140,7 +140,7 @@ class Machine(Part):
         [[0.0, 1.0]]
         """
         if place is not None:
-            problem = f"names a place on a machine of kind {quoted(self.kind)}, all points of which move alike; leave it out"
+            problem = f"names a place on a machine of kind {quoted(self.kind)}, whose points all move together; leave it out"
             raise InputError(name, problem)
         return self.mount().rows[0]
 

@@ -97,9 +97,9 @@ def _tables(text: str, name: str) -> Tables:
     except InputError:
         raise
     except RecursionError as error:
-        raise InputError(name, "is nested too deep; the files of jaxvib need four levels") from error
+        raise InputError(name, "is nested too deeply; files of jaxvib have at most four levels") from error
     except ValueError as error:  # not TOML, or a number with more digits than Python reads
-        raise InputError(name, f"is no TOML file: {error}") from error
+        raise InputError(name, f"is not a TOML file: {error}") from error
     return tables
 
 
@@ -113,7 +113,7 @@ def _require_plain(value: object, name: str) -> None:
         for k, entry in enumerate(value):
             _require_plain(entry, f"{name}[{k}]")
     elif isinstance(value, str) and (found := CONTROL.search(value)):
-        raise InputError(name or "the file", f"holds the control character {quoted(found[0])}; leave it out")
+        raise InputError(name or "the file", f"contains the control character {quoted(found[0])}; leave it out")
 
 
 _MARKS = {
@@ -135,11 +135,11 @@ def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> 
     """
     other = next((each for each, marks in _MARKS.items() if each != kind and any(mark in tables for mark in marks)), None)
     if other is None or any(mark in tables for mark in _MARKS[kind]):
-        return InputError(name, f"is no part of a {kind} file; {suggest_name(name, allowed)}")
+        return InputError(name, f"is not part of a {kind} file; {suggest_name(name, allowed)}")
     if kind == "scene":
-        return InputError(name, f"is no part of a scene file: this is a {other} file; give the scene file that it is about")
+        return InputError(name, f"is not part of a scene file: this is a {other} file; give the scene file that it refers to")
     new = "sweep" if kind == "study" else kind
-    return InputError(name, f"is no part of a {kind} file: this is a {other} file; `jaxvib new {new}` prints a {kind} file")
+    return InputError(name, f"is not part of a {kind} file: this is a {other} file; `jaxvib new {new}` prints a {kind} file")
 
 
 @validated
@@ -233,7 +233,7 @@ def scene_from_tables(tables: Tables) -> Scene:
         parts[name] = _built(tables[name], name, SECTIONS[name])
     for name in ("loads", "drive") if several else ():
         if name in tables:
-            raise InputError(name, f"stands beside [[exciters]]; write [exciters.{name}] below each [[exciters]]")
+            raise InputError(name, f"is given as well as [[exciters]]; write [exciters.{name}] below each [[exciters]]")
     effects = _built_effects(tables.get("effects", {}))
     if not several:
         return Scene(**parts, effects=effects)
@@ -259,7 +259,7 @@ def _built_effects(chosen: object) -> tuple[Effect, ...]:
     effects = []
     for name, value in chosen.items():
         if name not in EFFECTS:
-            raise InputError(f"effects.{name}", f"is no effect; {suggest_name(name, list(EFFECTS))}")
+            raise InputError(f"effects.{name}", f"is not an effect; {suggest_name(name, list(EFFECTS))}")
         if isinstance(value, Mapping):
             effects.append(build_part(EFFECTS[name], value, f"effects.{name}"))
         elif isinstance(value, list) and EFFECTS[name].repeatable and all(isinstance(each, Mapping) for each in value):
@@ -288,7 +288,7 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     prefix = f"{section}." if section else ""
     for name in values:
         if name not in parameters:
-            raise InputError(prefix + name, f"is no field here; {suggest_name(name, list(parameters))}")
+            raise InputError(prefix + name, f"is not a field here; {suggest_name(name, list(parameters))}")
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
@@ -412,20 +412,20 @@ speed = "{speed}"
 """
 
 TEMPLATES: dict[str, str] = {
-    "one_mass": """# A platform on a support; the auto-balancer's loads shake it.
-# Numbers are SI; text may carry any unit of the same dimension.
+    "one_mass": """# A platform on a support, with an exciter.
+# Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "one_mass"
-mass = 120.0                # kg, auto-balancer's body included, loads not counted
+mass = 120.0                # kg, with the body of the exciter, without the loads
 stiffness = "50 N/mm"       # of the support
 damping = 40.0              # N s/m
 """
     + _REST.format(speed="600 rpm"),
-    "two_mass": """# Two platforms on supports, joined by a link; platform 2 carries the auto-balancer.
-# Numbers are SI; text may carry any unit of the same dimension.
+    "two_mass": """# Two platforms on supports, joined by a link; platform 2 carries the exciter.
+# Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "two_mass"
-mass = [120.0, 117.6]       # kg; of platform 2 with the auto-balancer's body, loads not counted
+mass = [120.0, 117.6]       # kg; platform 2 includes the body of the exciter, without the loads
 stiffness = [5.0e4, 5.0e4]  # N/m, of the supports to the foundation
 damping = [40.0, 40.0]      # N s/m
 link_stiffness = 2.0e5      # N/m, between the platforms
@@ -433,11 +433,11 @@ link_damping = 60.0         # N s/m
 # exciter = 2               # the platform with the auto-balancer
 """
     + _REST.format(speed="1500 rpm"),
-    "three_mass": """# Three platforms; the links are those between 1-2, 1-3 and 2-3 (0 where there is none).
-# Numbers are SI; text may carry any unit of the same dimension.
+    "three_mass": """# Three platforms; the links are those between 1-2, 1-3 and 2-3 (0: no link).
+# Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "three_mass"
-mass = [60.0, 80.0, 57.6]   # kg; of the exciter's platform with the auto-balancer's body, loads not counted
+mass = [60.0, 80.0, 57.6]   # kg; the exciter's platform includes the body of the exciter, without the loads
 stiffness = [0.0, 5.0e4, 0.0]
 damping = [0.0, 40.0, 0.0]
 link_stiffness = [1.0e5, 0.0, 1.0e5]
@@ -446,10 +446,10 @@ exciter = 3                 # the platform with the auto-balancer
 """
     + _REST.format(speed="1500 rpm"),
     "network": """# Any number of platforms, supports and links.
-# Numbers are SI; text may carry any unit of the same dimension.
+# Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "network"
-mass = [40.0, 40.0, 40.0, 37.6]       # kg; of the exciter's platform with the auto-balancer's body, loads not counted
+mass = [40.0, 40.0, 40.0, 37.6]       # kg; the exciter's platform includes the body of the exciter, without the loads
 stiffness = [2.0e4, 0.0, 0.0, 2.0e4]  # N/m, 0 where a platform has no support
 damping = [20.0, 0.0, 0.0, 20.0]      # N s/m
 links = [[1, 2], [2, 3], [3, 4]]      # pairs of platforms

@@ -298,7 +298,7 @@ def _circular(
 def _fit(loads: CircularLoads, r: Array) -> None:
     """**Raises** `InputError` if the loads, of radius `r`, have no room side by side."""
     if not loads.alike:
-        raise InputError("loads.ball_radius", "is for loads that share every number; give one mass, radius and drag for all")
+        raise InputError("loads.ball_radius", "needs equal loads; give one mass, radius and drag for all")
     when_known(partial(require_side_by_side, loads.count), loads.radius, r)
 
 
@@ -315,7 +315,7 @@ def require_side_by_side(count: int, radius: float, ball_radius: float) -> None:
     """**Raises** `InputError` if `count` loads of `ball_radius`, m, have no room side by side on a circle of `radius`, m."""
     most = radius * (1.0 if count == 1 else math.sin(math.pi / count))
     if not ball_radius < most:
-        problem = f"{count} side by side on a circle of {radius:.6g} m have room below {most:.6g} m"
+        problem = f"{count} side by side on a circle of {radius:.6g} m need a ball_radius below {most:.6g} m"
         raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m; {problem}")
 
 

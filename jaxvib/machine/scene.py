@@ -183,7 +183,7 @@ class Scene(Part):
     def exciter(self) -> Exciter:
         """Exciter of a scene that has one. **Raises** `InputError` if it has several."""
         if len(self.exciters) != 1:
-            problem = f"has {len(self.exciters)} exciters; this is for a scene with one, simulate follows several"
+            problem = f"has {len(self.exciters)} exciters; this function needs a scene with one, use simulate for several"
             raise InputError("scene", f"{problem} (their parts are scene.exciters[0].drive and so on)")
         return self.exciters[0]
 
@@ -200,7 +200,7 @@ class Scene(Part):
         """
         exciter = _require_anticlockwise(self.exciter)
         if exciter.loads is None or not exciter.is_plain:
-            problem = "has an unbalance; this is for loads on a balanced rotor, simulate others"
+            problem = "has an unbalance; this function needs a balanced rotor with loads, use simulate for others"
             raise InputError("scene.exciters[0]", problem)
         return exciter.loads
 
@@ -240,7 +240,9 @@ class Scene(Part):
 def _require_anticlockwise(exciter: Exciter) -> Exciter:
     # A method of an Equinox module costs 30 us a call, and each analysis reads this several times.
     if exciter.direction != 1:
-        raise InputError("scene.exciters[0].direction", "is -1; this is for anticlockwise rotors, simulate others")
+        raise InputError(
+            "scene.exciters[0].direction", "is -1; this function needs an anticlockwise rotor, use simulate for others"
+        )
     return exciter
 
 
@@ -260,9 +262,9 @@ def _require_fit(machine: Machine, exciter: Exciter) -> None:
         if loads is not None:
             effect.validate(machine, loads)
         elif not all(isinstance(term, RotorImbalance) for term in effect.terms()):
-            raise InputError(f"effects.{effect.kind}", "acts on loads, which this exciter does not have; leave it out")
+            raise InputError(f"effects.{effect.kind}", "acts on loads, but this exciter has none; remove it")
         if not exciter.drive.ideal and has_term([effect], DrillingSpinRelease, SlipRelease):
-            problem = f"needs a drive of given speed (property ideal), not {exciter.drive.kind!r}; use ConstantSpeed"
+            problem = f"needs a drive with prescribed speed (property ideal), not {exciter.drive.kind!r}; use ConstantSpeed"
             raise InputError(f"effects.{effect.kind}", problem)
     if loads is not None:
         require_comparable(machine, loads, exciter.drive)
@@ -283,7 +285,7 @@ def _read_exciters(
 ) -> tuple[Exciter, ...]:
     """Return the exciters of a scene. The `effects` of a rotor are added to the only exciter."""
     if loads is not None or drive is not None:
-        raise InputError("exciters", "are given beside loads or drive; give these to an Exciter")
+        raise InputError("exciters", "are given together with loads or drive; give these to an Exciter")
     if not isinstance(exciters, (tuple, list)) or len(exciters) == 0:
         raise InputError("exciters", f"is {quoted(exciters)}; it must be a list of exciters, for example [Exciter(...)]")
     for k, each in enumerate(exciters):
@@ -311,13 +313,13 @@ def read_effects(effects: object) -> tuple[Effect, ...]:
     kinds = [effect.kind for effect in effects if not effect.repeatable]
     for kind in kinds:
         if kinds.count(kind) > 1:
-            raise InputError("effects", f"names {kind} {kinds.count(kind)} times; once is allowed")
+            raise InputError("effects", f"contains {kind} {kinds.count(kind)} times; it is allowed once")
     first = {effect.kind: index for index, effect in reversed(list(enumerate(effects)))}
     return tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
 
 
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
-    """**Raises** `InputError` if rounding loses one of two numbers that are added. Traced numbers are not checked.
+    """**Raises** `InputError` if rounding errors hide one of two numbers that are added. Traced numbers are not checked.
 
     This happens if the loads are too heavy or too light for the machine, or their drag is too weak for their inertia.
     """
@@ -335,7 +337,7 @@ def _require_comparable(
         if not _MIN_RATIO <= total / whole <= 1.0 / _MIN_RATIO:
             raise InputError(
                 "loads.mass",
-                f"makes {total:.3g} kg in all on a machine of {whole:.3g} kg, so that rounding loses one beside the other; "
+                f"makes {total:.3g} kg in all on a machine of {whole:.3g} kg, and rounding errors hide one of them; "
                 f"loads may have {_MIN_RATIO:g} to {1.0 / _MIN_RATIO:g} times the machine's mass",
             )
     if drag is not None:
@@ -345,6 +347,6 @@ def _require_comparable(
             least = _MIN_RATIO * float(np.max(each[lost])) * speed
             raise InputError(
                 "loads.drag",
-                f"takes {float(np.min(share[lost])):.1e} of a load's speed while the rotor turns by a radian, which is lost in "
-                f"rounding; give 0, or {least:.1g} N s/m at least",
+                f"takes {float(np.min(share[lost])):.1e} of a load's speed while the rotor turns by one radian, less than the "
+                f"rounding error; give 0, or at least {least:.1g} N s/m",
             )

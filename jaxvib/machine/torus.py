@@ -188,13 +188,13 @@ def _require_room(count: int, radius: float, tube: float, ball_radius: float) ->
         raise InputError("loads.tube", f"is {tube:.6g} m; it must be less than the ring's radius, {radius:.6g} m")
     if not ball_radius < tube:
         problem = "leaves no gap" if ball_radius == tube else "is larger than the tube"
-        hint = "give a smaller one, or for balls that only run around the axis balls(...)"
+        hint = "give a smaller one, or use balls(...) for balls that only run around the axis"
         raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m, which {problem} of {tube:.6g} m radius; {hint}")
     require_side_by_side(count, radius + tube - ball_radius, ball_radius)
 
 
-TEMPLATE = """# A vertical rotor on one support, with balls in a torus that are to balance it.
-# Numbers are SI; text may carry any unit of the same dimension.
+TEMPLATE = """# A vertical rotor on one support, with balls in a torus as automatic balancer.
+# Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "planar_rotor"
 mass = 6.87                 # kg, the torus included, balls not counted
@@ -217,6 +217,6 @@ speed = "140 rad/s"
 [effects]                   # only those of the scene
 gravity = { along = "axis" }                   # the axis is vertical
 static_imbalance = { moment = "6.87 g m" }     # of the rotor: its mass times its eccentricity
-rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths its sign
+rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths the change of sign
 """
 """Scene file with comments."""

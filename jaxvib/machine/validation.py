@@ -105,7 +105,7 @@ def _rebuild(scene: Scene) -> None:
                 rebuild_part(exciter.loads, "loads")
             rebuild_part(exciter.drive, "drive")
             if (exciter.loads is not None, exciter.unbalance is not None) != tuple(x in exciter.carries for x in _CARRIED):
-                raise InputError("carries", f"is {exciter.carries}, not what the exciter has; make a new Exciter")
+                raise InputError("carries", f"is {exciter.carries}, which is not that of the exciter; create a new Exciter")
             if exciter.unbalance is not None:
                 read_numbers(Exciter, "", unbalance=exciter.unbalance)
             for effect in exciter.effects:
@@ -156,7 +156,7 @@ def _number(name: str, leaf: object) -> Array:
         try:
             leaf = jnp.asarray(leaf, dtype=float)
         except (TypeError, ValueError) as error:
-            raise InputError(name, f"is {quoted(leaf)}, which is not a number; put one in, in SI units") from error
+            raise InputError(name, f"is {quoted(leaf)}, which is not a number; give a number in SI units") from error
     when_known(functools.partial(_require_finite, name), leaf)
     return leaf
 
@@ -164,4 +164,4 @@ def _number(name: str, leaf: object) -> Array:
 def _require_finite(name: str, value: np.ndarray | float) -> None:
     if not np.all(np.isfinite(value)):
         wrong = np.asarray(value)[~np.isfinite(value)].ravel()[0]
-        raise InputError(name, f"is {wrong}; a finite number is needed, see how it was computed")
+        raise InputError(name, f"is {wrong}; it must be finite, check how it was computed")

@@ -53,17 +53,17 @@ def field_of(equations: Equations, scene: Scene) -> Callable[[Array, State], Sta
     field: Callable[[Array, State], State] = call_user(equations, "equations", scene)
     if callable(field):
         return field
-    raise InputError("equations", f"gives {quoted(field)}; it must give a function of a time and a State")
+    raise InputError("equations", f"returns {quoted(field)}; it must return a function of a time and a State")
 
 
 class EnsembleStatus(eqx.Enumeration):
     """Outcomes of a run of an ensemble; the members are the sentences a user reads."""
 
     done = "the run reached its end"
-    detached = "the run reached its end, but on the way a load lost contact with its track; the equations keep it there"
+    detached = "the run reached its end, but a load lost contact with its track, on which the equations hold it"
     not_finite = "the motion grew without bounds"
     refused = REFUSED
-    not_resolved = "the steps are too long for the decay of the loads by drag, or of the machine by damping: give more steps"
+    not_resolved = "the steps are too long for the decay of the loads by drag or of the machine by damping: use more steps"
 
 
 class Ensemble(Result):

@@ -55,9 +55,9 @@ _TURNS, _SAMPLES = 3.0, 4096
 class GrowthStatus(eqx.Enumeration):
     """Growth of small disturbances. Each member is the sentence shown to the user."""
 
-    regular = "small disturbances do not grow exponentially: derivatives of the motion mean what they say"
-    unstable = "the motion repeats itself and is unstable: small disturbances grow exponentially until it is left"
-    chaotic = "small disturbances grow exponentially: derivatives of a run longer than the horizon mean nothing"
+    regular = "small disturbances do not grow exponentially: derivatives of the motion are meaningful"
+    unstable = "the motion is periodic and unstable: small disturbances grow exponentially and the machine leaves it"
+    chaotic = "small disturbances grow exponentially: derivatives of a run longer than the horizon are meaningless"
     undecided = "the run is too short or too uneven to decide whether small disturbances grow exponentially: run longer"
 
 
@@ -149,7 +149,7 @@ def growth(
 
     Source: Benettin, Galgani, Giorgilli, Strelcyn 1980.
     """
-    require_known(scene, "scene", "growth", "transform jam_orbit or simulate instead")
+    require_known(scene, "scene", "growth", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
     if not scene.drive.constant:
         raise InputError(

@@ -290,7 +290,7 @@ def whole_turns(scene: Scene, stretch: float) -> float:
     if not speeds:
         return stretch
     if len(speeds) > 1:
-        problem = f"turn unbalances at {speeds} rad/s, which are never again where they were; simulate, or use motors"
+        problem = f"turn unbalances at {speeds} rad/s and have no common period; simulate, or use motors"
         raise InputError("exciters", problem)
     turn = 2.0 * math.pi / speeds[0]
     turns = stretch / turn

@@ -170,7 +170,7 @@ def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
         turns = end * fastest / (2.0 * math.pi)
         steps = 4096 + 500 * turns
         if not steps <= MAX_STEPS:
-            raise InputError("until", f"is {end:g} s, {turns:.2g} turns of what moves fastest; run shorter stretches")
+            raise InputError("until", f"is {end:g} s, {turns:.2g} turns of the fastest motion; run shorter stretches")
         return min(2 ** math.ceil(math.log2(steps)), MAX_STEPS)
 
     steps = when_known(steps_of, fastest, end)
@@ -204,7 +204,7 @@ def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) 
     require(chosen, Tolerance, Accuracy, EqualSteps, diffrax.AbstractStepSizeController)
     if isinstance(chosen, diffrax.AbstractStepSizeController):
         if estimate:
-            problem = "is True together with a controller, whose steps cannot be made larger; give a Tolerance"
+            problem = "is True together with a controller, whose steps cannot be enlarged; give a Tolerance"
             raise InputError("estimate", problem)
         return chosen
     if isinstance(chosen, EqualSteps):
@@ -212,7 +212,7 @@ def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) 
     precision = float(jnp.finfo(end.dtype).eps)
     if isinstance(chosen, Accuracy):
         if estimate is False:
-            raise InputError("estimate", "is False together with accuracy, which is reached by estimates; give a Tolerance")
+            raise InputError("estimate", "is False together with accuracy, which needs error estimates; give a Tolerance")
         accuracy = small_number(chosen.error, "accuracy", end, 1e3)
         return StepControl(tolerance=np.asarray(max(1e-2 * accuracy, 10.0 * precision), end.dtype))
     default = 1e-8 if precision < 1e-10 else 1e-5
@@ -272,7 +272,7 @@ def plan_ensemble(
     values = jax.tree.map(jnp.asarray, values)
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
     if len(sizes) != 1 or sizes & {(), (0,)}:
-        raise InputError("values", f"has leading axes {sorted(sizes)}; all need one and the same, with 1 run at least")
+        raise InputError("values", f"has leading axes {sorted(sizes)}; all must be equal and at least 1")
     ((runs,),) = sizes
     known_end = known_number(until, "s", "until", low=0.0, open_low=True)
     end = jnp.asarray(known_end, dtype=float)
@@ -331,7 +331,7 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
             given = given, initial_state(given)
         scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
         if not isinstance(scene, Scene) or not isinstance(state, State):
-            raise InputError("make", f"gives {quoted(given)}; it must give a Scene, or a Scene and a State")
+            raise InputError("make", f"returns {quoted(given)}; it must return a Scene, or a Scene and a State")
         scene = validate_scene(scene)
         allowed = allowed_unknowns(scene)
         return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed

@@ -51,16 +51,19 @@ class RunStatus(eqx.Enumeration):
     """Outcomes of a run. Each member is the sentence shown to the user."""
 
     done = "the run reached its end"
-    max_steps_reached = "the run did not reach its end in the steps it was allowed"
+    max_steps_reached = "the run needs more steps than max_steps to reach its end"
     not_finite = "the motion grew without bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     not_accurate = "the run reached its end, but its estimated error is larger than the requested accuracy"
-    no_start = "the state to start from does not exist or is not finite"
-    beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
+    no_start = "the initial state does not exist or is not finite"
+    beating = "the motion is not periodic; it beats or wanders about constant mean values"
     creeping = (
-        "the loads balance the rotor, and creep from one arrangement that does so to the next: what is left changes slowly"
+        "the loads balance the rotor and creep from one balanced arrangement to the next; the "
+        "remaining vibration changes slowly"
     )
-    would_separate = "all loads are at nearly one angle, but this motion is unstable: slightly separated loads leave it"
+    would_separate = (
+        "all loads are at nearly one angle, and this motion is unstable: slightly separated loads move away from it"
+    )
     refused = REFUSED
 
 
@@ -138,9 +141,9 @@ class Run(AbstractMeasured, PointAnswers, Result):
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
         unstable, first = bool(self.status == RunStatus.would_separate), []
         if unstable:
-            first, state = [f"not settled: {self.message}"], "repeats itself only while the loads are at one angle"
+            first, state = [f"not settled: {self.message}"], "periodic only while the loads are at one angle"
         end = RunStatus[RunStatus.done] if unstable else self.message
-        one_angle = "  all loads stayed at the one angle at which they started: slightly separated loads may move otherwise"
+        one_angle = "  all loads stayed at their common initial angle: slightly separated loads may move differently"
         return "\n".join(
             [
                 *first,
@@ -160,7 +163,7 @@ class Run(AbstractMeasured, PointAnswers, Result):
         if not np.any(np.isfinite(times)):
             return []
         left = ", ".join(f"{j + 1} at {t:.6g} s" for j, t in enumerate(times) if np.isfinite(t))
-        return [f"  detached: loads lost contact with their track (load {left}); the equations keep them there"]
+        return [f"  detached: loads lost contact with their track (load {left}), on which the equations hold them"]
 
     @property
     def regime(self) -> Regime:
@@ -257,7 +260,7 @@ class Run(AbstractMeasured, PointAnswers, Result):
         mount, kind = self.scene.mount(), machine.kind
         if mount.axes != (0, 1):
             raise InputError(
-                "machine.kind", f"is {quoted(kind)}, which moves up and down only; a path needs a rotor such as rotor(...)"
+                "machine.kind", f"is {quoted(kind)}, which moves only up and down; a path needs a rotor such as rotor(...)"
             )
         moved = np.asarray(self.window.state.displacement)
         moved = moved[last_periods(np.asarray(self.window.time), moved)]

@@ -115,7 +115,7 @@ def settle(
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
-            "it may have no steady state here, otherwise allow more stretches or a larger drift",
+            "it may have no steady state at this speed; otherwise allow more stretches or a larger drift",
         )
     if throw and mode is not None:
         _require_mode(scene, run, mode)
@@ -152,11 +152,11 @@ def _plan_settle(
     throw: bool,
 ) -> _SettlePlan:
     """Validate the arguments of `settle` and choose its stretches. **Raises** `InputError`."""
-    require_known(scene, "scene", "settle", "transform jam_orbit or simulate instead")
+    require_known(scene, "scene", "settle", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
     for k, exciter in enumerate(scene.exciters):
         if not exciter.drive.constant and (exciter.drive.ideal or scene.is_plain):
-            problem = "a motion settles under a constant speed: use ConstantSpeed"
+            problem = "settle needs a constant speed: use ConstantSpeed"
             raise InputError(f"{scene.place_of(k)}drive", f"is {quoted(exciter.drive.kind)}; {problem}")
     count(periods, "periods")
     double = scene.top_speed.dtype.itemsize >= 8

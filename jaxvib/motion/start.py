@@ -78,12 +78,12 @@ def initial_state(
     if start not in ("rest", "jam", "spin_up"):
         raise InputError("start", f"is {quoted(start)}; it must be 'rest', 'jam' or 'spin_up'")
     if start != "jam" and mode is not None:
-        raise InputError("mode", f"is {quoted(mode)}, for start='jam' only; leave it out or start in a jam")
+        raise InputError("mode", f"is {quoted(mode)}, which is only for start='jam'; leave it out or start in a jam")
     scene = validate_scene(scene)
     mass = scene.machine.structure().mass
     zero = cast(Array, np.zeros(mass.shape[:1], mass.dtype))
     if angles is not None and len(scene.exciters) > 1:
-        raise InputError("angles", "are those of the loads of one exciter; give a State, which has those of each exciter")
+        raise InputError("angles", "are for a scene with one exciter; give a State with those of each exciter")
 
     def phases(exciter: Exciter, loads: Loads, rest: float | Array) -> Array:
         middle = known(rest if angles is None else numbers(angles, "rad", "angles", loads.count))
@@ -107,7 +107,7 @@ def initial_state(
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
     if not scene.drive.constant:
         raise InputError(
-            "start", f"is 'jam', but the drive is {quoted(scene.drive.kind)} and starts at another speed; start at 'rest'"
+            "start", f"is 'jam', but the drive is {quoted(scene.drive.kind)} and starts at another speed; use start='rest'"
         )
     try:
         modes = jam_modes(scene)
@@ -183,7 +183,7 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, turning: Turning) 
     has_slip = has_term(exciter.effects, SlipRelease)
     if loads is None or not (has_drilling or has_slip):
         if state.spin is not None:
-            raise InputError("start.spin", "is given, but no effect of the scene makes it free; leave it out, or add FreeSpin")
+            raise InputError("start.spin", "is given, but no effect of the scene allows it; leave it out, or add FreeSpin")
         return state
     if state.spin is not None:
         n = (loads.count,)
@@ -191,7 +191,7 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, turning: Turning) 
         drilling, slip = state.spin.drilling, state.spin.slip
         found = (None if drilling is None else jnp.shape(drilling), None if slip is None else tuple(map(jnp.shape, slip)))
         if found != needed:
-            problem = f"has shapes {found} of drilling and slip; this scene needs {needed} (None where no effect frees it)"
+            problem = f"has shapes {found} of drilling and slip; this scene needs {needed} (None if no effect allows it)"
             raise InputError("start.spin", problem)
         return state
     zero = jnp.zeros_like(state.angle[0])
@@ -219,7 +219,7 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
     """
     if not (isinstance(start, str) and start == "spin_up"):
         if spin_up is not None:
-            raise InputError("spin_up", "is for start='spin_up' only; leave it out or start with 'spin_up'")
+            raise InputError("spin_up", "is only for start='spin_up'; leave it out or use start='spin_up'")
         return scene
     drives = []
     for exciter in scene.exciters:
@@ -241,9 +241,11 @@ def validate_state(scene: Scene, state: State, mode: int | None, separation: Num
     **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `separation` is given beside it.
     """
     if separation is not None:
-        raise InputError("separation", f"is {quoted(separation)}, for named starts only; put the angles into the State")
+        raise InputError(
+            "separation", f"is {quoted(separation)}, which is only for named starts; put the angles into the State"
+        )
     if mode is not None:
-        raise InputError("mode", f"is {quoted(mode)}, for start='jam' only; leave it out if the start is a State")
+        raise InputError("mode", f"is {quoted(mode)}, which is only for start='jam'; leave it out if start is a State")
     if len(state.exciters) != len(scene.exciters):
         raise InputError("start.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")
     nd = scene.machine.structure().mass.shape[0]
@@ -251,13 +253,16 @@ def validate_state(scene: Scene, state: State, mode: int | None, separation: Num
     for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         with within(scene.place_of(k)):
             if exciter.drive.ideal != (own.rotor is None):
-                motor, ideal = "(angle, speed), the motor's rotor is a state", "None, the drive alone turns the rotor"
+                motor, ideal = (
+                    "(angle, speed), because the rotor of a motor is part of the state",
+                    "None, because the drive prescribes the motion of the rotor",
+                )
                 problem = f"under the drive {quoted(exciter.drive.kind)} it must be {motor if own.rotor is None else ideal}"
                 raise InputError("start.rotor", f"is {quoted(own.rotor)}; {problem}")
             if exciter.loads is not None:
                 _require_shapes(own, angle=exciter.loads.count, rate=exciter.loads.count)
             elif own.angle or own.rate:
-                raise InputError("start.angle", "is given; this exciter has no loads, leave angle and rate out")
+                raise InputError("start.angle", "is given, but this exciter has no loads; leave angle and rate out")
     require_start(scene, state)
     return with_spin(scene, state)
 

@@ -98,7 +98,7 @@ def small_number(value: float, name: str, time: Array, least: float) -> float:
         raise InputError(
             name,
             f"is {quoted(value)}; in {time.dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"
-            + ("" if plain else ", a number of Python's own such as 1e-6")
+            + ("" if plain else ", a Python number such as 1e-6")
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )
     return value

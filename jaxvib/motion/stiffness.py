@@ -99,7 +99,8 @@ def advice(scene: Scene) -> str:
     carrier = float(np.max(np.asarray(_carrier_decay(scene))))
     name = "machine.damping makes the machine" if carrier >= decay else "loads.drag makes the loads"
     return (
-        f"; {name} decay at {decay:.2g} 1/s, {decay / motion:.1g} times as fast as the motion: give less, or the default solver"
+        f"; {name} decay at {decay:.2g} 1/s, {decay / motion:.1g} times as fast as the motion: use a "
+        "smaller value, or the default solver"
     )
 
 

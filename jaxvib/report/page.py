@@ -51,14 +51,14 @@ class Report:
         if self.command:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
         units = self.units if self.scene is None else _of_coordinates(self.units, self.scene)
-        parts += [_section("What it is worth", worth(self.document, units))]
+        parts += [_section("Accuracy", worth(self.document, units))]
         parts += [_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures))]
         parts += [_section("Results", results(self.document, units))]
         if self.scene is not None:
             sketch = "" if self.sketch is None else _figure("sketch", self.sketch)
             parts += [_section("Machine", sketch + parameters(self.scene))]
         if self.text:
-            parts.append(f"<details><summary>As the terminal shows it</summary><pre>{escaped(self.text)}</pre></details>")
+            parts.append(f"<details><summary>Output of the terminal</summary><pre>{escaped(self.text)}</pre></details>")
         parts.append(_section("Made with", _versions()))
         return _PAGE.format(title=escaped(self.title), style=_STYLE, body="\n".join(filter(None, parts)))
 

@@ -149,12 +149,14 @@ def _grid(values: Sequence[Plain]) -> str:
         return f"<div class='wide'><table>{body}</table></div>{_more(len(values))}"
     numbers = [x for x in values if isinstance(x, (int, float)) and not isinstance(x, bool)]
     if not numbers:
-        return f"<p>{len(values)} values; --json and --out have them</p>"
-    return f"<p>{len(values)} numbers from {_cell(min(numbers))} to {_cell(max(numbers))}; --json and --out have them</p>"
+        return f"<p>{len(values)} values; see the output of --json or --out</p>"
+    return (
+        f"<p>{len(values)} numbers from {_cell(min(numbers))} to {_cell(max(numbers))}; see the output of --json or --out</p>"
+    )
 
 
 def _more(count: int) -> str:
-    return f"<p>{count - _MAX_ROWS} rows more; --json and --out have them</p>" if count > _MAX_ROWS else ""
+    return f"<p>{count - _MAX_ROWS} more rows; see the output of --json or --out</p>" if count > _MAX_ROWS else ""
 
 
 def _cell(value: Plain) -> str:

@@ -124,7 +124,7 @@ def plain(value: object) -> Plain:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    raise TypeError(f"{value!r} is no plain value, and no array")
+    raise TypeError(f"{value!r} is neither a plain value nor an array")
 
 
 def _plain_fields(value: DataclassInstance) -> dict[str, Plain]:

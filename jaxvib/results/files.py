@@ -85,7 +85,7 @@ def load(path: str | Path) -> Any:
             arrays = _arrays(file)
         layout, digest = (str(arrays.pop(name, "")) for name in (_LAYOUT, _DIGEST))
         if digest != _digest(layout, arrays):
-            raise ValueError("changed since it was saved")
+            raise ValueError("changed after it was saved")
         found = _decoded(json.loads(layout), arrays)
         if not isinstance(found, eqx.Module):
             raise ValueError("not a result")
@@ -93,7 +93,7 @@ def load(path: str | Path) -> Any:
     except FileNotFoundError as error:
         raise InputError("path", f"is {quoted(str(path))}; there is no such file") from error
     except _ODD as error:
-        raise InputError("path", f"is {quoted(str(path))}; it is no result written by save") from error
+        raise InputError("path", f"is {quoted(str(path))}; it is not a result written by save") from error
 
 
 _ODD = (
@@ -159,7 +159,7 @@ def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
         return {type(value).__name__: [_encoded(entry, arrays) for entry in value]}
     if isinstance(value, Mapping):
         return {"dict": [[_encoded(name, arrays), _encoded(entry, arrays)] for name, entry in value.items()]}
-    raise InputError("result", f"holds {quoted(value)}, which no file can hold; save what it was made from")
+    raise InputError("result", f"holds {quoted(value)}, which cannot be saved; save the data from which it was made")
 
 
 def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np.ndarray]) -> Plain:
@@ -173,7 +173,7 @@ def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np
 def _stored(array: np.ndarray, arrays: dict[str, np.ndarray]) -> str:
     if array.dtype.kind not in _KINDS:
         raise InputError(
-            "result", f"holds an array of the type {array.dtype}, which no file can hold; save what it was made from"
+            "result", f"holds an array of the type {array.dtype}, which cannot be saved; save the data from which it was made"
         )
     name = f"array{len(arrays)}"
     arrays[name] = array
@@ -241,7 +241,7 @@ def _class_named(name: str, base: type) -> Any:
     """
     module, _, inner = name.partition(":")
     if module.split(".")[0] not in _PACKAGES or not inner.isidentifier():
-        raise ValueError(f"{name} is no class of a result")
+        raise ValueError(f"{name} is not a class of a result")
     try:
         found = getattr(importlib.import_module(module), inner)
     except (ImportError, AttributeError):
@@ -252,5 +252,5 @@ def _class_named(name: str, base: type) -> Any:
         or (base is tuple and not hasattr(found, "_fields"))
         or (base is object and not dataclasses.is_dataclass(found))
     ):
-        raise ValueError(f"{name} is no class of a result")
+        raise ValueError(f"{name} is not a class of a result")
     return found

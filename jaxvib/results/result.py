@@ -129,5 +129,7 @@ class Result(eqx.Module):
         """
         found = files.load(path)
         if not isinstance(found, cls):
-            raise InputError("path", f"is {quoted(str(path))}; it is no {cls.__name__} but holds a {type(found).__name__}")
+            raise InputError(
+                "path", f"is {quoted(str(path))}; it contains a result of class {type(found).__name__}, not {cls.__name__}"
+            )
         return found

@@ -18,7 +18,7 @@ Status = TypeVar("Status", bound=eqx.Enumeration)
 class Computed(eqx.Enumeration):
     """Status of a result whose computation cannot fail if its input is valid."""
 
-    done = "the answer was computed"
+    done = "the result was computed"
 
 
 def is_status(value: object) -> TypeGuard[eqx.Enumeration]:

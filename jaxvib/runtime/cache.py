@@ -99,10 +99,10 @@ def require_own(folder: Path) -> None:
         found = place.stat()
         mode = stat.S_IMODE(found.st_mode)
         if found.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
-            raise InputError("folder", f"is '{folder}'; it must be your own, but '{place}' belongs to user {found.st_uid}")
+            raise InputError("folder", f"is '{folder}'; it must belong to you, but '{place}' belongs to user {found.st_uid}")
         others = mode & (stat.S_IWGRP | stat.S_IWOTH if place == folder else stat.S_IWOTH)
         if others and not (mode & stat.S_ISVTX and place != folder):
             raise InputError(
                 "folder",
-                f"is '{folder}'; it must be yours alone, but others may write to '{place}', do chmod go-w '{place}'",
+                f"is '{folder}'; others can write to '{place}', which is not safe; run chmod go-w '{place}'",
             )

@@ -50,14 +50,14 @@ def prepare_cpu(devices: int | None = 1) -> str:
     >>> jv.prepare_cpu()                    # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):
         ...
-    jaxvib.errors.InputError: prepare_cpu comes too late, JAX has begun to compute; call it before any array is made
+    jaxvib.errors.InputError: prepare_cpu was called after JAX had begun to compute; call it before any array is created
     """
     if devices is None:
         devices = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
         raise InputError("devices", f"is {quoted(devices)}; it must be a whole number, at least 1, or None for all cores")
     if backend_started():
-        raise InputError("prepare_cpu", "comes too late, JAX has begun to compute; call it before any array is made")
+        raise InputError("prepare_cpu", "was called after JAX had begun to compute; call it before any array is created")
     flags = os.environ.get("XLA_FLAGS", "").split()
     ours = []
     if loops_need_a_flag():

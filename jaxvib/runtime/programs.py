@@ -78,7 +78,8 @@ class CachedFunction(Generic[P, T]):
                 raise
             # JAX raises this error for forward derivatives of a run with the default adjoint, the replay of its steps.
             raise InputError(
-                "adjoint", "allows reverse derivatives only; for jvp and jacfwd of a run write adjoint=diffrax.ForwardMode()"
+                "adjoint",
+                "supports reverse-mode derivatives only; for jvp and jacfwd of a run use adjoint=diffrax.ForwardMode()",
             ) from error
 
     def is_ready(self, *args: P.args, **kwargs: P.kwargs) -> bool:

@@ -24,8 +24,10 @@ def start() -> None:
     if not has_flags():
         if backend_started():
             warnings.warn(
-                "JAX began to compute before jaxvib was used: time integration takes up to 50 times as long in this process, "
-                "and compiling 1.5 times. Call jaxvib.prepare_cpu() before any array is made, or silence this by "
+                "JAX began to compute before jaxvib was used: in this process, time integration "
+                "takes up to 50 times as long and "
+                "compilation 1.5 times as long. Call jaxvib.prepare_cpu() before any array is created, "
+                "or switch this warning off by "
                 "JAXVIB_AUTOMATIC=off in the environment",
                 stacklevel=3,
             )

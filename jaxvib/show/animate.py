@@ -90,7 +90,7 @@ def animate(
     """
     owner = checked_scene(_scene_of(motion, scene))
     if path is not None and Path(path).suffix.lower() not in (".gif", ".html", ".htm"):
-        raise InputError("path", f"is {quoted(str(path))}; films are written as .gif or .html")
+        raise InputError("path", f"is {quoted(str(path))}; a film must be a .gif or .html file")
     if isinstance(fps, bool) or not isinstance(fps, int) or not 1 <= fps <= 50:
         raise InputError("fps", f"is {quoted(fps)}; it must be a whole number of pictures a second, 1 to 50")
     first, last = _stretch(motion, begin, end)
@@ -101,10 +101,8 @@ def animate(
     count = round(float(np.clip(pictures, 2, _MAX_PICTURES)))
     if turns / count > _TURN:
         most = first + _TURN * 2.0 * np.pi * count / speed
-        problem = (
-            f"advances the rotor by {turns / count:.3g} turns from one picture to the next, which looks like another speed"
-        )
-        raise InputError("end", f"{problem}; end at {most:.4g} s or before, or let the film last more seconds")
+        problem = f"advances the rotor by {turns / count:.3g} turns from one frame to the next, which looks like another speed"
+        raise InputError("end", f"{problem}; end at {most:.4g} s or before, or make the film longer")
     # An orbit is periodic: the picture after the last one would be the first one.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
     dense = np.linspace(time[0], time[-1], max(400, count))
@@ -120,12 +118,12 @@ def animate(
 def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
     if isinstance(motion, Run):
         if scene is not None:
-            raise InputError("scene", "is for an Orbit only, a run has its own scene; leave it out")
+            raise InputError("scene", "is only for an Orbit, because a run contains its scene; leave it out")
         return motion.scene
     if not isinstance(motion, Orbit):
         raise InputError("motion", f"is a {type(motion).__name__}; give a Run, or an Orbit with its scene")
     if scene is None:
-        raise InputError("scene", "is missing; an Orbit does not have it: animate(orbit, scene=scene)")
+        raise InputError("scene", "is missing; an Orbit does not contain it: animate(orbit, scene=scene)")
     return scene
 
 
@@ -171,7 +169,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     farthest = float(np.max(np.abs(shown.displacement), initial=0.0)) * view.wheel.scale
     if chosen * farthest > (most_seen := _PICTURES_AWAY * (top - bottom)):
         raise InputError(
-            "magnify", f"is {chosen:g}, which moves the machine out of the picture; at most {most_seen / farthest:.3g}"
+            "magnify", f"is {chosen:g}, which moves the machine out of the figure; at most {most_seen / farthest:.3g}"
         )
     poses = [
         Pose(shown.displacement[k], shown.velocity[k], tuple(u[k] for u in shown.angle), float(shown.turn[k]))

@@ -49,7 +49,7 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
     if rate * np.max(h) > _MAX_ANGLE_BETWEEN_SAMPLES:
         most = int(np.ceil(t.size * rate * np.max(h) / _MAX_ANGLE_BETWEEN_SAMPLES))
         problem = f"has {t.size} samples, between which loads turn by up to {rate * np.max(h):.3g} rad"
-        raise InputError("run", f"{problem}; simulate with samples={most}, or animate its last turns")
+        raise InputError("run", f"{problem}; simulate with samples={most}, or animate the last turns only")
 
     def cubic(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
         s, step = (x.reshape(-1, *[1] * (value.ndim - 1)) for x in (share, h))
@@ -100,7 +100,7 @@ def of_orbit(orbit: Orbit, scene: Scene, time: np.ndarray) -> Stretch:
     if not np.isfinite(omega) or not np.isfinite(np.asarray(orbit.amplitude)).all():
         raise InputError("orbit", f"is no motion to be shown: {orbit.message}")
     if len(orbit.units) != len(scene.machine.structure().coordinates) or orbit.offsets.shape != (scene.loads.count,):
-        raise InputError("scene", "is not the one that the orbit belongs to: it has other coordinates or loads")
+        raise InputError("scene", "is not the scene of the orbit: it has other coordinates or loads")
     theta = omega * time
     q, v, (phi,), _ = jax.vmap(orbit.at)(jnp.asarray(theta))
     wave = np.exp(1j * np.asarray(orbit.orders)[:, None] * theta)

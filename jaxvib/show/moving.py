@@ -39,7 +39,7 @@ def moving(scene: Scene, jam: Jam) -> str:
     view = view_of(checked_scene(scene))
     omega, amplitude = float(jam.omega), np.asarray(jam.displacement)
     if not np.isfinite(omega) or not np.isfinite(amplitude).all():
-        raise ComputationError("absent", f"jam mode {int(jam.mode)} is no motion to be shown: {jam.message}")
+        raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown:  {jam.message}")
     theta = 2.0 * np.pi * np.arange(_FRAMES) / _FRAMES
     first, *others = (np.asarray(u, float) for u in scene.loads.rest())
     wave = np.exp(1j * theta)[:, None] * amplitude

@@ -339,6 +339,8 @@ def view_of(scene: Scene) -> View:
     """Return the drawing of a scene, chosen by the kind of places of its machine."""
     machine = scene.machine
     if machine.places == "plane" or (machine.places == "point" and machine.mounting().axes != (0, 1)):
-        problem = f"is {machine.kind!r}; machines are drawn that have platforms or a shaft, or that move across and up"
+        problem = (
+            f"is {machine.kind!r}; sketches are available for machines with platforms or a shaft, or that move across and up"
+        )
         raise InputError("machine.kind", problem)
     return {"platform": PlatformView, "shaft": ShaftView, "point": FrontView}[machine.places](scene)

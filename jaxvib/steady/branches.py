@@ -147,7 +147,7 @@ def branches(
 
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
-        raise InputError("least", "is for exact=True only; leave it out, light loads have a branch down to speed 0")
+        raise InputError("least", "is only for exact=True; leave it out, because branches of light loads begin at speed 0")
     count(points, "points", low=2, each=1e3)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     per_side = max(2, math.ceil(points / (2 * scene.machine.structure().mass.shape[0])))

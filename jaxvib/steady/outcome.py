@@ -22,7 +22,7 @@ from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import enumeration_of
 from jaxvib.units.known import is_known, when_known
 
-REFUSED = "a number that was not known while the program was built is not allowed: ask outside of jit, grad and vmap to see it"
+REFUSED = "a traced number has a value that is not allowed: call the function outside of jit, grad and vmap to see which one"
 """Sentence of the status `refused`."""
 
 Found = TypeVar("Found", bound=Result)

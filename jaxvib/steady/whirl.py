@@ -39,9 +39,11 @@ in units of the rounding."""
 class WhirlStatus(eqx.Enumeration):
     """Outcomes of a computation of whirls. Each member is the sentence shown to the user."""
 
-    done = "the answer was computed"
+    done = "the result was computed"
     refused = REFUSED
-    lost_digits = "rounding hides some of these motions, which are NaN: use double precision, or numbers that differ less"
+    lost_digits = (
+        "rounding errors hide some of these motions, whose values are NaN: use double precision, or numbers that differ less"
+    )
 
 
 class CriticalSpeeds(Result):
@@ -283,7 +285,8 @@ def _two_directions(scene: Scene) -> LinearModel:
     if model.mount.axes != (0, 1):
         raise InputError(
             "machine.kind",
-            f"is {quoted(scene.machine.kind)}, which moves up and down only: `jam_modes` (`jaxvib modes`) has its resonances; "
+            f"is {quoted(scene.machine.kind)}, which moves only up and down: for its resonances use "
+            "`jam_modes` (`jaxvib modes`); "
             "whirl needs a rotor such as rotor(...)",
         )
     when_known(_require_springs, carrier.stiffness)
@@ -296,7 +299,7 @@ def _require_springs(stiffness: np.ndarray) -> None:
         single = stiffness.dtype.itemsize < 8
         problem = "leaves a motion of the rotor without a spring" + (", within single precision" if single else "")
         raise InputError(
-            "machine.stiffness", f"{problem}; give every motion one{', or use double precision' if single else ''}"
+            "machine.stiffness", f"{problem}; every motion needs one{', or use double precision' if single else ''}"
         )
 
 

@@ -144,7 +144,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
         for key in spec:
             if key not in _KEYS:
                 hint = f'; write the whole name in quotes, "{name}.{key}"' if not {"from", "to"} & set(spec) else ""
-                raise InputError(f"axes.{name}.{key}", f"is no field of an axis{hint}; {suggest_name(key, _KEYS)}")
+                raise InputError(f"axes.{name}.{key}", f"is not a field of an axis{hint}; {suggest_name(key, _KEYS)}")
         for key in ("from", "to"):
             if key not in spec:
                 raise InputError(f"axes.{name}.{key}", "is missing; an axis is a list, or a table with from and to")
@@ -166,7 +166,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
             raise InputError(f"axes.{name}", f"is {quoted(spec)}; give a list of values, or a table with from, to and count")
         values = np.asarray([value(v, f"axes.{name}[{k}]") for k, v in enumerate(spec)])
         if np.unique(values).size < values.size:
-            raise InputError(f"axes.{name}", "has a value twice; name each one once")
+            raise InputError(f"axes.{name}", "has a value twice; give each value once")
         axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, spot)
     for end in (axis.low, axis.high):  # the constructors of the scene's parts check the ranges of single numbers
         validate_scene(put(scene, (spot,), jnp.asarray([end])))
@@ -180,7 +180,9 @@ def _where(scene: Scene, name: str) -> tuple[Spot, str]:
         return Spot(found, "", None), found.unit
     match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
     if match is None or match[1] not in _START:
-        raise InputError(f"axes.{name}", f"is no number of a start; {suggest_name(str(name), [f'start.{f}' for f in _START])}")
+        raise InputError(
+            f"axes.{name}", f"is not a number of a start; {suggest_name(str(name), [f'start.{f}' for f in _START])}"
+        )
     size = scene.loads.count if match[1] in ("angle", "rate") else scene.machine.structure().mass.shape[0]
     entry = None if match[2] is None else int(match[2])
     if entry is not None and entry >= size:
@@ -200,7 +202,7 @@ def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
             entries = {(field, k) for k in (range(size) if entry is None else (entry,))}
         for one in entries:
             if one in taken:
-                raise InputError(f"axes.{axis.name}", f"changes a number that axes.{taken[one]} changes too; name it once")
+                raise InputError(f"axes.{axis.name}", f"changes a number that axes.{taken[one]} also changes; name it once")
             taken[one] = axis.name
 
 

@@ -41,7 +41,7 @@ def on_a_cluster(
     except ImportError as error:
         raise InputError("workers", "need Dask; install it with: pip install '.[cluster]'") from error
     if workers is not None and scheduler is not None:
-        raise InputError("scheduler", "is given together with workers, which are processes of this machine; give one of them")
+        raise InputError("scheduler", "cannot be combined with workers, which are processes of this machine; give one of them")
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))
     with contextlib.ExitStack() as stack:
         if scheduler is None:
@@ -89,7 +89,7 @@ def _remote(study: Study, chunk: int, key: str, expected_versions: dict[str, str
     """Compute the cases of a chunk on a worker, or return the reason for a refusal: versions that differ from the store's."""
     for name, version in versions().items():
         if expected_versions[name] != version:
-            return f"has {name} {version}, and the store was begun with {expected_versions[name]}: digits would differ"
+            return f"has {name} {version}, but the store was created with {expected_versions[name]}: digits would differ"
     jax.config.update("jax_enable_x64", precise)
     take_a_device()
     if key not in _STUDIES:  # keep the first received copy, because the program was compiled for its functions

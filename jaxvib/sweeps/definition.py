@@ -39,12 +39,12 @@ def identify(value: object) -> Plain:
 class CaseStatus(eqx.Enumeration):
     """Outcomes of a case. Each member is the sentence shown to the user. Their order is part of the store's format."""
 
-    missing = "the case was not computed yet"
+    missing = "the case has not been computed yet"
     done = "the case was computed"
     absent = "a requested quantity does not exist in this case, such as a jam beyond its fold"
     not_finite = "the motion grew without bounds"
-    failed = "an error was raised, see the sentence beside it"
-    lost = "the worker that computed it died, several times"
+    failed = "an error was raised; its message is stored with the case"
+    lost = "the worker that computed the case died several times"
 
 
 CASE_STATUSES = enumeration_names(CaseStatus)
@@ -55,7 +55,7 @@ class SweepStatus(eqx.Enumeration):
     """Progress of a study. Each member is the sentence shown to the user."""
 
     done = "every case was computed"
-    partly = "not every case was computed yet; run the study again to continue"
+    partly = "some cases have not been computed yet; run the study again to continue"
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     if over not in grid:
         raise InputError("over", f"is {quoted(over)}; {suggest_name(str(over), grid)}")
     if not _has_labels(opened):
-        raise InputError("store", "has neither regime nor mode, whose shares could be shown; measure run.regime")
+        raise InputError("store", "has neither regime nor mode, of which shares can be shown; measure run.regime")
     place = dims.index(over)
     hits: dict[str, np.ndarray] = {}
     for rows in opened.pieces():
@@ -198,7 +198,9 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
         values = values[np.isfinite(values)]
         low, high = min(low, np.min(values, initial=np.inf)), max(high, np.max(values, initial=-np.inf))
     if not low <= high:
-        raise InputError("measure", f"is {quoted(name)}, which no case has; name another one: {', '.join(opened.names)}")
+        raise InputError(
+            "measure", f"is {quoted(name)}, which has no value in any case; choose another one: {', '.join(opened.names)}"
+        )
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
     return distribution_chart(edges, np.asarray(counts), across=_measure_label(opened, name), ax=ax)
@@ -229,7 +231,9 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
                 chosen = there & inside
                 sums[axis][k] += [np.sum(values[chosen]), np.sum(chosen)]
     if not found[1]:
-        raise InputError("measure", f"is {quoted(name)}, which no case has; name another one: {', '.join(opened.names)}")
+        raise InputError(
+            "measure", f"is {quoted(name)}, which has no value in any case; choose another one: {', '.join(opened.names)}"
+        )
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
     label = f"mean {_measure_label(opened, name)}"

@@ -263,7 +263,7 @@ class _Description:
         name = module.__name__
         if _is_library(name):
             if name.partition(".")[0] in _UNKNOWN_MODULES:
-                raise UnknownIdentity(f"uses the module {name}: files, the clock and the environment can change unseen")
+                raise UnknownIdentity(f"uses the module {name}: files, the clock and the environment can change unnoticed")
             return {"module": name, "version": _version(name)}
         entries = {key: self.of(value) for key, value in sorted(vars(module).items()) if not key.startswith("__")}
         return {"module": name, "digest": digest(entries)}
@@ -297,7 +297,7 @@ def _library_name(value: Any) -> str | None:
             found = getattr(found, part)
         if found is value:
             if module.partition(".")[0] in _UNKNOWN_MODULES or (module == "builtins" and inner in _UNKNOWN_BUILTINS):
-                raise UnknownIdentity(f"refers to {module}.{inner}: files, the clock and the environment can change unseen")
+                raise UnknownIdentity(f"refers to {module}.{inner}: files, the clock and the environment can change unnoticed")
             return f"{module}:{inner} {_version(module)}"
     return None
 

@@ -87,7 +87,7 @@ class Store:
             self.group = zarr.open_group(path, mode="r+" if writable else "r", zarr_format=3)
             self.attributes: Tables = dict(self.group.attrs)
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
-                raise InputError("store", f"is {quoted(str(path))}, which is no store of a sweep; name another one")
+                raise InputError("store", f"is {quoted(str(path))}, which is not the store of a sweep; name another one")
             self.record: Tables = self.attributes["study"]
             # A chunk without values needs a file too, because a missing file counts as damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
@@ -104,7 +104,7 @@ class Store:
     def damaged(self, what: str) -> InputError:
         """Return the error for a store that cannot be used."""
         return InputError(
-            "store", f"is {quoted(str(self.path))}, which is no store of a sweep, or a damaged one ({what}); name another"
+            "store", f"is {quoted(str(self.path))}, which is not the store of a sweep, or a damaged one ({what}); name another"
         )
 
     @classmethod
@@ -137,17 +137,17 @@ class Store:
         """
         for name, mine in study.identities.items():
             if isinstance(mine, dict) and UNKNOWN in mine and self.record["measure"].get(name) != mine:
-                problem = f"{mine[UNKNOWN]}; the numbers in {str(self.path)!r} may be of other code"
+                problem = f"{mine[UNKNOWN]}; the numbers in {str(self.path)!r} may come from different code"
                 raise InputError(f"measure.{name}", f"{problem}; name another store")
         if (found := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
             name, mine, its = found[0].replace(".tuple[", "[").replace(".dict[", "["), *found[1:]
             part = re.split(r"[.\[]", name)[0]
             problem = f"is {str(self.path)!r}, which holds another study: its {part} differs"
             where = "" if part == name else f" ({name} is {_short(its)} there and {_short(mine)} here)"
-            raise InputError("store", f"{problem}{where}; name another store, or run the study that it was made by")
+            raise InputError("store", f"{problem}{where}; name another store, or run the study of this store")
         for name, version in versions().items():
             if self.attributes["versions"].get(name) != version:
-                begun = f"was begun with {name} {self.attributes['versions'].get(name)}, and this is {version}"
+                begun = f"was created with {name} {self.attributes['versions'].get(name)}, and this is {version}"
                 raise InputError("store", f"{begun}: digits would differ; continue with that version, or name another store")
 
     @contextlib.contextmanager
@@ -159,7 +159,7 @@ class Store:
             except OSError as error:
                 raise cannot_write(self.path, error) from error
             if not is_mine:
-                problem = f"is {str(self.path)!r}, into which another sweep writes at this moment"
+                problem = f"is {str(self.path)!r}, into which another sweep is writing"
                 raise InputError("store", f"{problem}; wait until that has ended, or name another store")
             yield
 
@@ -359,10 +359,10 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
         for dim, size in zip(extra, form.shape, strict=True):
             if dim not in group and len(extra_names.get(dim, ())) == size:
                 add(dim, (dim,), (size,), (size,), str, fill="")[:] = np.asarray(extra_names[dim], dtype=object)
-    add("error", grid.dims, grid.shape, grid.tile, str, fill="", long_name="why a case failed")
+    add("error", grid.dims, grid.shape, grid.tile, str, fill="", long_name="reason why a case failed")
     meanings = {
         "flag_values": list(range(len(CASE_STATUSES))),
         "flag_meanings": " ".join(CASE_STATUSES),
         "sentences": [sentence(member(CaseStatus, name)) for name in CASE_STATUSES],
     }
-    add("status", grid.dims, grid.shape, grid.tile, "u1", fill=0, long_name="how a case ended", **meanings)
+    add("status", grid.dims, grid.shape, grid.tile, "u1", fill=0, long_name="outcome of a case", **meanings)

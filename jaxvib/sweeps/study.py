@@ -53,7 +53,7 @@ def study(
     """Return a validated study; for the arguments see `sweep`. **Raises** `InputError` for values that are not allowed."""
     scene = validate_scene(scene)
     if not isinstance(axes, Mapping) or not axes:
-        raise InputError("axes", "is empty; name at least one number that changes, such as drive.speed")
+        raise InputError("axes", "is empty; name at least one number that varies, such as drive.speed")
     found = tuple(axis_of(scene, name, spec) for name, spec in axes.items())
     require_apart(scene, found)
     drawn = [axis.name for axis in found if axis.values is None]
@@ -62,16 +62,19 @@ def study(
     if count(seed, "seed", low=0) >= 2**64:
         raise InputError("seed", "has more than 64 bits; give a smaller whole number")
     if drawn and not samples:
-        raise InputError(f"axes.{drawn[0]}", "is a range without count, so that it is sampled; give samples, or a count")
+        raise InputError(f"axes.{drawn[0]}", "is a range without a count; give samples, or a count")
     if samples and not drawn:
-        raise InputError("samples", f"is {samples}, and no axis is sampled; leave the count of an axis out, or samples")
+        raise InputError("samples", f"is {samples}, but no axis is sampled; leave out samples, or the count of an axis")
     names, measures = _named(measure)
     taken = [*_RESERVED, *(axis.name for axis in found), "sample"]
     for name in names:
         if name in taken:
-            raise InputError(f"measure.{name}", "is a name that something else has; give it another one")
+            raise InputError(f"measure.{name}", "is a name that is used already; choose another one")
         if not _is_name(name):
-            problem = "is no name of an array: up to 200 printable characters, no / \\ or $ among them, no . or __ in front"
+            problem = (
+                "is not a valid name of an array: up to 200 printable characters without /, \\ and "
+                "$, not beginning with . or __"
+            )
             raise InputError(f"measure.{name}", f"{problem}; give it another one")
     runs = [m for m in measures if isinstance(m, RunMeasure)]
     chosen = tier or ("time" if runs else "leading")
@@ -81,13 +84,13 @@ def study(
     plan = None
     if runs:
         if until is None:
-            raise InputError("until", f"is missing; {runs[0].name} is read off a run, say how long that is")
+            raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
         end = float(number(until, "s", "until", low=0.0, open_low=True))
         initial_state(scene, start, mode=mode, throw=False)
         plan = planned(scene, corners(found), spots, end, None if steps is None else count(steps, "steps"))
     elif until is not None or any(spot.number is None for spot in spots):
         what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.spot.number is None)
-        raise InputError(what, "is about runs, and nothing is read off a run; measure for example run.regime")
+        raise InputError(what, "is an option of runs, but no quantity is measured in a run; measure for example run.regime")
     grid = Grid(found, samples, seed, sampling, ())
     if math.prod(grid.shape) > _MAX_CASES:
         problem = f"make {math.prod(grid.shape):.3g} cases; a study has {_MAX_CASES:.0e} at most"
@@ -102,7 +105,7 @@ def study(
     except (InputError, ComputationError):
         raise
     except Exception as error:  # any error of a user's function
-        problem = f"cannot be computed ({type(error).__name__}: {error}); it gets a Scene and gives a number of JAX"
+        problem = f"cannot be computed ({type(error).__name__}: {error}); it must take a Scene and return a number of JAX"
         raise InputError("measure", problem) from error
     for name, m, form in zip(names, measures, forms, strict=True):
         axes_count = 1 if isinstance(m, RunMeasure) and m.axis else 0
@@ -136,7 +139,7 @@ def _named(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
             return tuple(found), tuple(found.values())
         measure = ()
     if isinstance(measure, (str, Quantity, RunMeasure)) or not isinstance(measure, Sequence) or not measure:
-        raise InputError("measure", f"is {quoted(measure)}; give a list of what is measured, such as ['run.regime']")
+        raise InputError("measure", f"is {quoted(measure)}; give a list of quantities, such as ['run.regime']")
     measures = [measure_of(m, f"measure[{k}]") for k, m in enumerate(measure)]
     names = [m.name.removeprefix("run.").replace(" ", "_").replace("/", "_per_") for m in measures]
     several = {name for name in names if names.count(name) > 1}
@@ -181,11 +184,11 @@ def load_study(path: str | Path) -> Study:
         if not isinstance(tables.get(name, {}), Mapping):
             raise InputError(name, f"is not a table; write [{name}]")
     if not isinstance(tables["measure"], list) or not tables["measure"]:
-        raise InputError("measure", "is not a list of tables; write [[measure]] for each of what is measured")
+        raise InputError("measure", "is not a list of tables; write [[measure]] for each quantity")
     run = dict(tables.get("run", {}))
     for name in run:
         if name not in ("until", "start", "mode", "steps"):
-            raise InputError(f"run.{name}", f"is no field here; {suggest_name(name, ['until', 'start', 'mode', 'steps'])}")
+            raise InputError(f"run.{name}", f"is not a field here; {suggest_name(name, ['until', 'start', 'mode', 'steps'])}")
     given = [_measure(table, f"measure[{k}]", Path(path)) for k, table in enumerate(tables["measure"])]
     measure: Measures = [m for _, m in given]
     if any(name for name, _ in given):
@@ -211,7 +214,7 @@ def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]
     if str(rest.get("quantity", "")).startswith("run."):
         read = measure_of(rest["quantity"], f"{field}.quantity")
         if len(rest) > 1:
-            raise InputError(f"{field}.{next(k for k in rest if k != 'quantity')}", "is no field of what is read off a run")
+            raise InputError(f"{field}.{next(k for k in rest if k != 'quantity')}", "is not a field of a quantity of a run")
         return name, read
     quantity, _ = quantity_from_table(rest, field, ())
     return name, quantity
@@ -221,7 +224,7 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     """Return a user's quantity: a function of a scene, in a module that Python can import."""
     for key in table:
         if key not in ("function", "unit"):
-            raise InputError(f"{field}.{key}", f"is no field here; {suggest_name(key, ['function', 'unit', 'name'])}")
+            raise InputError(f"{field}.{key}", f"is not a field here; {suggest_name(key, ['function', 'unit', 'name'])}")
     module, _, function = str(table["function"]).partition(":")
     try:
         found = getattr(importlib.import_module(module), function)

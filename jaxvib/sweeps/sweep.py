@@ -95,7 +95,7 @@ class Sweep(Result):
             lines.append(f"  {cases} {name}: {sentence(member(CaseStatus, name))}")
         if self.damaged:
             again = "they were computed again" if self.computed else "run the study again, which computes them again"
-            lines.append(f"  {self.damaged} cases were in damaged files, or cut off while they were written: {again}")
+            lines.append(f"  {self.damaged} cases were in damaged or incomplete files: {again}")
         if self.computed:
             each = 1e3 * self.seconds / self.computed
             lines.append(f"  {self.computed} of them in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
@@ -238,7 +238,7 @@ def _computed(
 ) -> Sweep:
     """Compute the missing chunks of a store that this process has locked, and recompute the damaged ones."""
     if (changed := new_study.changed()) is not None:
-        problem = "is a function of which a part, or a value that it refers to, has changed since the study was made"
+        problem = "is a function whose code or data changed after the study was made"
         raise InputError(f"measure.{changed}", f"{problem}; make the study again")
     kept.require_same(new_study)
     states = kept.states(writing=True)

@@ -108,7 +108,7 @@ def _checked(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, p
     if not np.isfinite(entry):
         needed = "a finite number is needed"
     elif unit == "rad" and abs(entry) * precision > 1.0:
-        needed = f"it must be below {1.0 / precision:.1e} rad, above which angles have no digits within a turn"
+        needed = f"it must be below {1.0 / precision:.1e} rad, above which an angle is not resolved within one turn"
     raise InputError(name, f"is {f'{entry:g} {unit}'.strip()}; {needed}")
 
 

@@ -44,7 +44,5 @@ def require_known(tree: PyTree, field: str, asking: str, instead: str) -> None:
     The message names the argument `field`, the function `asking`, which needs the value in Python, and the remedy `instead`.
     """
     if not is_known(tree):
-        problem = (
-            f"holds numbers that JAX is transforming (jit, grad, vmap, ...), and {asking} decides by their values in Python"
-        )
+        problem = f"holds numbers that JAX is transforming (jit, grad, vmap, ...), but {asking} needs their values in Python"
         raise InputError(field, f"{problem}; {instead}")

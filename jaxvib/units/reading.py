@@ -149,7 +149,7 @@ def require_real(value: object, unit: str, field: str) -> None:
 
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
     """Return the error for a text that is not in `unit`, or for a text without a readable unit if `unit` is None."""
-    wanted = "no number with a unit" if unit is None else f"not in {unit}" if unit else "no plain number"
+    wanted = "not a number with a unit" if unit is None else f"not in {unit}" if unit else "not a plain number"
     return InputError(
         field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
     )
@@ -202,7 +202,7 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
         return magnitude * (2.0 * math.pi) ** (hertz - wanted_hertz)
     if angle != wanted_angle and not rest.keys() - {"second"}:
         if unit == "rad/s":
-            raise InputError(field, f"is {quoted(text)}, which does not say what it counts; write {_example(unit)}")
+            raise InputError(field, f"is {quoted(text)}, which does not name the unit; write {_example(unit)}")
         raise _wrong_unit(text, unit, field)
     return magnitude
 

@@ -145,7 +145,7 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
     """
     pair = _pair(of)
     if not isinstance(pair, tuple) or len(pair) != 2:
-        raise InputError("of", f"is {quoted(of)}; a phase is that between two platforms, give a pair such as (1, 2)")
+        raise InputError("of", f"is {quoted(of)}; a phase needs a pair of platforms such as (1, 2)")
     text = f"phase between platforms {pair[0]} and {pair[1]}"
     return _asking("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
 

@@ -33,7 +33,7 @@ def _asking(name: str, unit: str, function: Callable[..., Array], text: str, *se
 
 def _platforms(scene: Scene, what: str) -> Platforms:
     if not isinstance(scene.machine, Platforms):
-        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}; {what} is that of a machine of platforms")
+        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}; {what} needs a machine of platforms")
     return scene.machine
 
 
@@ -207,11 +207,11 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
     """
     rows = tuple(prices) if isinstance(prices, (list, tuple)) else ()
     if len(rows) < 2 or not all(isinstance(row, (list, tuple)) and len(row) == 2 for row in rows):
-        raise InputError("prices", "is no list of at least two pairs (stiffness, price)")
+        raise InputError("prices", "must be a list of at least two pairs (stiffness, price)")
     stiffness = tuple(number_in(k, "N/m", f"prices[{i}]") for i, (k, _) in enumerate(rows))
     price = tuple(number_in(p, "", f"prices[{i}]") for i, (_, p) in enumerate(rows))
     if not all(a < b for a, b in itertools.pairwise(stiffness)) or not stiffness[0] > 0.0:
-        raise InputError("prices", "has stiffnesses that do not ascend from one greater than 0")
+        raise InputError("prices", "must have ascending stiffnesses greater than 0")
     for i, each in enumerate(price):
         if not 0.0 <= each < math.inf:
             raise InputError(f"prices[{i}]", f"has the price {each:g}; a price must be at least 0 and finite")

@@ -163,7 +163,7 @@ class Quantity:
 
     def __pow__(self, power: float) -> Quantity:
         if isinstance(power, str):
-            raise InputError(self.name, f"is raised to {quoted(power)}; give a plain number")
+            raise InputError(self.name, f"is raised to {quoted(power)}; the power must be a plain number")
         power = number_in(power, "", f"the power of {self.words}")
         unit = f"({self.unit})**{power:g}" if self.unit else ""
         return _made("**", f"({self.words})^{power:g}", unit, self, _constant(power, ""))
@@ -335,7 +335,7 @@ class Demand:
         return value - limit if self.sense == "at most" else limit - value
 
     def __bool__(self) -> bool:
-        problem = "is a demand and neither true nor false; give a range as two demands, force > 10 and force < 50"
+        problem = "is a demand, not True or False; write a range as two demands, force > 10 and force < 50"
         raise InputError(self.words, problem)
 
 
@@ -348,9 +348,9 @@ def _with_unit(value: Operand, name: str) -> Quantity:
     if isinstance(value, Quantity):
         return value
     if isinstance(value, (str, UnitQuantity)):
-        magnitude, unit = in_own_unit(value, f"the value beside {name}")
+        magnitude, unit = in_own_unit(value, f"the value combined with {name}")
         return replace(_constant(magnitude, unit), name=str(value).strip())
-    return _constant(number_in(value, "", f"the value beside {name}"), "")
+    return _constant(number_in(value, "", f"the value combined with {name}"), "")
 
 
 def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
@@ -363,7 +363,7 @@ def _term(value: Operand, unit: str, name: str) -> Quantity:
     """Return an operand of a sum as a quantity; a text is converted to the unit of the other operand, as for a limit."""
     if isinstance(value, Quantity) or not isinstance(value, (str, UnitQuantity)):
         return _with_unit(value, name)
-    return replace(_constant(number_in(value, unit, f"the value beside {name}"), unit), name=str(value).strip())
+    return replace(_constant(number_in(value, unit, f"the value combined with {name}"), unit), name=str(value).strip())
 
 
 def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
@@ -373,7 +373,7 @@ def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
     if not same_unit(left.unit, right.unit):
         raise InputError(
             f"{names[0]} {sign} {names[1]}",
-            f"puts together {left.unit or 'no unit'} and {right.unit or 'no unit'}; divide each by a value first, for example "
+            f"combines {left.unit or 'no unit'} and {right.unit or 'no unit'}; divide each by a value first, for example "
             f'by "1 {left.unit or right.unit}"',
         )
     return _made(sign, f"{left.words} {sign} {right.words}", left.unit, left, right)
@@ -403,7 +403,7 @@ def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
         raise InputError(operation, f"has {quoted(quantities)}; give one quantity or several")
     for each in quantities[1:]:
         if not same_unit(each.unit, quantities[0].unit):
-            raise InputError(operation, f"puts together {quantities[0].unit or 'no unit'} and {each.unit or 'no unit'}")
+            raise InputError(operation, f"combines {quantities[0].unit or 'no unit'} and {each.unit or 'no unit'}")
     name = f"{operation} of ({'; '.join(q.words for q in quantities)})"
     return _made(operation, name, quantities[0].unit, *quantities)
 

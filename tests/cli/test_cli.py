@@ -56,11 +56,11 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
     for words in (("modes", "--exact"), ("criterion",)):
         code, out, err = typed(words[0], "stations.toml", *words[1:])
-        assert (code, out) == (2, "") and "machine.stations differ; this holds for loads that run at one point" in err
+        assert (code, out) == (2, "") and "machine.stations differ; this function needs loads that run at one point" in err
     one_plane = TEMPLATES["rotor"].replace("stations = [0.28, 0.25, -0.25, -0.28]", "stations = 0.1")
     (tmp_path / "one_plane.toml").write_text(one_plane)
     code, _, err = typed("modes", "one_plane.toml", "--exact")
-    assert code == 2 and "machine.kind is 'rotor'; jam modes are those of platforms; ask phase_jams" in err
+    assert code == 2 and "machine.kind is 'rotor'; jam modes are defined for platforms; use phase_jams" in err
     code, _, err = typed("whirl", "stations.toml", "--speed", "-5")
     assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
 
@@ -78,12 +78,12 @@ def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):
     plain = scene("two_mass", speed=150.0)
     shaken = jv.Scene(plain.machine, plain.loads, plain.drive, (jv.StaticImbalance("5 g m"),))
     jv.save_scene(shaken, tmp_path / "shaken.toml")
-    said = "amplitudes and forces are the loads' alone: the static imbalance shakes at the rotor's own speed"
+    said = "amplitudes and forces are the loads' alone: the static imbalance adds a vibration at the rotor speed"
     assert said in typed("modes", "shaken.toml")[1]
     assert said not in typed("modes", "machine.toml")[1]
     assert said in typed("modes", "shaken.toml", "--phases")[1]
     code, _, err = typed("modes", "shaken.toml", "--exact")
-    assert code == 2 and "effects.static_imbalance shakes the machine at the rotor's own speed" in err
+    assert code == 2 and "effects.static_imbalance excites the machine at the rotor speed as well" in err
     assert typed("modes", "shaken.toml", "--exact", "--without", "static_imbalance")[0] == 0
     code, _, err = typed("modes", "shaken.toml", "--without", "stop")
     assert code == 2 and "--without is 'stop'; the scene's effects are: static_imbalance" in err
@@ -208,7 +208,7 @@ def test_exact_balance_is_searched_from_below_all_resonances(typed, monkeypatch)
 
 
 WRONG = [
-    (("mass = [", "masses = ["), "machine.masses is no field here; did you mean 'mass'"),
+    (("mass = [", "masses = ["), "machine.masses is not a field here; did you mean 'mass'"),
     (("drag = 1.5\n", ""), "loads.drag is missing"),
     (("120.0", "-120.0"), "machine.mass[0] is -120 kg; it must be greater than 0"),
     (("50000.0", '"5 kg"'), "machine.stiffness[0] is '5 kg', which is not in N/m"),
@@ -216,8 +216,8 @@ WRONG = [
     (("count = 3", "count = 0"), "loads.count is 0; it must be a whole number, at least 1"),
     (("speed = 150.0", "speed = -1"), "drive.speed is -1 rad/s; it must be greater than 0"),
     (('kind = "two_mass"', 'kind = "two-mass"'), "machine.kind is 'two-mass'; did you mean 'two_mass'"),
-    (("[machine]", "[machin]"), "machin is no part of a scene file; did you mean 'machine'"),
-    (("[machine]", "[machine"), "is no TOML file"),
+    (("[machine]", "[machin]"), "machin is not part of a scene file; did you mean 'machine'"),
+    (("[machine]", "[machine"), "is not a TOML file"),
 ]
 
 
@@ -246,8 +246,8 @@ def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, say
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "1"), 1, "does not exist at rotor speed"),
         (("simulate", "machine.toml", "--until", "9s", "--max-steps", "50"), 1, "max_steps_reached"),
         (("simulate", "machine.toml", "--until", "1s", "--tolerance", "1e-30"), 2, "tolerance is 1e-30"),
-        (("optimize", "machine.toml"), 2, "machine is no part of a design file: this is a scene file; `jaxvib new design`"),
-        (("modes", "design.toml"), 2, "scene is no part of a scene file: this is a design file; give the scene file"),
+        (("optimize", "machine.toml"), 2, "machine is not part of a design file: this is a scene file; `jaxvib new design`"),
+        (("modes", "design.toml"), 2, "scene is not part of a scene file: this is a design file; give the scene file"),
         (("new", "four-mass"), 2, "four-mass"),
     ],
 )

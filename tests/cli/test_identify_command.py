@@ -59,8 +59,8 @@ def test_wrong_commands(typed, words, code, says):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("[pendulum]", "[rod]"), "rod is no part of a measurement file"),
-        (("mass =", "masses ="), "pendulum.masses is no field here; did you mean 'mass'"),
+        (("[pendulum]", "[rod]"), "rod is not part of a measurement file"),
+        (("mass =", "masses ="), "pendulum.masses is not a field here; did you mean 'mass'"),
         (("dry = false", "dry = 1"), "identify.dry is 1; write true or false"),
         (('file = "swing.csv"', "file = 3"), "record.file is 3; write the path of a CSV file"),
         (("[identify]", "[[identify]]"), "it must be a table, write [identify]"),

@@ -77,19 +77,19 @@ def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
     code, _, err = typed("sweep", "study.toml")
     assert code == 1 and "finished cases are saved in study.zarr; run the same command again to continue" in err
     code, out, _ = typed("show", "study.zarr")
-    assert code == 0 and "not every case was computed yet" in out and "6 missing" in out
+    assert code == 0 and "some cases have not been computed yet" in out and "6 missing" in out
     assert "6 of them in this call" in typed("sweep", "study.toml")[1]
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words", "says"),
     [
-        ("[axes]", "[axis]", (), "axis is no part of a study file; did you mean 'axes'"),
+        ("[axes]", "[axis]", (), "axis is not part of a study file; did you mean 'axes'"),
         ("own_quantity:heaviness", "own_quantity:weight", (), "which cannot be imported"),
         ('function = "own_quantity:heaviness"', 'quantity = "run.regimes"', (), "did you mean 'run.regime'"),
         ('function = "own_quantity:heaviness"', 'quantity = "amplitudes"', (), "did you mean 'amplitude'"),
         ('"loads.drag" = [0.5, 1.0]', '"loads.drag" = [0.5, 0.5]', (), "has a value twice"),
-        ("chunk = 4", "chunk = 4\n[run]\nuntill = 3.0", (), "run.untill is no field here; did you mean 'until'"),
+        ("chunk = 4", "chunk = 4\n[run]\nuntill = 3.0", (), "run.untill is not a field here; did you mean 'until'"),
         ("chunk = 4", "chunk = 4\nsamples = -3", (), "samples is -3"),
         (
             "",
@@ -97,8 +97,8 @@ def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
             ("--scheduler", "tcp://127.0.0.1:9", "--timeout", "0.5 s"),
             "no scheduler with workers answers there within 0.5 s",
         ),
-        ("", "", ("--workers", "2", "--scheduler", "tcp://127.0.0.1:9"), "given together with workers"),
-        ("", "", ("--store", "machine.toml"), "no store of a sweep"),
+        ("", "", ("--workers", "2", "--scheduler", "tcp://127.0.0.1:9"), "cannot be combined with workers"),
+        ("", "", ("--store", "machine.toml"), "not the store of a sweep"),
     ],
 )
 def test_what_is_wrong_is_said(typed, tmp_path, old, new, words, says):
@@ -113,4 +113,4 @@ def test_a_store_that_is_there_is_not_begun_anew(typed):
     code, _, err = typed("sweep", "study.toml", "--no-resume")
     assert code == 2 and "exists already; give another folder with --store" in err
     code, _, err = typed("show", "machine.toml")
-    assert code == 2 and "no store of a sweep" in err
+    assert code == 2 and "not the store of a sweep" in err

@@ -190,9 +190,9 @@ def test_wrong_arguments_of_files_end_in_one_sentence(change, says, tmp_path):
 
 
 def test_a_run_has_no_acceleration_and_no_frequencies(run, tmp_path):
-    with pytest.raises(jv.InputError, match="quantity is 'acceleration', which a run does not keep"):
+    with pytest.raises(jv.InputError, match="quantity is 'acceleration', which a run does not save"):
         jv.export_uff(run, tmp_path / "m.unv", quantity="acceleration")
-    with pytest.raises(jv.InputError, match=r"frequencies is .* which goes with a scene"):
+    with pytest.raises(jv.InputError, match=r"frequencies is .* which is an option for a scene"):
         jv.export_uff(run, tmp_path / "m.unv", frequencies=[1.0, 2.0])
 
 

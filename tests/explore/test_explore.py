@@ -63,7 +63,7 @@ def test_each_slider_moves_its_number_alone():
     assert [(steps[0], steps[-1]) for steps in counts] == [(1, 8), (1, 10)]  # twice as many as there are, 8 at least
     with pytest.raises(jv.InputError, match=r"loads\.ball_radius .* side by side"):
         scene_at(scene, {COUNT: 256})
-    with pytest.raises(jv.InputError, match=r"machine\.mass is no slider of this scene; there are: drive\.speed"):
+    with pytest.raises(jv.InputError, match=r"machine\.mass is not a slider of this scene; the sliders are:  drive\.speed"):
         scene_at(scene, {"machine.mass": 3.0})
 
 
@@ -109,7 +109,7 @@ def test_what_cannot_be_shown_is_said(one_mass):
     stop = jv.Stop(platform=1, stiffness=1e6, gap=1e-3)
     bent = jv.Scene(one_mass.machine, one_mass.loads, one_mass.drive, (stop,))
     said = pictures.image(lambda: pictures.diagram(bent, 100.0), SceneOrProblem(bent, ""))
-    assert "<b>Nothing to show here:</b> effects.stop" in said
+    assert "<b>No figure:</b> effects.stop" in said
     no_room = scene_or_problem(lambda: jv.Scene(one_mass.machine, jv.balls(count=0, mass=1, radius=1, drag=1), one_mass.drive))
     assert pictures.toml(no_room) == "" and "loads.count" in pictures.text(lambda: "", no_room)
 
@@ -260,7 +260,7 @@ def test_the_machine_moves_as_its_jam_says(two_platforms):
     (seconds,) = {e.get("dur") for e in drawn.iter(f"{SVG}animateTransform") if e.get("type") == "translate"}
     (once,) = turns
     assert float(seconds[:-1]) / float(once[:-1]) == pytest.approx(float(jam.rotor_speed / jam.omega), rel=1e-3)
-    with pytest.raises(jv.ComputationError, match="jam mode 1 is no motion to be shown"):
+    with pytest.raises(jv.ComputationError, match="jam mode 1 cannot be shown"):
         moving(two_platforms, jv.jam_modes(two_platforms).select(1, throw=False))
 
 

@@ -88,7 +88,7 @@ def test_restitution_is_read_from_files_and_checked():
         with pytest.raises(jv.InputError, match=says):
             jv.LoadContact(1e5, **arguments)
     uneven = jv.torus_balls(count=2, mass=[0.06, 0.07], radius=0.2, tube=0.015, ball_radius=0.0125)
-    with pytest.raises(jv.InputError, match="is for loads of one mass"):
+    with pytest.raises(jv.InputError, match="needs loads of equal mass"):
         jv.Scene(HEAVY, uneven, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))
 
 

@@ -53,7 +53,7 @@ WRONG = {
     ),
     "stiffness of no link": (
         lambda: jv.network(mass=[1, 1], stiffness=1, damping=1, link_stiffness=[1e3], link_damping=[1.0], exciter=1),
-        "machine.link_stiffness has 1 values; the machine has no links",
+        "machine.link_stiffness has 1 values, but the machine has no links",
     ),
     "links that are no list": (
         lambda: jv.network(mass=[1, 1], stiffness=1, damping=1, links=3, exciter=1),
@@ -72,10 +72,10 @@ WRONG = {
     "no drive": (lambda: jv.Scene(machine(), balls(), 5.0), "drive is 5.0; it must be a Drive, for example ConstantSpeed("),
     "bearings of balls": (
         lambda: scene(effects=(jv.DryFriction(0.1, 0.01),)),
-        "effects.dry_friction needs loads with bearings, and a ball has none (property has_bearing); give pendulums",
+        "effects.dry_friction needs loads with bearings, and a ball has none (property has_bearing); use pendulums",
     ),
     "no effect": (lambda: scene(effects=(5,)), "effects[0] is 5; it must be an Effect, for example Gravity()"),
-    "twice": (lambda: scene(effects=(jv.Gravity(), jv.Gravity())), "effects names gravity 2 times; once is allowed"),
+    "twice": (lambda: scene(effects=(jv.Gravity(), jv.Gravity())), "effects contains gravity 2 times; it is allowed once"),
 }
 
 
@@ -162,19 +162,19 @@ WRONG_ROTORS = {
     "term's unit": (lambda: jv.rotor(**ROTOR, stiffness_terms=("1 N/m", "2 m", 3.0)), r"stiffness_terms\[1\] is '2 m'"),
     "terms that no supports have": (
         lambda: jv.rotor(**ROTOR, stiffness_terms=(1e6, 2e5, 3e4)),
-        r"machine\.stiffness_terms \[1000000\.0, 200000\.0, 30000\.0\] would drive the rotor",
+        r"machine\.stiffness_terms \[1000000\.0, 200000\.0, 30000\.0\] would add energy to the rotor",
     ),
     "negative term": (
         lambda: jv.rotor(**ROTOR, damping_terms=(8e2, 0.0, -1.0)),
-        r"damping_terms .* the outer two must be at least 0",
+        r"damping_terms .* the first and the last must be at least 0",
     ),
     "a polar inertia that no body has": (
         lambda: jv.rotor(**{**ROTOR, "polar_inertia": 0.96}),
-        r"machine\.polar_inertia is 0\.96 kg m\^2; no body has more than twice its transverse inertia, 0\.958 kg m\^2",
+        r"machine\.polar_inertia is 0\.96 kg m\^2; it cannot exceed twice the transverse inertia, 0\.958 kg m\^2",
     ),
     "supports at one place": (
         lambda: jv.rotor(**{**ROTOR, "position": 0.165}),
-        r"machine\.position puts both supports at 0\.165 m, which leaves the tilt of the rotor free",
+        r"machine\.position puts both supports at 0\.165 m, which does not hold the tilt of the rotor",
     ),
     "leaning platforms": (lambda: rotor_scene(two(), None, (jv.MomentImbalance(1e-3),)), r"needs a rotor that can tilt"),
     "far platform": (
@@ -186,12 +186,15 @@ WRONG_ROTORS = {
         r"name a platform instead",
     ),
     "platform of a rotor": (lambda: rotor_scene(effects=(jv.CubicSupport(1.0, platform=1),)), r"on a rotor give a position"),
-    "both places": (lambda: jv.CubicSupport(1.0, platform=1, position=0.1), r"names a platform and a position"),
+    "both places": (lambda: jv.CubicSupport(1.0, platform=1, position=0.1), r"has both a platform and a position"),
     "side of a ring": (lambda: rotor_scene(effects=(jv.Stop(1.0, 0.0, side="above", position=0.1),)), r"it must be 'both'"),
     "unknown side": (lambda: jv.Stop(1.0, 0.0, side="left"), r"effects\.stop\.side is 'left'; allowed: above, below, both"),
     "reaction": (lambda: jv.DryFriction(0.1, 0.01, reaction="none"), r"is 'none'; allowed: exact, run_up, steady"),
     "pendulums in contact": (lambda: rotor_scene(effects=contact()), r"give balls or rollers their ball_radius"),
-    "contact of several tracks": (lambda: touching(), r"needs loads on one track; this machine has them at several stations"),
+    "contact of several tracks": (
+        lambda: touching(),
+        r"needs loads on one track, but the loads of this machine run at several stations",
+    ),
     "twice": (lambda: rotor_scene(effects=(jv.Gravity(), jv.Gravity())), r"names gravity 2 times"),
 }
 

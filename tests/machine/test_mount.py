@@ -95,7 +95,7 @@ def test_loads_on_two_discs_are_euler_lagrange():
         (machines()["two_mass"], 3, "place is 3; the machine has platforms 1 to 2"),
         (machines()["two_mass"], 0.1, "is a distance along a rotor's axis; name a platform instead, 1 to 2"),
         (machine(), 1, "place is 1, which numbers a platform; on a rotor give a position"),
-        (jv.planar_rotor(mass=37.0, stiffness=1e6, damping=8.0), 0.1, "names a place .*, all points of which move alike"),
+        (jv.planar_rotor(mass=37.0, stiffness=1e6, damping=8.0), 0.1, "names a place .*, whose points all move together"),
     ],
     ids=["no platform", "distance", "platform", "planar"],
 )

@@ -65,7 +65,7 @@ def test_leaves_of_one_exciter_keep_their_order():
     ],
 )
 def test_theories_refuse_several_exciters(ask):
-    with pytest.raises(jv.InputError, match=r"has 2 exciters; this is for a scene with one, simulate"):
+    with pytest.raises(jv.InputError, match=r"has 2 exciters; this function needs a scene with one, use simulate"):
         ask(two()) if ask is not jv.envelope else ask(two(), 1.0)
 
 
@@ -123,13 +123,16 @@ BAD = {
     "platform": (lambda: two(at=3), r"at is 3; the machine has platforms 1 to 2"),
     "truth value": (lambda: two(at=True), r"at is True; it must be a whole number"),
     "distance": (lambda: two(at="2 mm"), r"at is a distance along a rotor's axis; name a platform instead"),
-    "friction without loads": (lambda: two(effects=jv.DryFriction(0.01, 0.02)), r"acts on loads, which this exciter does not"),
+    "friction without loads": (lambda: two(effects=jv.DryFriction(0.01, 0.02)), r"acts on loads, but this exciter has none"),
     "shared effect": (lambda: jv.Exciter(LOADS, DRIVE, effects=jv.Gravity()), "effects.gravity acts on the whole machine"),
     "own effect": (
         lambda: jv.Scene(TWO, exciters=[jv.Exciter(LOADS, DRIVE)] * 2, effects=jv.StaticImbalance(0.1)),
         r"effects.static_imbalance acts on one rotor; give it to an exciter",
     ),
-    "both forms": (lambda: jv.Scene(TWO, LOADS, DRIVE, exciters=[jv.Exciter(LOADS, DRIVE)]), "are given beside loads or drive"),
+    "both forms": (
+        lambda: jv.Scene(TWO, LOADS, DRIVE, exciters=[jv.Exciter(LOADS, DRIVE)]),
+        "are given together with loads or drive",
+    ),
     "none": (lambda: jv.Scene(TWO, exciters=[]), r"exciters is \[\]; it must be a list of exciters"),
     "replaced number": (
         lambda: jv.simulate(eqx.tree_at(lambda s: s.exciters[1].unbalance, two(), -1.0), 1.0),

@@ -125,21 +125,21 @@ def tables(**changed):
     [
         (dict(machine=None), "machine is missing; a scene file needs the table [machine]"),
         (dict(machine=5), "machine is 5; it must be a table, write [machine]"),
-        (dict(machin={}), "machin is no part of a scene file; did you mean 'machine'? allowed: machine, loads"),
+        (dict(machin={}), "machin is not part of a scene file; did you mean 'machine'? allowed: machine, loads"),
         (dict(machine__kind=None), "machine.kind is missing; allowed: one_mass, two_mass, three_mass, network"),
         (dict(machine__kind="twomass"), "machine.kind is 'twomass'; did you mean 'two_mass'? allowed: one_mass, two_mass"),
         (dict(machine__kind=["two_mass"]), "machine.kind is ['two_mass']; "),
         (dict(machine__mass=None), "machine.mass is missing; needed here: mass, stiffness, damping, link_stiffness"),
-        (dict(machine__stifness=1.0), "machine.stifness is no field here; did you mean 'stiffness'? allowed: mass,"),
+        (dict(machine__stifness=1.0), "machine.stifness is not a field here; did you mean 'stiffness'? allowed: mass,"),
         (dict(machine__mass=[120.0, -1.0]), "machine.mass[1] is -1 kg; it must be greater than 0"),
         (dict(machine__mass={"a": 1}), "machine.mass is {'a': 1}, which is not a number; write a number in kg"),
         (dict(loads__count=0), "loads.count is 0; it must be a whole number, at least 1"),
         (dict(loads__count="3"), "loads.count is '3'; it must be a whole number, at least 1"),
-        (dict(loads__inertia=1.0), "loads.inertia is no field here"),
+        (dict(loads__inertia=1.0), "loads.inertia is not a field here"),
         (dict(drive__speed="1500 kg"), "drive.speed is '1500 kg', which is not in rad/s"),
-        (dict(drive__sped=3.0), "drive.sped is no field here; did you mean 'speed'? allowed: speed"),
+        (dict(drive__sped=3.0), "drive.sped is not a field here; did you mean 'speed'? allowed: speed"),
         (dict(effects=5), "effects is not a table"),
-        (dict(effects={"gravty": True}), "effects.gravty is no effect; did you mean 'gravity'? allowed: gravity"),
+        (dict(effects={"gravty": True}), "effects.gravty is not an effect; did you mean 'gravity'? allowed: gravity"),
         (dict(effects={"gravity": 3}), "effects.gravity is 3; write true, false or a table of its arguments"),
         (dict(effects={"gravity": {"g": -1.0}}), "effects.gravity.g is -1 m/s^2; it must be at least 0"),
     ],
@@ -162,14 +162,14 @@ def test_a_file_that_cannot_be_read_says_which(tmp_path):
     with pytest.raises(jv.InputError, match=r"missing.toml cannot be read \(No such file or directory\)"):
         jv.load_scene(tmp_path / "missing.toml")
     (tmp_path / "broken.toml").write_text("[machine\nkind = 3")
-    with pytest.raises(jv.InputError, match=r"broken\.toml is no TOML file"):
+    with pytest.raises(jv.InputError, match=r"broken\.toml is not a TOML file"):
         jv.load_scene(tmp_path / "broken.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(jv.InputError, match=r"bytes\.toml is not UTF-8 text"):
         jv.load_scene(tmp_path / "bytes.toml")
     with pytest.raises(jv.InputError, match="cannot be read"):
         jv.load_scene(tmp_path)
-    with pytest.raises(jv.InputError, match="scene is no TOML"):
+    with pytest.raises(jv.InputError, match="scene is not a TOML"):
         jv.scene_from_toml("[machine")
 
 

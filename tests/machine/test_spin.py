@@ -207,21 +207,21 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
         ),
         (
             lambda: jv.Scene(HEAVY, balls(), jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1), (jv.FreeSpin(),)),
-            r"effects.free_spin needs a drive of given speed \(property ideal\), not 'dc_motor'",
+            r"effects.free_spin needs a drive with prescribed speed \(property ideal\), not 'dc_motor'",
         ),
         (lambda: jv.with_spin(scene(BOTH), some_state(), "asleep"), "turning is 'asleep'; it must be 'rolling' or 'still'"),
         (
             lambda: jv.simulate(scene(), 0.1, start=jv.with_spin(scene(BOTH), some_state())),
-            "start.spin is given, but no effect of the scene makes it free",
+            "start.spin is given, but no effect of the scene allows it",
         ),
         (
             lambda: jv.simulate(scene(BOTH), 0.1, start=jv.with_spin(scene(BOTH[:1]), some_state())),
             "start.spin has shapes .* this scene needs",
         ),
-        (lambda: jv.vector_field(scene(BOTH))(0.0, some_state()), r"state.spin has no .*; see with_spin\(scene, state\)"),
+        (lambda: jv.vector_field(scene(BOTH))(0.0, some_state()), r"state.spin has no .*; use with_spin\(scene, state\)"),
         (
             lambda: jv.jam_modes(jv.Scene(HEAVY, PLANE, jv.ConstantSpeed(1.0), (jv.Sliding(0.1),))),
-            r"effects.sliding is not part of this theory \(term SlipRelease\)",
+            r"effects.sliding is not included in this function \(term SlipRelease\)",
         ),
     ],
 )

@@ -130,7 +130,7 @@ def test_ensemble_names_runs_in_which_balls_leave_the_wall():
     many = jv.ensemble(make, jnp.asarray([-1.0, 1.0, jnp.nan]), 0.02, stepsize_controller=steps, estimate=False)
     np.testing.assert_array_equal(many.detached[:2], [[False, True], [False, False]])
     assert [str(name) for name in status_names(many.status)] == ["detached", "done", "not_finite"]
-    assert "the equations keep it there" in many.summary()
+    assert "on which the equations hold it" in many.summary()
 
 
 def test_frequency_about_the_equator_is_the_resolved_one():
@@ -147,7 +147,7 @@ def test_frequency_about_the_equator_is_the_resolved_one():
         (lambda: balls(ball_radius=0.02), "loads.ball_radius is 0.02 m, which is larger than the tube of 0.015 m"),
         (lambda: balls(ball_radius=0.015), r"which leaves no gap of 0.015 m radius.*balls\(\.\.\.\)"),
         (lambda: balls(tube=0.25), "loads.tube is 0.25 m; it must be less than the ring's radius"),
-        (lambda: balls(51), "loads.ball_radius is 0.0125 m; 51 side by side on a circle of 0.2025 m have room below"),
+        (lambda: balls(51), "loads.ball_radius is 0.0125 m; 51 side by side on a circle of 0.2025 m need a ball_radius below"),
         (lambda: balls(mass=0.0), "loads.mass is 0 kg; it must be greater than 0"),
         (lambda: balls(radius="3 kg"), "loads.radius is '3 kg', which is not in m"),
         (lambda: jv.RollingFriction(-1e-5), "effects.rolling_friction.coefficient is -1e-05 m; it must be at least 0"),

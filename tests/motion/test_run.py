@@ -43,7 +43,7 @@ def test_reading_what_is_no_run_is_an_input_error(tmp_path):
     (tmp_path / "text.npz").write_text("no run")
     np.savez(tmp_path / "other.npz", x=np.zeros(2))
     for name in ("text.npz", "other.npz"):
-        with pytest.raises(jv.InputError, match=r"it is no result written by save"):
+        with pytest.raises(jv.InputError, match=r"it is not a result written by save"):
             jv.Run.load(tmp_path / name)
 
 

@@ -67,10 +67,10 @@ def test_starts_that_cannot_be_say_what_else_to_start_from():
         with pytest.raises(jv.InputError) as error:
             ask(scene(effects=effects))
         assert str(error.value) == (
-            "start is 'jam', but effects cubic_support and stop are not part of this theory (term SupportForce); "
+            "start is 'jam', but effects cubic_support and stop are not included in this function (term SupportForce); "
             "start at 'rest', or from a State"
         )
-    with pytest.raises(jv.InputError, match=r"separation is 0\.1, for named starts only"):
+    with pytest.raises(jv.InputError, match=r"separation is 0\.1, which is only for named starts"):
         jv.simulate(scene(), 1.0, start=jv.initial_state(scene()), separation=0.1)
     np.testing.assert_allclose(jv.initial_state(scene(), separation="3 deg").azimuth, -np.pi / 2 + np.deg2rad([-3.0, 0.0, 3.0]))
 

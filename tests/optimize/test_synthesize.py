@@ -113,11 +113,11 @@ def test_wrong_questions_are_said_in_one_sentence():
         (3.0, [], None, "must be a DesignSpace"),
         (SPACE, [3.0], None, "must be a Demand, for example"),
         (SPACE, [], 3.0, "must be a Synthesis"),
-        (running, [], None, "give a ConstantSpeed"),
+        (running, [], None, "use a ConstantSpeed"),
     ):
         with pytest.raises(jv.InputError, match=says):
             synthesize(space, wish, subject_to=subject_to, begin=begin)
-    assert _run(SCENE, None, True)[1].startswith("the objective and the demands belong to no jam mode")
+    assert _run(SCENE, None, True)[1].startswith("neither the objective nor the demands have a jam mode")
     assert _run(SCENE, 3, False) == (None, "not requested")
 
 

@@ -85,7 +85,7 @@ def test_numbers_that_are_not_finite_and_long_lists():
     document = {"error": math.nan, "omega": list(range(40)), "table": [[1.0, 2.0]] * 300, "empty": [], "flag": True}
     page = checked(Report("x", {**document, "error": None}, {"omega": "rad/s"}).html())
     said = " ".join(page.text)
-    assert "40 numbers from 0 to 39" in said and "100 rows more" in said and "yes" in said and "omega, rad/s" in said
+    assert "40 numbers from 0 to 39" in said and "100 more rows" in said and "yes" in said and "omega, rad/s" in said
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)

@@ -36,8 +36,8 @@ def test_long_lists_are_told_by_their_range():
     document = {"times": [0.5 * k for k in range(40)], "names": ["x"] * 40, "grid": [[1.0, 2.0], [3.0, None]]}
     text = results(document, {})
     assert cells(text, "p") == [
-        "40 numbers from 0 to 19.5; --json and --out have them",
-        "40 values; --json and --out have them",
+        "40 numbers from 0 to 19.5; see the output of --json or --out",
+        "40 values; see the output of --json or --out",
     ]
     assert cells(text) == ["1", "2", "3", "none"]
     short = results({"times": [1.0, 2.0], "none": []}, {})

@@ -20,7 +20,7 @@ SCENE = jv.Scene(
     jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
     jv.ConstantSpeed("60 rad/s"),
 )
-LOST = "it is no result written by save"
+LOST = "it is not a result written by save"
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_keys_keep_their_types():
 
 def test_what_no_file_can_hold_is_refused_before_writing(tmp_path, modes):
     for value in (np.asarray([None]), jnp.ones(2, jnp.bfloat16), object()):
-        with pytest.raises(jv.InputError, match="which no file can hold"):
+        with pytest.raises(jv.InputError, match="which cannot be saved"):
             _encoded(value, {})
 
 
@@ -197,7 +197,7 @@ def test_control_characters_never_reach_a_message(tmp_path):
     path = tmp_path / "x.toml"
     for text in ('"a\\u001b[31m" = 1', 'machine = "\\u009b31m"', '[machine]\nkind = "\\u202e"'):
         path.write_text(text)
-        with pytest.raises(jv.InputError, match="holds the control character") as caught:
+        with pytest.raises(jv.InputError, match="contains the control character") as caught:
             jv.load_scene(path)
         assert str(caught.value).isprintable()
     error = jv.InputError("a\x1b]0;x\x07" + "b" * 5000, "is \x9b31m\n\u202e " + "c" * 9999 + "; " + "d " * 5000)

@@ -34,7 +34,7 @@ def test_a_folder_others_can_write_to_is_refused(tmp_path, mode, part):
     folder = tmp_path / "shared"
     (folder / "programs").mkdir(parents=True)
     (folder / part).chmod(mode)
-    with pytest.raises(InputError, match=r"must be yours alone.*chmod go-w"):
+    with pytest.raises(InputError, match=r"others can write to.*chmod go-w"):
         jv.use_cache(folder)
     assert cache.program_folder() is None
 
@@ -44,7 +44,7 @@ def test_a_folder_that_others_can_exchange_is_refused(tmp_path):
     above = tmp_path / "above"
     (above / "own").mkdir(parents=True)
     above.chmod(0o777)
-    with pytest.raises(InputError, match="above', do chmod"):
+    with pytest.raises(InputError, match="above', which is not safe; run chmod"):
         jv.use_cache(above / "own")
     above.chmod(0o1777)
     jv.use_cache(above / "own")
@@ -56,7 +56,7 @@ def test_a_folder_of_another_user_is_refused(tmp_path, part):
     folder = tmp_path / "above" / "foreign"
     (folder / "programs").mkdir(parents=True)
     os.chown(folder / part, 12345, -1)
-    with pytest.raises(InputError, match=r"must be your own.*belongs to user 12345"):
+    with pytest.raises(InputError, match=r"must belong to you.*belongs to user 12345"):
         jv.use_cache(folder)
 
 
@@ -70,7 +70,7 @@ def test_a_link_is_judged_by_where_it_leads(tmp_path):
     (tmp_path / "shared").mkdir()
     (tmp_path / "shared").chmod(0o777)
     (tmp_path / "link").symlink_to(tmp_path / "shared")
-    with pytest.raises(InputError, match="must be yours alone"):
+    with pytest.raises(InputError, match="others can write to"):
         jv.use_cache(tmp_path / "link")
 
 

@@ -37,7 +37,7 @@ except jv.InputError as error:
     print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert "prepare_cpu comes too late" in done.stdout
+    assert "prepare_cpu was called after JAX had begun to compute" in done.stdout
     with pytest.raises(jv.InputError, match="devices is 0"):
         jv.prepare_cpu(0)
 

@@ -93,7 +93,7 @@ def test_campbell_diagram_has_both_senses():
 
 
 def test_platforms_do_not_whirl():
-    with pytest.raises(jv.InputError, match=r"machine\.kind is 'two_mass', which moves up and down only"):
+    with pytest.raises(jv.InputError, match=r"machine\.kind is 'two_mass', which moves only up and down"):
         jv.whirl(platforms("two_mass"))
     with pytest.raises(jv.InputError, match=r"rotor_speed\[1\] is -5 rad/s; it must be at least 0"):
         jv.whirl(published_rotor(), [10.0, -5.0])

@@ -138,7 +138,7 @@ def layout_without(store, text):
 def test_damaged_metadata_are_refused(copy, harm):
     harm(copy)
     for ask in (lambda: run_study(STUDY, copy), lambda: jv.open_sweep(copy)):
-        with pytest.raises(jv.InputError, match="no store of a sweep, or a damaged one"):
+        with pytest.raises(jv.InputError, match="not the store of a sweep, or a damaged one"):
             ask()
 
 
@@ -161,7 +161,7 @@ def other_versions(store):
 
 def test_a_store_of_other_versions_is_refused(copy):
     other_versions(copy)
-    with pytest.raises(jv.InputError, match=f"begun with jax 0.1.0, and this is {jax.__version__}: digits would differ"):
+    with pytest.raises(jv.InputError, match=f"created with jax 0.1.0, and this is {jax.__version__}: digits would differ"):
         run_study(STUDY, copy)
 
 
@@ -179,7 +179,7 @@ def test_a_second_sweep_says_that_the_first_runs(copy):
     asked = [sys.executable, "-S", "-c", HOLD, str(copy / seals.FOLDER / "lock")]
     with subprocess.Popen(asked, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as first:
         assert first.stdout.readline() == "held\n"
-        with pytest.raises(jv.InputError, match="into which another sweep writes at this moment; wait until that has ended"):
+        with pytest.raises(jv.InputError, match="into which another sweep is writing; wait until that has ended"):
             run_study(STUDY, copy)
         assert jv.open_sweep(copy).status_name == "done"
         first.kill()
@@ -197,7 +197,7 @@ def test_of_two_threads_one_writes(tmp_path):
             thread.join()
 
     assert run_study(STUDY, store, report=second).status_name == "done"
-    assert len(said) == 1 and "another sweep writes" in said[0]
+    assert len(said) == 1 and "another sweep is writing" in said[0]
 
 
 def refused(store):

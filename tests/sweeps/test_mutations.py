@@ -71,7 +71,7 @@ TABLES = [
     ('function = "sys:exit"', "function <built-in function exit>"),
     ('function = "operator:index"', "cannot be computed"),
     ('function = "no_such_module:f"', "cannot be imported"),
-    ('function = "math:sqrt"\nmode = 3', "mode is no field here"),
+    ('function = "math:sqrt"\nmode = 3', "mode is not a field here"),
 ]
 
 

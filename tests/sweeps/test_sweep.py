@@ -139,7 +139,7 @@ def test_what_cannot_be_a_folder(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(jv.InputError, match="cannot be written"):
         run_study(STUDY, "/proc/study.zarr")
-    with pytest.raises(jv.InputError, match="no store of a sweep"):
+    with pytest.raises(jv.InputError, match="not the store of a sweep"):
         run_study(STUDY, tmp_path / "file")
 
 

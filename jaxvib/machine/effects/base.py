@@ -174,7 +174,7 @@ class Gravity(Effect):
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for gravity along the axis if the loads do not move in that direction."""
         if len(jax.eval_shape(loads.position, *loads.rest())) <= _AXES[self.along]:
-            problem = f"needs loads that move along the rotor's axis, which {loads.kind!r} do not; leave gravity out"
+            problem = f"needs loads that move along the rotor's axis, which {loads.kind!r} do not; remove gravity"
             raise InputError("effects.gravity.along", f"is {quoted(self.along)}; it {problem}")
 
     def energy(self, loads: Loads, u: Coordinates) -> Array:

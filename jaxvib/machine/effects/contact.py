@@ -83,9 +83,13 @@ class LoadContact(Effect):
         """**Raises** `InputError` for `loads` without a size, or at several stations of the `machine`."""
         ball_radius(loads, "effects.load_contact")
         if self.restitution is not None and jnp.ndim(loads.mass) > 0:
-            raise InputError("effects.load_contact.restitution", "is for loads of one mass; give the damping of their contacts")
+            raise InputError(
+                "effects.load_contact.restitution", "needs loads of equal mass; give the damping of the contacts in its place"
+            )
         if not machine.mounting().at_one_point:
-            raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
+            raise InputError(
+                "effects.load_contact", "needs loads on one track, but the loads of this machine run at several stations"
+            )
 
     def validate_start(self, loads: Loads, u: Coordinates) -> None:
         """**Raises** `InputError` if the `loads` cannot start at the coordinates `u`.
@@ -99,9 +103,11 @@ class LoadContact(Effect):
         wrong = ~np.all(np.diff(phi, axis=-1) > 0.0, axis=-1) | ~(phi[..., -1] - phi[..., 0] < 2.0 * np.pi)
         if np.any(wrong):
             which = np.round(phi[wrong][0] if phi.ndim > 1 else phi, 4).tolist()
-            problem = "loads in contact never pass each other: each angle must be above the one before, all within one turn"
+            problem = (
+                "loads in contact cannot pass each other: each angle must be larger than the one before, all within one turn"
+            )
             raise InputError(
-                "start.angle", f"is {which} rad; {problem} (add 2 pi to loads that are a turn behind, or sort them)"
+                "start.angle", f"is {which} rad; {problem} (add 2 pi to angles that are one turn behind, or sort them)"
             )
 
     def _require_distances(self, loads: Loads, u: tuple[Array, ...]) -> None:

@@ -106,7 +106,7 @@ class DryFriction(Effect):
         if not loads.has_bearing:
             raise InputError(
                 "effects.dry_friction",
-                f"needs loads with bearings, and a {loads.kind} has none (property has_bearing); give pendulums, or drag",
+                f"needs loads with bearings, and a {loads.kind} has none (property has_bearing); use pendulums, or drag",
             )
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:

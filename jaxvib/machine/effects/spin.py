@@ -49,7 +49,7 @@ class FreeSpin(Effect):
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
         """Return the effect, which has no numbers."""
-        return Typical(cls(), "no moment about the normal of a contact at a point")
+        return Typical(cls(), "no moment about the normal of a point contact")
 
     def terms(self) -> tuple[Term, ...]:
         """Return the freedom to spin."""
@@ -59,7 +59,7 @@ class FreeSpin(Effect):
         """**Raises** `InputError` for loads that are not coupled to their spin."""
         rest = loads.rest()
         if jax.eval_shape(loads.drilling_spin, rest, rest, jnp.zeros(())) is None:
-            problem = f"needs balls in a torus; {loads.kind!r} are not coupled to a spin about the normal (drilling_spin)"
+            problem = f"needs balls in a torus; {loads.kind!r} have no drilling spin"
             raise InputError("effects.free_spin", problem)
 
 

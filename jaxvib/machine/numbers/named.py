@@ -191,7 +191,7 @@ def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
     """
     there, field = numbers_of(scene), f"{field}.{name}"
     if not isinstance(name, str):
-        raise InputError(field, f"is no name of a number; {suggest_name(str(name), list(there))}")
+        raise InputError(field, f"is not the name of a number; {suggest_name(str(name), list(there))}")
     if name in there:
         return there[name]
     array, index = m.groups() if (m := re.fullmatch(r"(.+)\[(\d+)\]", name)) else (name, None)
@@ -208,11 +208,13 @@ def _why_unnamed(scene: Scene, name: str) -> str:
     part, _, last = name.rpartition(".")
     owner = next((each for prefix, _, each in _parts(scene) if prefix == part), None)
     if last not in getattr(type(owner), "__dataclass_fields__", ()):
-        return "is no number of this scene"
+        return "is not a number of this scene"
     value = getattr(owner, last)
     if value is None or np.size(value) == 0:
         return "is not set in this scene"
-    return "has entries of different units" if _is_continuous(value) else f"is {quoted(value)}, which is no continuous number"
+    return (
+        "has entries of different units" if _is_continuous(value) else f"is {quoted(value)}, which is not a continuous number"
+    )
 
 
 def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array | np.ndarray) -> Scene:
@@ -237,8 +239,8 @@ def present_numbers(scene: Scene, found: NamedNumber, field: str) -> tuple[Named
     if not found.keeps_zeros(scene) or np.all(values != 0.0):
         return (found,)
     if not np.any(values):
-        advice = f"name the entry that shall be added, for example {found.name}[0]"
-        raise InputError(f"{field}.{found.name}", f"is 0 in every entry, and zeros stay as they are; {advice}")
+        advice = f"name the entry to add, for example {found.name}[0]"
+        raise InputError(f"{field}.{found.name}", f"is 0 in every entry, and zeros are not changed; {advice}")
     return tuple(each for each, value in zip(found.single(scene), values, strict=True) if value != 0.0)
 
 
@@ -256,7 +258,7 @@ def read_value(name: str, value: Number) -> float:
     spec, index = spec_of(name), re.search(r"\[(\d+)\]$", str(name))
     entry = int(index[1]) if index else None
     if spec is None or (len(spec.units) > 1 and (entry or 0) >= len(spec.units)):
-        raise InputError(str(name), "is no number of a scene; give a name such as 'machine.stiffness[0]' or 'drive.speed'")
+        raise InputError(str(name), "is not a number of a scene; give a name such as 'machine.stiffness[0]' or 'drive.speed'")
     return NamedNumber(name, (), entry, 1, spec).value(value, name)
 
 

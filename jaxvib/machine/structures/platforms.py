@@ -101,7 +101,7 @@ def _platforms(
     for name, value in of_links.items():
         given = len(value) if isinstance(value, (list, tuple)) else getattr(value, "size", 1)
         if not joined and given > 0:
-            problem = f"has {given} values; the machine has no links, leave it out or give links"
+            problem = f"has {given} values, but the machine has no links; leave it out or give links"
             raise InputError(f"machine.{name}", problem)
     found |= read(len(joined), **of_links) if joined else dict.fromkeys(of_links, jnp.asarray(np.zeros(0), dtype=float))
     return Platforms(**found, links=joined, exciter=which, kind=kind)

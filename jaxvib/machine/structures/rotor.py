@@ -201,19 +201,22 @@ def rotor(
 
 def _require_passive(field: str, one: float, two: float, three: float) -> None:
     if min(one, three) < 0.0 or two**2 > one * three * (1.0 + 1e-9):
-        problem = "would drive the rotor; the outer two must be at least 0, their product at least the middle one's square"
+        problem = (
+            "would add energy to the rotor; the first and the last must be at least 0, and their product "
+            "at least the square of the middle one"
+        )
         raise InputError(f"machine.{field}", f"{[one, two, three]} {problem}")
 
 
 def _require_two_places(places: np.ndarray) -> None:
     if places[0] == places[1]:
-        problem = "which leaves the tilt of the rotor free; give two places, such as [0.165, -0.155]"
+        problem = "which does not hold the tilt of the rotor; give two places, such as [0.165, -0.155]"
         raise InputError("machine.position", f"puts both supports at {places[0]:g} m, {problem}")
 
 
 def _require_body(across: float, along: float) -> None:
     if along > 2.0 * across * (1.0 + 1e-6):
-        most = f"no body has more than twice its transverse inertia, {2.0 * across:g} kg m^2 (a thin disc)"
+        most = f"it cannot exceed twice the transverse inertia, {2.0 * across:g} kg m^2 (a thin disc)"
         raise InputError("machine.polar_inertia", f"is {along:g} kg m^2; {most}")
 
 
@@ -302,21 +305,22 @@ static_imbalance = { moment = "8 g m" }
 """
 
 TEMPLATES = {
-    "planar_rotor": """# A rotor on one isotropic support; it does not tilt.
-# Numbers are SI; text may carry any unit of the same dimension.
+    "planar_rotor": """# A rotor on one isotropic support, without tilt.
+# Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "planar_rotor"
-mass = 37.0                 # kg, auto-balancer's body included, loads not counted
+mass = 37.0                 # kg, with the body of the exciter, without the loads
 stiffness = "1160 N/mm"     # of the support, across and up
 damping = 840.0             # N s/m
 """
     + _ROTOR,
-    "rotor": """# A rigid rotor on two supports; it moves across and up and tilts both ways.
-# Numbers are SI; text may carry any unit of the same dimension. Places along the axis are counted from the mass centre.
+    "rotor": """# A rigid rotor on two supports; it moves in two directions and tilts about two axes.
+# Numbers are in SI units; text can have any unit of the same dimension.
+# Positions along the axis are measured from the mass centre.
 [machine]
 kind = "rotor"
-mass = 37.0                               # kg, loads not counted
-transverse_inertia = 0.479                # kg m^2, about an axis across, loads not counted
+mass = 37.0                               # kg, without the loads
+transverse_inertia = 0.479                # kg m^2, about a transverse axis, without the loads
 polar_inertia = 0.093                     # kg m^2, about the axis of rotation
 stiffness = ["604 N/mm", "555 N/mm"]      # of the two supports
 damping = [439.0, 404.0]                  # N s/m

@@ -48,12 +48,12 @@ _BALANCED = 0.02
 class RegimeName(eqx.Enumeration):
     """Kinds of motion. Each member is the sentence shown to the user."""
 
-    swinging = "the loads swing and do not go round"
+    swinging = "the loads swing and do not rotate"
     jammed = "the loads are jammed: they turn together, slower than the rotor"
     unbalanced = "the loads turn with the rotor, which is not balanced"
     balanced = "the loads turn with the rotor and balance it"
-    parted = "the loads have parted: they turn at different speeds that no longer change"
-    unsettled = "the loads have not come to a steady motion"
+    parted = "the loads have separated: they turn at different speeds that no longer change"
+    unsettled = "the loads have not reached a steady motion"
 
 
 REGIMES = enumeration_names(RegimeName)
@@ -124,7 +124,7 @@ class Regime(Result):
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
             evidence += [self._remainder(), pattern]
         if bool(self.caught):
-            evidence.append("the rotor itself is caught at a resonance, below its motor's speed")
+            evidence.append("the rotor itself is stuck at a resonance, below the speed of its motor")
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
 
@@ -132,7 +132,7 @@ class Regime(Result):
         share = float(self.unbalance)
         # The loads can have at most their unbalance at one angle; the excess belongs to the rotor.
         if share > 1.005:
-            return f"the rotor's imbalance is more than the loads can balance: {share:.2g} times their unbalance is left"
+            return f"the imbalance of the rotor exceeds what the loads can balance: {share:.2g} times their unbalance is left"
         return f"{100.0 * share:.3g} % of the loads' unbalance is left"
 
     @validated

@@ -68,7 +68,7 @@ class Spectrum(Result):
             for j, (name, unit, k) in enumerate(zip(self.coordinates, self.units, peaks, strict=True))
         ]
         return "\n".join(
-            [f"{self.time.size} pieces, strongest in the last one, zero to peak:", *(f"  {line}" for line in lines)]
+            [f"{self.time.size} parts, strongest components of the last one, zero to peak:", *(f"  {line}" for line in lines)]
         )
 
     @validated
@@ -118,13 +118,13 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     """Return the spectrum of a run's window if `parts` is 1, otherwise of this number of pieces of its trajectory."""
     count(parts, "parts")
     if parts > 1 and trajectory is None:
-        raise InputError("parts", f"is {parts}; the run kept its end only, simulate with save='all', or give 1")
+        raise InputError("parts", f"is {parts}, but the run saved its end only; simulate with save='all', or give 1")
     kept = window if parts == 1 or trajectory is None else trajectory
     time = np.asarray(kept.time, float)
     # Neighbouring pieces share a half, since Hann's window suppresses the ends of each piece.
     size = time.size if parts == 1 else 2 * time.size // (parts + 1)
     if size < 64:
-        raise InputError("parts", f"is {parts}, which leaves {size} samples for a piece; 64 are needed, give fewer parts")
+        raise InputError("parts", f"is {parts}, which leaves {size} samples for each part; 64 are needed, give fewer parts")
     starts = np.linspace(0, time.size - size, parts).astype(int)
     step = float(time[1] - time[0])
     points = _FINER * 2 ** int(np.ceil(np.log2(size)))

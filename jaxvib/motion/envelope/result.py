@@ -26,13 +26,15 @@ class EnvelopeStatus(eqx.Enumeration):
     """Outcomes of an averaged run. Each member is the sentence shown to the user."""
 
     done = "the averaged run reached its end"
-    max_steps_reached = "the averaged run did not reach its end in the steps it was allowed"
+    max_steps_reached = "the averaged run needs more steps than max_steps to reach its end"
     not_finite = "the motion grew without bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
-    no_start = "the state to start from does not exist or is not finite"
-    would_separate = "all loads are at nearly one angle, but this motion is unstable: slightly separated loads leave it"
+    no_start = "the initial state does not exist or is not finite"
+    would_separate = (
+        "all loads are at nearly one angle, and this motion is unstable: slightly separated loads move away from it"
+    )
     refused = REFUSED
-    not_turning = "a load turns too slowly against gravity, or is not lifted by its drag, for gravity to average out"
+    not_turning = "gravity does not average out: a load turns too slowly, or its drag does not lift it against gravity"
 
 
 class Envelopes(eqx.Module):
@@ -96,7 +98,7 @@ class Envelope(AbstractMeasured, Result):
         state = "settled" if bool(self.settled) else "not settled: run longer"
         end = EnvelopeStatus[EnvelopeStatus.done] if unstable else self.message
         if unstable:
-            first, state = [f"not settled: {self.message}"], "repeats itself only while the loads are at one angle"
+            first, state = [f"not settled: {self.message}"], "periodic only while the loads are at one angle"
         return "\n".join(
             [
                 *first,

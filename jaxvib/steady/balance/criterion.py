@@ -165,7 +165,7 @@ def criterion(scene: Scene) -> Criterion:
     scene = validate_scene(scene)
     require_one_point(scene)
     if scene.loads.count < 2:
-        raise InputError("loads.count", "is 1; the criterion, on the gathering of loads, needs 2 or more")
+        raise InputError("loads.count", "is 1; the criterion is about the gathering of loads and needs 2 or more")
     require_terms(scene.all_effects, CRITERION_TERMS, "acts|act on each load separately, which the criterion excludes")
     return _judged(characteristic_speeds(scene))
 

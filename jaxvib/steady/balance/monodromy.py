@@ -119,8 +119,8 @@ def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | N
     decay, wanted = (float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest)))
     if wanted >= _MOST and decay * 2.0 * np.pi / slowest < _FORGOTTEN:
         problem = (
-            f"is {slowest:g} rad/s, so slow that a turn takes more than {_MOST} steps, and the carrier still vibrates at its "
-            f"end (it decays at {max(decay, 0.0):.2g} 1/s); turn faster, or give machine.damping"
+            f"is {slowest:g} rad/s, at which a turn takes more than {_MOST} steps, and the carrier still vibrates at its "
+            f"end (it decays at {max(decay, 0.0):.2g} 1/s); use a higher speed, or give machine.damping"
         )
         raise InputError("drive.speed", problem)
     return None

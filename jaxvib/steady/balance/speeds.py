@@ -34,9 +34,9 @@ _GRID_POINTS = 24
 class CriterionStatus(eqx.Enumeration):
     """Outcome of the criterion for a machine; the members are the sentences a user reads."""
 
-    judged = "every rotor speed is judged"
-    free = "no support holds the machine against one of its motions: its lowest resonance is 0, and it can drift"
-    not_finite = "the speeds could not be computed: a number of the scene is not allowed, or beyond the precision"
+    judged = "stability was decided at every rotor speed"
+    free = "no support resists one of the motions of the machine: its lowest resonance is 0, and it can drift"
+    not_finite = "the speeds could not be computed: a number of the scene is not allowed or exceeds the precision"
 
 
 class CharacteristicSpeeds(Result):
@@ -202,11 +202,11 @@ def _direction(model: LinearModel) -> Array:
 def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
     """**Raises** `InputError` if no coordinate moves the port, a rotor has a motion without a spring, or rounding hides one."""
     if not np.any(port):
-        problem = "moves with none of the coordinates; put the exciter where it can move, or its loads cannot act"
+        problem = "does not move with any coordinate, and its loads have no effect; put the exciter at a point that can move"
         raise InputError("machine.port", problem)
     if scene.mounting().gyroscopic is not None:
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
-            raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
+            raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; every motion needs one")
         return
     # Resonances that rounding hides, relative to the highest one, although a spring resists the motion.
     rounding = mass.shape[0] * np.finfo(mass.dtype).eps
@@ -217,7 +217,10 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
     if np.sum(squares <= rounding * squares[-1]) > free:
         stiff = int(np.argmax(np.diag(stiffness) / np.diag(mass)))
         name = scene.machine.structure().coordinates[stiff]
-        cannot = "cannot move beside the others in this precision; soften its spring, or leave it out of the machine"
+        cannot = (
+            "is too stiff to be computed together with the others in this precision; use a softer spring, "
+            "or leave it out of the machine"
+        )
         if np.any(port[:, stiff]):
             raise InputError("machine.exciter", f"stands on {name}, which {cannot}")
         raise InputError("machine.stiffness", f"is so high at {name} that it {cannot}")

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class StabilityStatus(eqx.Enumeration):
     """Stability of a balanced motion; the members are the sentences a user reads."""
 
-    stable = "errors of the balanced motion die out"
-    unstable = "errors of the balanced motion grow"
-    undecided = "errors of the balanced motion change in a turn by less than the error of the computation"
+    stable = "deviations from the balanced motion decay"
+    unstable = "deviations from the balanced motion grow"
+    undecided = "deviations from the balanced motion change during a turn by less than the error of the computation"
 
 
 class BalancedStability(Result):

@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 class BalanceStatus(eqx.Enumeration):
     """Outcomes of the balance of loads; the members are the sentences a user reads."""
 
-    unique = "the loads cancel in one arrangement, up to a common turn and a mirror image"
-    family = "the loads cancel in a family of arrangements, with neutral directions besides the common turn"
-    alone = "a single load has nothing to cancel it"
-    outweighed = "one load's m R, or the rotor's imbalance, is larger than all others together: nothing can cancel it"
+    unique = "the loads cancel in one arrangement, apart from a common rotation and a mirror image"
+    family = "the loads cancel in a family of arrangements, with neutral directions in addition to the common rotation"
+    alone = "a single load has no other load to cancel it"
+    outweighed = "one load's m R, or the rotor's imbalance, is larger than all others together and cannot be cancelled"
 
 
 class BalancedStates(Result):
@@ -157,14 +157,14 @@ def balanced_states(scene: Scene) -> BalancedStates:
     >>> loads = jv.balls(count=3, mass=[0.3, 0.4, 0.5], radius=0.1, drag=1.0)
     >>> states = jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0)))
     >>> print(states.summary())
-    the loads cancel in one arrangement, up to a common turn and a mirror image
+    the loads cancel in one arrangement, apart from a common rotation and a mirror image
       0, 90, 233.1 deg
       0, 270, 126.9 deg
     neutral directions: turn of all loads
     >>> loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     >>> imbalance = jv.StaticImbalance("50 g m", angle="90 deg")    # as much as each of the balls
     >>> print(jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), (imbalance,))).summary())
-    the loads cancel in one arrangement, up to a common turn and a mirror image
+    the loads cancel in one arrangement, apart from a common rotation and a mirror image
       210, 330 deg
       330, 210 deg
     neutral directions: none
@@ -211,8 +211,8 @@ def _imbalance(scene: Scene) -> complex:
     moment += [float(lever) * each for lever in levers if lever is not None for each in static]
     if abs(sum(moment)) > 1e-9 * max(map(abs, moment), default=0.0):
         problem = (
-            "tilt the rotor: loads at one point cannot cancel a moment imbalance, nor a static one away from them "
-            "(it sits at the rotor's mass centre); leave it out, or simulate"
+            "tilt the rotor: loads at one point cannot cancel a moment imbalance, or a static imbalance at another point "
+            "(it acts at the mass centre of the rotor); leave it out, or simulate"
         )
         raise InputError("effects", problem)
     return sum(static, 0j)
@@ -385,9 +385,7 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
     """Return validated angles at which the loads cancel each other, and the number of their neutral directions."""
     sides, imbalance = _sides(circular_loads(scene)), _imbalance(scene)
     if not np.min(np.asarray(natural_frequencies(scene))) > 0.0:
-        problem = (
-            "lets the machine drift: that motion neither grows nor dies, which hides whether the loads do; give it a support"
-        )
+        problem = "lets the machine drift; this neutral motion hides the growth or decay of the loads, add a support"
         raise InputError("machine.stiffness", problem)
     if angles is None:
         states = balanced_states(scene)
@@ -396,7 +394,7 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
         angles = states.angles[0]
     angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
     if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > 1e-9 * sides.sum():
-        raise InputError("angles", "leave an unbalance; take them from balanced_states(scene).angles")
+        raise InputError("angles", "leave an unbalance; use angles from balanced_states(scene).angles")
     _require_undisturbed(scene, angles)
     return angles, _neutral(sides, angles, turns=imbalance == 0.0).shape[1]
 

@@ -49,8 +49,10 @@ class JamStatus(eqx.Enumeration):
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
     at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
-    cannot_stay_together = "these loads cannot jam at one angle: one needs more torque than the vibration has at any phase"
-    unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
+    cannot_stay_together = (
+        "these loads cannot jam at one angle: one of them needs more torque than the vibration can supply at any phase"
+    )
+    unbounded = "the loads turn at an undamped resonance: the vibration grows without bounds"
     refused = REFUSED
 
 

@@ -12,7 +12,7 @@ class PhasePattern(eqx.Enumeration):
 
     together = "all together"
     opposite = "in two opposite groups"
-    spread = "spread so that they cancel each other"
+    spread = "spread around the circle, cancelling each other"
     other = "at other phases"
 
 

@@ -270,7 +270,7 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     speeds = np.asarray(omega, dtype=float)
     top = float(scene.drive.speed)
     if speeds.ndim != 1 or not np.all((speeds > 0.0) & (speeds < top)) or not np.all(np.diff(speeds) > 0.0):
-        raise InputError("omega", f"must be a list of load speeds that ascend, above 0 and below the rotor's {top:g}")
+        raise InputError("omega", f"must be an ascending list of load speeds above 0 and below the rotor speed {top:g}")
     # From the jam upward, then from the jam downward.
     places, cut = np.arange(speeds.size), int(np.searchsorted(speeds, float(jam.omega)))
     order = np.concatenate([places[cut:], places[:cut][::-1]])

@@ -42,10 +42,10 @@ _SAME_JAM_DISTANCE = 0.02
 class PhaseStatus(eqx.Enumeration):
     """Outcomes of a jam of loads at different angles. Each member is the sentence shown to the user."""
 
-    found = "the loads can jam in this way"
-    with_rotor = "the loads turn with the rotor and leave it at rest: they balance, and are not jammed"
-    not_converged = "no jam was found from this start"
-    unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
+    found = "the loads can jam at these phases"
+    with_rotor = "the loads turn with the rotor and balance it: they are not jammed"
+    not_converged = "the search from this initial guess found no jam"
+    unbounded = "the loads turn at an undamped resonance: the vibration grows without bounds"
     refused = REFUSED
 
 

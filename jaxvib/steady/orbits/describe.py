@@ -47,11 +47,14 @@ class OrbitStatus(eqx.Enumeration):
 
     found = "the loads can jam in this periodic motion"
     absent = "this mode does not exist at this rotor speed"
-    not_converged = "no periodic motion was found: the torque balance could not be met"
+    not_converged = "no periodic motion was found: the torques cannot be balanced"
     under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
-    would_separate = "the loads would have to pull at each other to stay side by side: nothing holds this motion together"
+    would_separate = "the loads would separate: staying side by side needs tensile forces between them"
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
-    unresolved = "the motion was found, its stability was not: the carrier's fastest motion is too fast beside the loads'"
+    unresolved = (
+        "the motion was found, but not its stability: the fastest motion of the carrier is too fast "
+        "compared with that of the loads"
+    )
     refused = REFUSED
 
 
@@ -136,7 +139,7 @@ class Orbit(Result):
     def judgement(self) -> str:
         """Text "stable" or "unstable", or that the stability is not known."""
         if np.isnan(self.multiplier):
-            return "stability not known"
+            return "stability unknown"
         return "stable" if self.stable else "unstable"
 
     def force_peaks(self) -> Array:
@@ -184,7 +187,7 @@ class Orbit(Result):
         several = [f"load {k + 1}" for k in range(deviation.shape[1])]
         panels = [
             (f"displacement, {' or '.join(shown)}", 1e3 * motion, [f"coordinate {k + 1}" for k in range(motion.shape[1])]),
-            ("loads ahead of Ωt, degrees", deviation, several if len(several) > 1 else ["all loads"]),
+            ("load angle - Ωt, degrees", deviation, several if len(several) > 1 else ["all loads"]),
             ("foundation force, N", force, ["across", "up"][-force.shape[1] :]),
         ]
         return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)

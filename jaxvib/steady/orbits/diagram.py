@@ -147,7 +147,7 @@ def exact_branches(
     speed = float(scene.drive.speed)
     high = speed * 4.0 / 3.0 if most is None else float(number(most, "rad/s", "most", low=0.0, open_low=True))
     if not high > low:
-        raise InputError("most", f"is {high:.6g} rad/s; it must be above the least, {low:.6g} rad/s")
+        raise InputError("most", f"is {high:.6g} rad/s; it must be above the lowest, {low:.6g} rad/s")
     inside = np.concatenate([[low], inside[(inside > low) & (inside < high)], [high]])
     omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, inside.size), inside)
     solve = _Solver(scene, accuracy, low)

@@ -74,7 +74,7 @@ def plan_orbit(
     named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
     if len(named) != 1:
         given = " and ".join(named) if named else "none"
-        raise InputError("jam_orbit", f"was called with {given}; give one of mode=3, omega=95.0, near=95.0")
+        raise InputError("jam_orbit", f"was called with {given}; give exactly one of mode, omega and near, for example mode=3")
     scene = validate_scene(scene)
     all_known = is_known(scene, omega, near)
     # Starts have no derivatives. A known scene stays the same object, because it is validated already.

@@ -76,7 +76,9 @@ class Cost(Result):
 
     def summary(self) -> str:
         """Return the fastest method for each of the errors `WANTED`, and the tiers left out, as text."""
-        lines = [f"{self.quantity.replace('_', ' ')}: {len(self.rows)} ways, reference known to {self.reference_error:.1e}"]
+        lines = [
+            f"{self.quantity.replace('_', ' ')}: {len(self.rows)} methods, error of the reference {self.reference_error:.1e}"
+        ]
         for wanted in WANTED:
             row = self.cheapest(wanted)
             way = "none here" if row is None else f"{', '.join(x for x in row[:4] if x)}: {row.seconds:.3g} s"

@@ -40,7 +40,7 @@ def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
     **Raises** `InputError` for a drive whose speed is not constant, and if no mode is stable.
     """
     if not scene.drive.constant:
-        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; a jam is one at a constant speed: use ConstantSpeed")
+        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; a jam needs a constant speed: use ConstantSpeed")
     mode = usual_mode(scene) if mode is None else mode
     return ExactJam(mode, *(jam_orbit(scene, mode=mode, points=collocation_points(scene, points)) for points in (32, 24)))
 
@@ -53,7 +53,7 @@ def usual_mode(scene: Scene) -> int:
     modes = jam_modes(scene)
     rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
     if not rising:
-        raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
+        raise InputError("mode", "is missing, and no jam mode of this scene is stable by slope; give its number")
     return rising[-2] if len(rising) > 1 else rising[-1]  # the loads of the last one turn almost with the rotor
 
 
@@ -71,4 +71,4 @@ def slow_period(scene: Scene) -> float:
 def unstable(tiers: str, jam: ExactJam) -> str:
     """Return a sentence with the reason why time integration cannot compute an unstable jam."""
     largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
-    return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"
+    return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), and a run leaves it"

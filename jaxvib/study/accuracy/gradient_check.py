@@ -46,11 +46,12 @@ class GradientStatus(eqx.Enumeration):
     """Outcomes of a check. Each member is the sentence shown to the user."""
 
     agree = "every derivative agrees with finite differences"
-    differ = "derivatives differ from finite differences by more than the tolerance and the error of these"
+    differ = "derivatives differ from finite differences by more than the tolerance plus the error of the differences"
     noisy = "no derivative differs, but finite differences are too noisy for the requested tolerance"
-    not_finite = "a derivative, or the quantity beside the point, is not a finite number"
+    not_finite = "a derivative, or the quantity near the point, is not a finite number"
     chaotic = (
-        "the quantity changes as much for any small change of a number: nearby motions diverge, derivatives are meaningless"
+        "the quantity changes by the same amount for any small change of a number: nearby motions "
+        "diverge, and derivatives are meaningless"
     )
 
 
@@ -123,8 +124,8 @@ class GradientCheck(Result):
             worst = np.max(np.where(np.isfinite(self.error), self.error, np.inf), axis=0)
         lines = [f"{self.message} (relative tolerance {self.tolerance:.0e})"]
         for i in np.argsort(-worst):
-            found = ", ".join(f"{route} off by {self.error[k, i]:.1e}" for k, route in enumerate(self.routes))
-            floor = f"finite differences good to {self.noise[i] / scale[i]:.1e} at a step of {self.step[i]:.1e}"
+            found = ", ".join(f"{route} differs by {self.error[k, i]:.1e}" for k, route in enumerate(self.routes))
+            floor = f"finite differences accurate to {self.noise[i] / scale[i]:.1e} at a step of {self.step[i]:.1e}"
             lines.append(f"  {self.numbers[i]}: {self.difference[i]:.9g}; {found}; {floor}")
         if self.left_out:
             lines.append(f"  left out, at a bound: {', '.join(self.left_out)}")
@@ -274,7 +275,9 @@ def _movable(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber
             else:
                 left_out.append(each.name)
     if not found:
-        raise InputError("free", "names no number that can be moved both ways; name numbers that are not at their bounds")
+        raise InputError(
+            "free", "contains no number that can change in both directions; give numbers that are not at their bounds"
+        )
     return found, np.asarray(scales), tuple(left_out)
 
 

@@ -58,7 +58,7 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
     left_out: list[str] = []
     light = jam_modes(scene).select(mode, throw=False)
     if not bool(light.status == JamStatus.found):
-        left_out = [f"leading order, full, which starts from it: {light.message}"]
+        left_out = [f"leading order, and full, which starts from it: {light.message}"]
     else:
         ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
         if not bool(jam.fine.stable):

@@ -69,13 +69,13 @@ class Tier(NamedTuple):
 TIERS = (
     Tier(
         "leading order",
-        "every jam of light loads, folds; no harmonics, no way there",
+        "all jams of light loads, folds; no harmonics, no transients",
         jammed_loads,
         lambda scene, mode, until: jam_modes(scene).select(mode, throw=False),
     ),
     Tier(
         "exact orbit",
-        "the periodic motion of a jam, all harmonics, its stability; no way there",
+        "the periodic motion of a jam with all harmonics, its stability; no transients",
         require_coincident,
         lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False),
     ),
@@ -87,7 +87,7 @@ TIERS = (
     ),
     Tier(
         "full",
-        "every motion of every scene in time; no unstable jam",
+        "every motion in time of every scene; no unstable jams",
         lambda scene: None,
         lambda scene, mode, until: settle(scene, mode=mode, throw=False),
     ),

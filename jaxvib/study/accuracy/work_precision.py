@@ -166,7 +166,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
             rows.append(leading(_single(scene), "float32"))
     else:
         start = State(*jam.fine.at(jnp.zeros(())))
-        left_out.append(f"leading order: {light.message}; runs start on the exact motion in its place")
+        left_out.append(f"leading order: {light.message}; runs start on the exact motion in place of it")
     for few in _ORBIT_POINTS:
         points = collocation_points(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points)), scene)
@@ -277,7 +277,7 @@ def _final_state(ask: _Ask, end: float | None) -> Cost:
         return value if np.isfinite(value) else np.inf
 
     rows = _full(ask, initial_state(ask.scene), lambda tolerance: end, error)
-    reason = "leading order, exact orbit, envelope: they know no phase, which is a part of the final state"
+    reason = "leading order, exact orbit, envelope: these do not determine the phase, which is part of the final state"
     parts = jax.tree.leaves(jax.tree.map(lambda x, unit: np.ravel(x / unit), _last(best()), scale()))
     return Cost("final_state", np.concatenate(parts).tolist(), float(best().error), rows, (reason,))
 

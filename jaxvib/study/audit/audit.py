@@ -36,7 +36,7 @@ class AuditStatus(eqx.Enumeration):
 
     done = "the change by each effect was computed"
     unsettled = "the motion had not settled to the requested accuracy: smaller changes are not resolved; run longer"
-    failed = "the motion of the scene itself could not be computed; there is nothing to compare with"
+    failed = "the motion of the scene itself could not be computed; a comparison is not possible"
 
 
 class Audit(Result):
@@ -80,7 +80,7 @@ class Audit(Result):
         """Return the needed, negligible and missing effects of the scene as text."""
         lines = [f"{self.motion}: {self.kind}; {self.message}"]
         for row in self.effects:
-            change = "no change is known" if math.isnan(row.change) else f"changes up to {100.0 * row.change:.3g} %"
+            change = "change unknown" if math.isnan(row.change) else f"changes up to {100.0 * row.change:.3g} %"
             where = "" if row.present else ", not in the scene"
             lines.append(f"  {row.effect}{where}: {row.advice} ({change}, {row.operations:+d} operations)")
         for tier in self.tiers:

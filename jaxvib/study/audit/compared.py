@@ -65,7 +65,7 @@ class EffectRow(NamedTuple):
 
     @property
     def change(self) -> float:
-        """Largest relative change, without its sign; NaN if no change is known."""
+        """Largest relative change, without its sign; NaN if change unknown."""
         known = [abs(x) for x in (self.amplitude, self.foundation_force, self.omega, self.fold) if not math.isnan(x)]
         return max(known, default=math.nan)
 
@@ -181,7 +181,7 @@ def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, acc
         says=variant.says,
     )
     if isinstance(repeated.comparison, JamComparison) and tier == "full" and own.kind != "jammed":
-        lost = f"a run from the jam came to another motion ({own.kind})"
+        lost = f"a run from the jam reached another motion ({own.kind})"
         return row._replace(advice="cannot tell", says="; ".join(filter(None, [row.says, lost])))
     return row._replace(**_advice(row, new.kind, old.kind, accuracy))
 
@@ -196,12 +196,12 @@ def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, st
         advice = advice_if_needed
     elif math.isnan(row.change) or math.isnan(row.uncertainty):
         advice = "cannot tell"
-        sentences.append(f"no change is known: {new}")
+        sentences.append(f"change unknown: {new}")
     elif row.change - row.uncertainty > accuracy:
         advice = advice_if_needed
     elif row.change + row.uncertainty <= accuracy and new == old:
         advice = "negligible"
     else:
         advice = "cannot tell"
-        sentences.append(f"the motion repeats to {row.uncertainty:.1e} only")
+        sentences.append(f"the motion is periodic only to {row.uncertainty:.1e} only")
     return {"advice": advice, "says": "; ".join(filter(None, sentences))}

@@ -88,7 +88,7 @@ class JamComparison(NamedTuple):
         kind = f"jam mode {self.mode}, {orbit.judgement}" if there else f"no jam mode {self.mode}"
         # The motion of loads that would separate is a different one; other statuses concern the computation only.
         if there and bool(orbit.status == OrbitStatus.would_separate):
-            kind = f"{kind}, but the loads part"
+            kind = f"{kind}, but the loads separate"
         computed = not there or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)
         return MotionValues(
             kind,

@@ -90,7 +90,7 @@ def _gravity(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow |
     if total_gravity(scene.all_effects):
         return None
     share = gravity_share(_arm(scene), values.omega)
-    return _row("gravity: g/(R Omega^2)", share, accuracy, "its share in the force with which loads press on their track")
+    return _row("gravity: g/(R Omega^2)", share, accuracy, "share of gravity in the normal force of the loads on their track")
 
 
 def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
@@ -101,7 +101,7 @@ def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     half = math.asin(min(ratio, 1.0))
     filled = n * half / math.pi
     if filled >= 1.0:
-        says = f"{own[1]}they have no room on the track: give lighter loads, or more than one track"
+        says = f"{own[1]}they do not fit on the track: use lighter loads, or more than one track"
         return NumberRow("crowding: N arcsin(r/R)/pi", filled, 1.0, "perhaps needed", says)
     if not own[1]:
         return None
@@ -113,7 +113,7 @@ def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
 def _distance(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     if not np.isfinite(values.closest) or has_term(scene.all_effects, LoadInteraction):
         return None
-    says = "diameter over the least distance of two loads: above 1 they pass through each other, and load_contact is called for"
+    says = "diameter over the smallest distance of two loads: above 1 they pass through each other, and load_contact is needed"
     return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, says)
 
 
@@ -142,7 +142,10 @@ def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRo
     whole = float(1.0 / (port @ jnp.linalg.solve(model.mass, port.T))[0, 0])
     n = scene.loads.count
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.inertia_factor() * scene.loads.mass, (n,))))
-    says = "the machine does not tilt in this model: where it may, loads that turn couple its tilts (a rotor's own inertia too)"
+    says = (
+        "the machine does not tilt in this model: if it can, the rotating loads couple its tilts "
+        "(so does the inertia of a rotor)"
+    )
     return _row("gyroscopic: sum kappa m / M", loads / whole, accuracy, says)
 
 
@@ -152,7 +155,7 @@ def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | No
         return None
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
     weight = _G * (float(jnp.trace(machine.carrier().mass)) + loads)
-    says = "foundation force over weight: above 1 springs that the machine stands on would have to pull; stop, cubic_support"
+    says = "foundation force over weight: above 1, springs under the machine would have to pull; stop, cubic_support"
     return _row("lift: R / (M g)", values.foundation_force / weight, 1.0, says)
 
 

@@ -42,10 +42,10 @@ class TierRow(NamedTuple):
     def words(self) -> str:
         """Return the row as text."""
         if not self.answers:
-            return f"does not answer; {self.says}"
+            return f"not applicable; {self.says}"
         off = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))
         took = "" if math.isnan(self.seconds) else f", {self.seconds:.2g} s"
-        return f"off by {100.0 * off:.2g} %{took}; {self.says}"
+        return f"error {100.0 * off:.2g} %{took}; {self.says}"
 
 
 def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues, repeats: int) -> list[TierRow]:
@@ -68,7 +68,7 @@ def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, ow
     amplitude, size = np.abs(np.asarray(found.amplitude)), np.asarray(own.amplitude)
     if not np.all(np.isfinite(amplitude)):
         status = getattr(found, "status", None)
-        return TierRow(tier.name, False, *nothing, says="no such motion" if status is None else status_name(status))
+        return TierRow(tier.name, False, *nothing, says="this motion does not exist" if status is None else status_name(status))
     says = tier.answers
     if isinstance(comparison, JamComparison) and isinstance(found, MotionValues) and found.kind != "jammed":
         says = f"the run left the jam: {found.kind}"
@@ -92,13 +92,13 @@ def _call(
     timeless = tier.name in ("leading order", "exact orbit")
     if isinstance(comparison, JamComparison):
         if not timeless and "unstable" in own.kind:
-            return "the jam is unstable, a run leaves it"
+            return "the jam is unstable, and a run leaves it"
         until = 10.0 * SLOW_PERIODS * slow_period(scene)
         if tier.name == "full":
             return lambda: comparison.full(scene)
         return lambda: tier.jam(scene, comparison.mode, until)
     if timeless:
-        return "knows the jams of this scene, not which of them a run comes to"
+        return "computes the jams of this scene, not the one that a run reaches"
     if tier.name == "full":
         return lambda: comparison.full(scene)
     start = comparison.state(scene)

@@ -67,7 +67,9 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
         yield Variant("gyroscopic coupling", True, eqx.tree_at(lambda s: s.machine, scene, machine))
     if not scene.drive.ideal and until is not None:
         drive = SpinUp(scene.drive.speed, until / 2.0)
-        yield Variant("limited power", True, eqx.tree_at(lambda s: s.drive, scene, drive), "against a drive that nothing slows")
+        yield Variant(
+            "limited power", True, eqx.tree_at(lambda s: s.drive, scene, drive), "compared with a drive of unlimited power"
+        )
 
 
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
@@ -94,4 +96,4 @@ def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[
     if scene.drive.constant:
         slower = ConstantSpeed(scene.drive.speed * (1.0 - _DROOP))
         says = f"a motor that loses {100.0 * _DROOP:g} % of its speed: induction_motor, dc_motor"
-        yield Variant("drive that gives way", False, eqx.tree_at(lambda s: s.drive, scene, slower), says)
+        yield Variant("weak drive", False, eqx.tree_at(lambda s: s.drive, scene, slower), says)

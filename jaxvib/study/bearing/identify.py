@@ -46,10 +46,10 @@ class IdentifyStatus(eqx.Enumeration):
     """Outcomes of a fit. Each member is the sentence shown to the user."""
 
     found = "the fit explains the record up to noise"
-    patterned = "the residuals of the fit are no noise: the law of friction is incomplete, the intervals are wrong"
-    negative = "a coefficient of friction comes out below 0: the swing grows, or its decay is not that of this law"
-    contradicted = "the period contradicts the pendulum's length and inertia, and mu1 is in proportion to them"
-    undetermined = "the record does not determine the friction: too short, too noisy, or swings of one size only"
+    patterned = "the residuals of the fit are not noise: the friction law is incomplete and the intervals are wrong"
+    negative = "a coefficient of friction is below 0: the swing grows, or its decay does not follow this law"
+    contradicted = "the period contradicts the length and inertia of the pendulum, and mu1 is proportional to them"
+    undetermined = "the record does not determine the friction: it is too short, too noisy, or has swings of one amplitude only"
     not_converged = "no fit was found: the record does not resemble a swing of this pendulum"
 
 
@@ -269,28 +269,28 @@ def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
     """Yield the notes about a fit, a sentence each."""
     decrement, frequency, small = found.decrement, found.frequency.value, float(found.pendulum.frequency)
     if decrement is not None and found.dry is None and decrement.drift > 4.0:
-        yield "the swing decays faster the smaller it is, as by dry friction: identify mu2 as well"
+        yield "the swing decays faster at small amplitudes, as with dry friction: identify mu2 as well"
     elif decrement is not None and decrement.drift < -4.0:
-        yield "the swing decays slower the smaller it is, as by the drag of air: mu1 is too large"
+        yield "the swing decays more slowly at small amplitudes, as with air drag: mu1 is too large"
     if abs(frequency / small - 1.0) > 0.02:
         differs = f"the swing's frequency is {frequency:.4g} rad/s, the pendulum's length and inertia give {small:.4g}"
-        yield f"{differs}: mu1 is in proportion to the moment of inertia, check them"
+        yield f"{differs}: mu1 is proportional to the moment of inertia, check these values"
     for name, estimate in (("mu1", found.viscous), ("mu2", found.dry)):
         if estimate is not None and estimate.low <= 0.0:
             is_below = estimate.high < 0.0
             yield (
-                f"{name} is below 0, its whole interval too"
+                f"{name} and its whole interval are below 0"
                 if is_below
                 else f"{name} cannot be distinguished from 0 in this record"
             )
     if math.isfinite(found.stopped_at):
-        yield f"dry friction holds the pendulum from {found.stopped_at:.4g} s on"
+        yield f"dry friction stops the pendulum at {found.stopped_at:.4g} s on"
     if np.any(found.record.time > found.until):
         yield f"the record after {found.until:.4g} s is left out: the pendulum rests, or its swing is below the noise"
     if is_patterned:
-        yield "the residuals of the fit are no noise: the intervals consider noise only and are too narrow"
+        yield "the residuals of the fit are not noise: the intervals include noise only and are too narrow"
     if decrement is not None and decrement.is_drifting:
-        yield "the formula of ten periods is for viscous friction alone: its interval does not hold mu1 here"
+        yield "the formula of ten periods is for viscous friction only: its interval does not contain mu1 here"
 
 
 def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:

@@ -52,7 +52,7 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
     part = tables.get("record", {})
     for name in part:
         if name not in _FIELDS:
-            raise InputError(f"record.{name}", f"is no field here; {suggest_name(name, list(_FIELDS))}")
+            raise InputError(f"record.{name}", f"is not a field here; {suggest_name(name, list(_FIELDS))}")
     record = build_part(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
     return Measurement(pendulum, record, *options)
 

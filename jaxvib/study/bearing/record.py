@@ -72,7 +72,7 @@ class Record(eqx.Module):
         try:
             self.time, self.angle = (np.asarray(x, dtype=float) for x in (time, angle))
         except (TypeError, ValueError) as error:
-            raise InputError(name, "has entries that are no numbers; give the time in s and the angle in rad") from error
+            raise InputError(name, "has entries that are not numbers; give the time in s and the angle in rad") from error
         self.name = name
         if self.time.ndim != 1 or self.time.shape != self.angle.shape:
             shapes = f"time {self.time.shape}, angle {self.angle.shape}"
@@ -147,7 +147,7 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
             )
     rows = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
-        raise InputError(str(path), "holds no lines of numbers; it needs two columns, time and angle")
+        raise InputError(str(path), "contains no lines of numbers; it needs two columns, time and angle")
     mark = next((m for m in (";", "\t", ",") if m in rows[0][1]), None)
     cells = [(k, [cell.strip().strip('"') for cell in line.split(mark)]) for k, line in rows]
 
@@ -155,7 +155,7 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
     while cells and len(heads) < 2 and not any(_is_number(cell, mark) for cell in cells[0][1]):
         heads.append(cells.pop(0)[1])
     if not cells:
-        raise InputError(str(path), "holds no lines of numbers below its header")
+        raise InputError(str(path), "contains no lines of numbers below its header")
     places, factors = _columns(heads, len(cells[0][1]), columns, angle_unit, path)
 
     width = len(heads[0]) if heads else len(cells[0][1])
@@ -189,9 +189,7 @@ def _columns(
     given = None if angle_unit is None else _factor(angle_unit, "angle", f"{path}: unit of angle")
     if not heads:
         if requested is not None or width > 2:
-            raise InputError(
-                str(path), f"has {width} columns and no line of names; write one, for example time (s), angle (deg)"
-            )
+            raise InputError(str(path), f"has {width} columns but no line of names; add one, for example time (s), angle (deg)")
         return [0, 1], [1.0, 1.0 if given is None else given]
     if len(heads) == 2 and len(heads[1]) != len(heads[0]):
         raise InputError(str(path), f"has {len(heads[0])} names but {len(heads[1])} units below them")
@@ -220,7 +218,7 @@ def _columns(
         else:
             advice = f"write {what} ({'s' if what == 'time' else 'deg'})" + (" or give angle_unit" if what == "angle" else "")
             raise InputError(
-                str(path), f"has the column {quoted(heads[0][place])} for the {what}, whose unit is not known; {advice}"
+                str(path), f"has the column {quoted(heads[0][place])} for the {what}, whose unit is unknown; {advice}"
             )
     return places, factors
 
@@ -239,7 +237,7 @@ def _parted(head: str, what: str) -> tuple[str, str]:
 def _factor(unit: str, what: str, field: str) -> float:
     factor = _UNITS[what].get(unit.strip().lower())
     if factor is None:
-        raise InputError(field, f"is {quoted(unit)}, which is no unit of {what} here; write {_EXAMPLES[what]}")
+        raise InputError(field, f"is {quoted(unit)}, which is not a unit of {what} here; write {_EXAMPLES[what]}")
     return factor
 
 

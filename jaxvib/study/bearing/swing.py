@@ -95,9 +95,9 @@ class SwingStatus(eqx.Enumeration):
     """Outcomes of a swing. Each member is the sentence shown to the user."""
 
     swinging = "the pendulum still swings at the last time"
-    stopped = "dry friction brought the pendulum to a stop and holds it"
-    max_steps_reached = "the swing did not reach its last time in the steps it was allowed"
-    no_start = "the swing does not exist: a number of it is not finite, or the pendulum would not hang"
+    stopped = "dry friction stopped the pendulum"
+    max_steps_reached = "the swing needs more steps than max_steps to reach its last time"
+    no_start = "the swing does not exist: one of its numbers is not finite, or the pendulum would not hang"
 
 
 class Swing(Result):

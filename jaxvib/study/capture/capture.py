@@ -45,10 +45,10 @@ _SCAN = 32
 class CaptureStatus(eqx.Enumeration):
     """Outcomes of a search for a threshold. Each member is the sentence shown to the user."""
 
-    found = "from the threshold up every start was captured"
-    all_captured = "every start was captured: the threshold lies below the speeds that were tried"
-    none_captured = "not every start at the highest speed was captured: the threshold lies above the speeds that were tried"
-    not_converged = "the last doubling of the steps moved the threshold by more than the distance of the speeds tried there"
+    found = "every start above the threshold was captured"
+    all_captured = "every start was captured: the threshold is below the computed speeds"
+    none_captured = "not every start at the highest speed was captured: the threshold is above the computed speeds"
+    not_converged = "the last doubling of the steps changed the threshold by more than the spacing of the computed speeds"
 
 
 class Capture(Result):
@@ -105,16 +105,18 @@ class Capture(Result):
         """Return the threshold with its uncertainty, and the outcomes below it, as text."""
         n = self.captured.shape[1]
         head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
-        doubled = "" if np.isnan(self.moved) else f"; their last doubling moved the threshold by {float(self.moved):.1e}"
+        doubled = "" if np.isnan(self.moved) else f"; their last doubling changed the threshold by {float(self.moved):.1e}"
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
-            head += f"\n  detached: in {share:.3g} % of the runs a ball lost contact with its wall; the equations keep it there"
+            head += (
+                f"\n  detached: in {share:.3g} % of the runs a ball lost contact with its wall, on which the equations hold it"
+            )
         if np.isnan(self.threshold):
             return head
         below = self.fraction[self.speed < float(self.threshold)]
         where = f"threshold {float(self.threshold):.4f} +- {float(self.uncertainty):.1e} of the rotor's speed"
-        lone = f"; below it {100.0 * np.mean(below):.3g} % are captured, too" if np.any(below > 0.0) else ""
+        lone = f"; below it {100.0 * np.mean(below):.3g} % are also captured" if np.any(below > 0.0) else ""
         return f"{head}\n  {where}{lone}"
 
     @validated
@@ -209,7 +211,7 @@ def capture(
     scene = validate_scene(scene)
     in_torus(scene.loads, "capture")
     if not scene.drive.constant:
-        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a given speed, use ConstantSpeed")
+        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a prescribed speed, use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:
         raise InputError("resolution", f"is {quoted(resolution)}; it must be between 0 and 1, such as 1e-3")
     if turning not in get_args(Turning):
@@ -329,7 +331,7 @@ def capture_time(run: Run, within: float = 0.05) -> Array:
     True
     """
     if run.trajectory is None:
-        raise InputError("run", "kept its window only; run simulate with save='all'")
+        raise InputError("run", "saved its window only; run simulate with save='all'")
     times, speed = run.trajectory.time, run.trajectory.rotor_speed[:, None]
     excess = jnp.abs(run.trajectory.state.azimuth_rate - speed) - within * jnp.abs(speed)
 

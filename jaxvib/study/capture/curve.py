@@ -55,11 +55,14 @@ class ThresholdCurve(Result):
 
     def summary(self) -> str:
         """Return a line of text for each value."""
-        lines = [f"captured in {int(self.turns)} turns: from which initial speed on, and the least, in the rotor's speed"]
+        lines = [
+            f"captured in {int(self.turns)} turns: threshold of the initial speed, and the lowest captured "
+            "one, relative to the rotor speed"
+        ]
         for each in zip(self.value, self.threshold, self.uncertainty, self.least, strict=True):
             value, threshold, uncertainty, least = map(float, each)
             found = "not every start" if np.isnan(threshold) else f"{threshold:.4f} +- {uncertainty:.1e}"
-            lines.append(f"  {value:10.6g}  {found}" + ("" if np.isnan(least) else f"; the least {least:.4f}"))
+            lines.append(f"  {value:10.6g}  {found}" + ("" if np.isnan(least) else f"; lowest {least:.4f}"))
         return "\n".join(lines)
 
     @validated

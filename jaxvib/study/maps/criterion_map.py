@@ -52,7 +52,7 @@ class CriterionMap(Result):
 
     def summary(self) -> str:
         """Return a table in text: the share of speeds at which both agree, and the mean modulus of the boundaries' shift."""
-        lines = ["share of rotor speeds judged right (mean shift of the boundaries it has)"]
+        lines = ["share of rotor speeds with the right prediction (mean shift of the boundaries)"]
         lines.append("drag x \\ mass x " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
         for d, factor in enumerate(self.drag_factor):
             cells = []

@@ -160,20 +160,20 @@ def run_ups(
     if not scene.loads.circular:
         raise InputError(
             "loads.kind",
-            f"is {quoted(scene.loads.kind)}; run-ups vary the drag of loads on a circle; of balls in a torus ask capture",
+            f"is {quoted(scene.loads.kind)}; run_ups varies the drag of loads on a circle; for balls in a torus use capture",
         )
     loads = cast(CircularLoads, scene.loads)
     given = loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
     if drag is None and given.ndim:
-        raise InputError("loads.drag", "differs from load to load; name the values of `drag` to run up with")
+        raise InputError("loads.drag", "differs from load to load; give the values of `drag` for the run-ups")
     drags = jnp.atleast_1d(given)
     n = scene.loads.count
     if starts is not None and angles is not None:
-        raise InputError("starts", "was given with angles; give a number of random starts or the angles")
+        raise InputError("starts", "cannot be combined with angles; give a number of random starts or the angles")
     if separation is not None and not (starts is None and angles is None):
         raise InputError(
             "separation",
-            f"is {quoted(separation)}; it places the loads of a single start, leave out starts and angles",
+            f"is {quoted(separation)}; it is only for a single start, leave out starts and angles",
         )
     if angles is not None:
         sets = np.asarray(angles, dtype=float)

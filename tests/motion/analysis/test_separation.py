@@ -29,7 +29,7 @@ def test_three_balls_balance_a_rotor_unless_at_one_angle():
     separated, one_angle = (jv.simulate(s, 10.0, separation=a, save="window", estimate=False) for a in (None, 0.0))
     assert separated.regime.label == "balanced" and float(separated.foundation_force) < 1.0
     assert one_angle.status_name == "would_separate" and not bool(one_angle.settled) and bool(one_angle.finished)
-    assert one_angle.summary().startswith("not settled: all loads are at nearly one angle, but this motion is unstable")
+    assert one_angle.summary().startswith("not settled: all loads are at nearly one angle, and this motion is unstable")
     np.testing.assert_allclose(one_angle.foundation_force, 215.5, rtol=1e-3)
 
 

@@ -251,18 +251,21 @@ class Wind(jv.Effect):
         (dict(scene="a"), "scene is 'a'; it must be a Scene"),
         (dict(start="warm"), "start is 'warm'"),
         (dict(start="jam"), "mode is missing"),
-        (dict(mode=1), "for start='jam' only"),
-        (dict(spin_up=1.0), "is for start='spin_up' only"),
+        (dict(mode=1), "which is only for start='jam'"),
+        (dict(spin_up=1.0), "is only for start='spin_up'"),
         (dict(start="spin_up", spin_up=50.0), "longer than the run"),
         (dict(stepsize_controller=jv.Tolerance(0.0)), "tolerance is 0.0; in float64 it must be at least"),
         (dict(save="some"), "save is 'some'"),
         (dict(samples=1), "samples is 1"),
         (dict(max_steps=0), "max_steps is 0"),
-        (dict(scene=eqx.tree_at(lambda s: s.drive, small(), MOTOR)), "drive.kind is .* this holds at a given rotor speed"),
-        (dict(scene=small(effects=(Wind(),))), "effects.wind is not part of this theory"),
+        (
+            dict(scene=eqx.tree_at(lambda s: s.drive, small(), MOTOR)),
+            "drive.kind is .* this function needs a prescribed rotor speed",
+        ),
+        (dict(scene=small(effects=(Wind(),))), "effects.wind is not included in this function"),
         (
             dict(scene=small(effects=(jv.StaticImbalance(1e-3),))),
-            r"effects.static_imbalance is not part of this theory \(term RotorImbalance\)",
+            r"effects.static_imbalance is not included in this function \(term RotorImbalance\)",
         ),
     ],
 )
@@ -294,7 +297,7 @@ def test_what_is_measured_of_a_window():
 
 
 def test_a_run_that_does_not_finish_says_so():
-    with pytest.raises(jv.ComputationError, match=r"in the steps it was allowed \(5 steps\)") as error:
+    with pytest.raises(jv.ComputationError, match=r"needs more steps than max_steps to reach its end \(5 steps\)") as error:
         jv.envelope(small(), 60.0, max_steps=5)
     assert error.value.status == "max_steps_reached"
 

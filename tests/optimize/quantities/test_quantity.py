@@ -89,7 +89,7 @@ def test_units_and_words_of_expressions():
 
 @pytest.mark.parametrize("wrong", [True, float("inf"), None, [1.0]])
 def test_what_is_no_number_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"the value beside a is .*(write a number in|finite number|one number)"):
+    with pytest.raises(ValueError, match=r"the value combined with a is .*(write a number in|finite number|one number)"):
         A + wrong
     with pytest.raises(ValueError, match=r"is 3\.0; it must be a Quantity"):
         largest(A, 3.0)

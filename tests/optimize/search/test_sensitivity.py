@@ -110,4 +110,4 @@ def test_what_the_machine_does_not_have_is_not_met():
     found = ended([[0.5, 0.5]], [[np.nan, np.nan, np.nan]], [0.0], [0.0])
     held, first = limits_of(problem, [FIRST < 4.0], found, np.array([[np.nan, 4.0]]))
     assert held.broken == first.broken == np.inf
-    assert first.shortfall() == held.shortfall() == "the nearest machine found has no such value"
+    assert first.shortfall() == held.shortfall() == "the nearest machine does not have this quantity"

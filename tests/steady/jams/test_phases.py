@@ -170,7 +170,7 @@ def test_a_branch_over_the_drag_passes_its_folds():
     assert not np.any(branch.stable[int(np.argmax(branch.drag_factor)) :])
     last = np.max(np.asarray(branch.drag_factor)[np.asarray(branch.stable)])
     assert 9.2e-4 < 9.2e-4 * last < 9.6e-4
-    with pytest.raises(jv.InputError, match="omega must be a list of load speeds that ascend"):
+    with pytest.raises(jv.InputError, match="omega must be an ascending list of load speeds"):
         phase_branch(scene, jam, [100.0, 500.0])
 
 
@@ -283,7 +283,7 @@ def test_jams_by_slope_are_judged_for_loads_that_may_part():
     separation = [float(np.ptp(run.trajectory.state.angle[0][k])) for run in (coincident, separated) for k in (0, -1)]
     assert separation[0] == 0.0 and separation[1] < 1e-6 and abs(separation[2] - 0.02) < 1e-12 and separation[3] > 0.5
     assert bool(coincident.coincident) and not bool(separated.coincident)
-    assert coincident.summary().startswith("not settled: all loads are at nearly one angle, but this motion is unstable")
+    assert coincident.summary().startswith("not settled: all loads are at nearly one angle, and this motion is unstable")
     assert "unstable" not in separated.summary()
 
 

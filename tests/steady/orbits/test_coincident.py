@@ -189,7 +189,7 @@ def test_gyroscopic_modes_have_no_numbers():
 
 def test_a_rotor_out_of_balance_has_no_periodic_jam():
     s = scene("two_mass", effects=(jv.StaticImbalance(0.01),))
-    with pytest.raises(jv.InputError, match=r"effects\.static_imbalance shakes the machine at the rotor's own speed"):
+    with pytest.raises(jv.InputError, match=r"effects\.static_imbalance excites the machine at the rotor speed as well"):
         jv.jam_orbit(s, mode=1)
 
 

@@ -177,7 +177,7 @@ def test_modes_of_light_loads_with_dry_friction():
 def test_theories_without_dry_friction_refuse_it():
     scene = alike(dry())
     for ask in (criterion_functional, lambda s, w: jv.phase_jams(s)):
-        with pytest.raises(jv.InputError, match=r"effects\.dry_friction is not part of this theory"):
+        with pytest.raises(jv.InputError, match=r"effects\.dry_friction is not included in this function"):
             ask(scene, 20.0)
 
 

@@ -258,6 +258,6 @@ def test_stability_beside_a_far_faster_carrier_is_not_computed(question):
     machine = jv.one_mass(mass=50.0, stiffness=5e17, damping=100.0)
     scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(9.0))
     found = jv.jam_orbit(scene, **question)
-    assert found.status_name == "unresolved" and found.judgement == "stability not known"
+    assert found.status_name == "unresolved" and found.judgement == "stability unknown"
     assert np.isnan(found.multiplier) and not found.stable and np.all(np.isnan(found.multipliers))
     np.testing.assert_allclose([found.omega, found.rotor_speed], 9.0, rtol=1e-9)

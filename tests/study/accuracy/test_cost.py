@@ -82,9 +82,9 @@ def test_a_run_up_is_measured_at_its_end():
     run = jv.simulate(scene, 2.0, stepsize_controller=jv.Tolerance(1e-10), estimate=False)
     np.testing.assert_allclose(cost.reference, run.amplitude, rtol=1e-7)
     exact, averaged = cost.left_out
-    assert exact == "leading order, exact orbit: drive.kind is 'run_up'; a jam is one at a constant speed: use ConstantSpeed"
-    assert averaged.startswith("envelope: effects.static_imbalance is not part of this theory (term RotorImbalance)")
-    with pytest.raises(jv.InputError, match=r"drive\.kind is 'run_up'; a jam is one at a constant speed"):
+    assert exact == "leading order, exact orbit: drive.kind is 'run_up'; a jam needs a constant speed: use ConstantSpeed"
+    assert averaged.startswith("envelope: effects.static_imbalance is not included in this function (term RotorImbalance)")
+    with pytest.raises(jv.InputError, match=r"drive\.kind is 'run_up'; a jam needs a constant speed"):
         jv.work_precision(scene, mode=1)
 
 

@@ -58,5 +58,5 @@ def test_a_quantity_without_the_number_has_no_derivative():
 
 
 def test_a_choice_has_no_derivative():
-    with pytest.raises(jv.InputError, match=r"effects\.stop\[0\]\.platform is 2, which is no continuous number"):
+    with pytest.raises(jv.InputError, match=r"effects\.stop\[0\]\.platform is 2, which is not a continuous number"):
         jv.check_gradients(SCENES["stop"], lambda s: s.drive.speed, free=["effects.stop[0].platform"])

@@ -184,7 +184,7 @@ def test_gyroscopic_coupling_is_taken_out():
 
 def test_what_a_scene_could_have_is_put_in_with_usual_numbers():
     put_in = {variant.name: variant for variant in possible_variants(SCENE, (2e-3,), None)}
-    assert set(put_in) == {"static_imbalance", "cubic_support", "drive that gives way"}  # no bearing, no size, no tilt
+    assert set(put_in) == {"static_imbalance", "cubic_support", "weak drive"}  # no bearing, no size, no tilt
     (cubic,) = [effect for effect in put_in["cubic_support"].scene.all_effects if effect.kind == "cubic_support"]
     # Its force k3 a^3 cos^3 has the fundamental (3/4) k3 a^3: 1 % of k a.
     np.testing.assert_allclose(0.75 * cubic.stiffness * 2e-3**2, 0.01 * SCENE.machine.stiffness[0], rtol=1e-12)
@@ -340,7 +340,7 @@ def test_what_cannot_be_asked_is_refused(asked, says):
 def test_a_spin_that_the_scene_does_not_make_free_is_refused():
     state = jv.initial_state(SCENE)
     spin = jv.Spin(jnp.zeros(SCENE.loads.count), None)
-    with pytest.raises(jv.InputError, match=r"start\.spin is given, but no effect of the scene makes it free"):
+    with pytest.raises(jv.InputError, match=r"start\.spin is given, but no effect of the scene allows it"):
         jv.audit(SCENE, start=jv.State(state.displacement, state.velocity, state.angle, state.rate, spin=spin))
 
 
@@ -363,7 +363,7 @@ def test_every_variant_starts_from_a_state_that_it_takes(kind):
     [
         ("found", "jam mode 1, stable", "jam mode 1, stable"),
         ("under_resolved", "jam mode 1, stable", "jam mode 1, stable (under_resolved)"),
-        ("would_separate", "jam mode 1, stable, but the loads part", "jam mode 1, stable, but the loads part"),
+        ("would_separate", "jam mode 1, stable, but the loads separate", "jam mode 1, stable, but the loads separate"),
     ],
 )
 def test_a_status_of_the_computation_is_no_kind_of_motion(status, kind, words, monkeypatch):

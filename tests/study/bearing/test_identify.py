@@ -46,7 +46,7 @@ def test_what_comes_before_the_release_is_left_out():
 @pytest.mark.parametrize(
     ("law", "degrees", "note"),
     [
-        (dict(air=2e-3), 10.0, "as by the drag of air"),
+        (dict(air=2e-3), 10.0, "as with air drag"),
         (dict(dry=0.02), 10.0, "identify mu2"),
         (dict(torque=0.1), 40.0, ""),
     ],
@@ -132,7 +132,7 @@ def test_a_whole_swing_down_to_rest_gives_both_frictions():
     assert found.viscous.low < 8e-4 < found.viscous.high and found.viscous.error < 1e-5
     assert found.dry.low < 0.09 < found.dry.high and found.dry.error < 3e-4
     assert -1.0 < found.correlation < -0.5
-    assert any("holds the pendulum from" in note for note in found.notes)
+    assert any("stops the pendulum at" in note for note in found.notes)
 
 
 def test_what_is_wrong_with_a_fit_is_said():

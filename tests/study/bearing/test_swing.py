@@ -59,7 +59,7 @@ def test_dry_friction_converges_to_the_sharp_law():
         assert float(swing.rate[-1]) == 0.0 and float(swing.angle[-1]) == float(swing.angle[-40])
     assert errors[1] < 0.2 * errors[0] and errors[2] < 0.2 * errors[1] and errors[2] < 5e-6
     swing = jv.swing(ROD, t, angle=0.17, viscous=2e-4, dry=0.02)
-    assert jv.SwingStatus[swing.status].startswith("dry friction brought") and abs(float(swing.stopped_at) - stop) < 0.3
+    assert jv.SwingStatus[swing.status].startswith("dry friction stopped") and abs(float(swing.stopped_at) - stop) < 0.3
     np.testing.assert_allclose(swing.angle, expected, atol=1e-4)
 
 

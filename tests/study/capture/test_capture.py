@@ -112,7 +112,7 @@ def test_capture_doubles_steps_until_its_threshold_stays(monkeypatch):
     chosen = jv.capture(scene, speeds, turns=150)
     assert int(chosen.steps) == 2 * int(np.ceil(150.0 * 2.0 * np.pi / 140.0 * needed))
     assert chosen.status_name == "found" and float(chosen.moved) == 0.0
-    assert "moved the threshold by 0.0e+00" in chosen.summary()
+    assert "changed the threshold by 0.0e+00" in chosen.summary()
     monkeypatch.setattr("jaxvib.study.capture.capture.steps_per_second", lambda scene, equations: 0.2 * needed)
     first, early, late = (jv.capture(scene, speeds, turns=150, doublings=n) for n in (0, 1, 3))
     assert first.status_name == "none_captured" and np.isnan(first.moved)
@@ -188,7 +188,7 @@ def test_reverse_derivatives_are_the_forward_ones():
         ),
         (
             lambda s: jv.capture(jv.Scene(s.machine, s.loads, jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1))),
-            "drive.kind is 'dc_motor'; capture needs a given speed",
+            "drive.kind is 'dc_motor'; capture needs a prescribed speed",
         ),
         (
             lambda s: capture_time(jv.simulate(s, 0.1, start=thrown_state(s, -0.1), save="window", estimate=False)),

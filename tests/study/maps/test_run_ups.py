@@ -34,7 +34,7 @@ def test_run_ups_name_each_lane():
     for more, says in ((dict(drag=np.zeros(0)), "drag is an empty array"), (dict(starts=2, seed=-1), "seed is -1")):
         with pytest.raises(jv.InputError, match=says):
             jv.run_ups(s, 5.0, **more)
-    with pytest.raises(jv.InputError, match="was given with angles"):
+    with pytest.raises(jv.InputError, match="cannot be combined with angles"):
         jv.run_ups(s, 5.0, starts=3, angles=[[0.0, 0.1]])
 
 
@@ -65,5 +65,5 @@ def test_run_ups_start_as_far_apart_as_asked():
         found = jv.run_ups(s, 0.1, separation=separation, stepsize_controller=jv.Tolerance(1e-5))
         np.testing.assert_allclose(np.degrees(np.ptp(found.angle)), 10.0 if separation else 0.0, atol=1e-12)
     for others in ({"starts": 3}, {"angles": [[0.0, 0.1]]}):
-        with pytest.raises(jv.InputError, match=r"separation is '10 deg'; it places the loads of a single start"):
+        with pytest.raises(jv.InputError, match=r"separation is '10 deg'; it is only for a single start"):
             jv.run_ups(s, 0.1, separation="10 deg", **others)

@@ -168,7 +168,7 @@ CASES = (
         "drag 0, exact jam",
         hard="no jam exists: loads that nothing drives do not turn",
         quantity="load speed of the exact jam 3",
-        against="no such motion",
+        against="this motion does not exist",
         scene=_undragged,
         answer=_no_drag,
         reference=lambda scene: Reference([0.0], scale=1.0),
