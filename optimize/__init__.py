@@ -1,4 +1,4 @@
-"""Design of machines: free numbers of a scene, quantities and demands, and the search for the best machine."""
+"""Design of machines: free parameters of a scene, quantities and demands, and the search for the best machine."""
 # ruff: noqa: E402
 
 import sys

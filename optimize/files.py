@@ -1,4 +1,4 @@
-"""Design files in TOML: free numbers, held quantities, demands and the objective."""
+"""Design files in TOML: free parameters, held quantities, demands and the objective."""
 
 from __future__ import annotations
 
@@ -153,49 +153,49 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     return quantity, {k: table[k] for k in more if k in table}
 
 
-TEMPLATE = """# A design: which numbers of the scene may change, what keeps its value, what is wanted.
-scene = "machine.toml"            # path of the scene file, from here
+TEMPLATE = """# A design: free parameters of the scene, held quantities, demands and the objective.
+scene = "machine.toml"            # path of the scene file, relative to this file
 
-[free]                            # bounds, SI or with units; of every support that is there: 0 stays 0;
-                                  # machine.stiffness[0] frees one entry, also of a support that is not there yet
+[free]                            # bounds, SI or with units, for every support of the scene; entries of 0 stay 0;
+                                  # machine.stiffness[0] frees one entry, also that of a new support
 "machine.stiffness" = ["10 N/mm", "200 N/mm"]
-"machine.link_stiffness" = ["50 N/mm", "500 N/mm"]    # of a single platform leave this line out
+"machine.link_stiffness" = ["50 N/mm", "500 N/mm"]    # remove this line for a single platform
 
-[[hold]]                          # keeps its value during the search
+[[hold]]                          # a quantity with a fixed value during the search
 quantity = "jam_frequency"        # or amplitude, foundation_force, support_frequency_squared, total
-mode = 3                          # jam modes go by resonance: 2 r - 1 is the jam just below resonance r (1 of one platform)
-value = "570 rpm"                 # left out: what it is in the scene
+mode = 3                          # number of the jam mode: 2 r - 1 is the jam just below resonance r (1 for one platform)
+value = "570 rpm"                 # default: the value in the scene
 
 [[hold]]
-quantity = "support_frequency_squared"   # the sum of k/M over the supports: how soft the machine may stand
+quantity = "support_frequency_squared"   # sum of k/M over the supports: total stiffness of the suspension
 
 # [[demand]]                      # at_most, at_least or both
 # quantity = "amplitude"
 # mode = 3
 # of = [1, 2]
 # at_least = "2 mm"
-# tier = "exact"                  # of the exact motion (default); "leading": of light loads
+# tier = "exact"                  # "exact": exact motion (default); "leading": light loads
 
-# [ties]                          # what follows what: equal, or [name, factor], or [name, "keep"] for the present ratio
+# [ties]                          # number = source, [source, factor], or [source, "keep"] for the present ratio
 # "machine.stiffness[1]" = "machine.stiffness[0]"
 
-# [choices]                       # values that can be had, such as springs of a catalogue; numbers of loads
+# [choices]                       # allowed values, such as springs of a catalogue, or numbers of loads
 # "machine.stiffness[0]" = ["20 N/mm", "25 N/mm", "32 N/mm"]
 # "loads.count" = [2, 3, 4]
 
 [objective]
-# tolerances = { "machine.stiffness" = 0.05, "machine.damping" = 0.3 }    # over machines that are off by so much:
-# statistic = "worst"             # the worst of them; "expected": the mean
+# tolerances = { "machine.stiffness" = 0.05, "machine.damping" = 0.3 }    # relative tolerances of manufacture
+# statistic = "worst"             # the worst machine within the tolerances; "expected": the mean
 quantity = "force_per_amplitude"  # or amplitude, foundation_force, jam_frequency
 mode = 3
-of = [1, 2]                       # amplitude of platform 1 (y1) relative to platform 2 (y2); 1 alone: that platform's own
+of = [1, 2]                       # amplitude of platform 1 (y1) relative to platform 2 (y2); of = 1: amplitude of platform 1
 # maximize = true
 
 [search]
 starts = 256
 seed = 0
-# iterations = 100                # of the descent
-# rate = 0.05                     # its first step, in parts of a free number's range
+# iterations = 100                # iterations of the descent
+# rate = 0.05                     # first step of the descent, relative to the range of a free parameter
 # polishing = 12                  # steps of Newton's method at the end
 """
 """Commented example of a design file."""

@@ -37,7 +37,7 @@ _LEAST_MOVE = 1e-6
 class SynthesisStatus(eqx.Enumeration):
     """Outcomes of a search; the members are the sentences a user reads."""
 
-    done = "the search converged: no change of a free number improves the objective"
+    done = "the search converged: no change of a free parameter improves the objective"
     not_converged = "the search has not converged: allow more polishing or more iterations"
     contradictory = "no design in the bounds meets all demands"
     interrupted = "the search was interrupted: this is its best design"
@@ -51,7 +51,7 @@ class Outcome:
 
     **Attributes**
 
-    - `parameters`: the free numbers by name, SI
+    - `parameters`: the free parameters by name, SI
     - `exists`: True if the mode exists
     - `omega`, rad/s
     - `amplitude`, m, of platform 1 (y1) first, and `foundation_force`, N, zero to peak
@@ -66,7 +66,7 @@ class Outcome:
     force_per_amplitude: float
 
     def as_dict(self) -> dict[str, Plain]:
-        """Return the same for JSON: free numbers beside the quantities, None instead of NaN."""
+        """Return the same for JSON: free parameters beside the quantities, None instead of NaN."""
         shown = ("omega", "amplitude", "foundation_force", "force_per_amplitude")
         return {name: plain(value) for name, value in {**self.parameters, **{k: getattr(self, k) for k in shown}}.items()}
 
@@ -115,8 +115,8 @@ class Limit(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """Influence of a free number: `what`: its name; the change of the objective in per cent if only this number is 1 % smaller
-    (`less`) and 1 % larger (`more`)."""
+    """Influence of a free parameter: `what`: its name; the change of the objective in per cent if only this number is 1 %
+    smaller (`less`) and 1 % larger (`more`)."""
 
     what: str
     less: float
@@ -142,7 +142,7 @@ class Synthesis(Result):
     - `status`: a `SynthesisStatus`; `scene`: the best design
     - `before` and `after`: its `Outcome` by the jam's equations, `verified` by time integration of the full equations from
       `run` (both None if that was not done or failed: `unverified` states the reason)
-    - `table` of `Row`: every free number and quantity before and after, of the exact motion and in time
+    - `table` of `Row`: every free parameter and quantity before and after, of the exact motion and in time
     - `limits` of `Limit`: demands, held quantities, and active bounds, with the gain from moving each
     - `influences` of `Influence`: the influence of each number
     - `machines` of `Machine`: the different ones that were found, and how often

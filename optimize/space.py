@@ -1,4 +1,4 @@
-"""Design space: free numbers of a scene, their bounds and ties, catalogues, and held quantities."""
+"""Design space: free parameters of a scene, their bounds and ties, catalogues, and held quantities."""
 
 from __future__ import annotations
 
@@ -84,13 +84,13 @@ class Choice(NamedTuple):
 
 
 class DesignSpace(eqx.Module):
-    """Numbers of a scene that may change, between bounds, and quantities that must keep their value.
+    """Parameters of a scene that may change, between bounds, and quantities that must keep their value.
 
     **Arguments**
 
     - `scene`: the design from which the search begins
     - `free`: a mapping from names to (low, high), SI or text with units; typical: 2 to 20 numbers, from a half or a tenth to 2
-      or 10 times their values. More free numbers need more starts
+      or 10 times their values. More free parameters need more starts
     - `hold`: quantities that keep their value, made by `optimize.hold`; sums and products too (`total`, `product`)
     - `ties`: a mapping from a name to the number that it follows: another number's name (equal), (name, factor), or (name,
       "keep") for the ratio that both have in the scene; zeros of an array stay, as in `free`
@@ -107,15 +107,15 @@ class DesignSpace(eqx.Module):
 
     Inside, a design is a vector z in [0, 1]^d.
 
-    **Attributes**, of the d free numbers: bounds `low` and `high` (d,), SI; `logs`: True for a range that is divided by ratio;
-    `held`: the held quantities; `counts`: the allowed numbers of loads.
+    **Attributes**, of the d free parameters: bounds `low` and `high` (d,), SI; `logs`: True for a range that is divided by
+    ratio; `held`: the held quantities; `counts`: the allowed numbers of loads.
 
     **Raises** `InputError` for
 
     - a name that the scene does not have, and bounds the wrong way round
     - a number that is free twice, or free and tied
     - values of a catalogue that no scene can have
-    - more held quantities than free numbers
+    - more held quantities than free parameters
 
     >>> import jaxvib as jv
     >>> from optimize import DesignSpace
@@ -181,13 +181,13 @@ class DesignSpace(eqx.Module):
         if len(self.held) >= self.size:
             raise InputError(
                 "hold",
-                f"holds {len(self.held)} quantities with {self.size} free numbers; there must be more "
-                "free numbers than held quantities",
+                f"holds {len(self.held)} quantities with {self.size} free parameters; there must be more "
+                "free parameters than held quantities",
             )
 
     @property
     def size(self) -> int:
-        """Number d of free numbers."""
+        """Number d of free parameters."""
         return sum(each.size for each in self.free)
 
     def _bounds(self, like: np.ndarray | Array) -> tuple[ModuleType, np.ndarray | Array, np.ndarray | Array]:
@@ -196,14 +196,14 @@ class DesignSpace(eqx.Module):
         return xp, xp.asarray(self.low), xp.asarray(self.high)
 
     def _require_size(self, values: Any, name: str, *, single: bool = False) -> None:
-        """**Raises** `InputError` unless the values are an array with an entry for each free number."""
+        """**Raises** `InputError` unless the values are an array with an entry for each free parameter."""
         is_array = isinstance(values, (np.ndarray, Array)) and is_real(values) and not np.ma.is_masked(values)
         if not is_array or (values.shape if single else values.shape[-1:]) != (self.size,):
             axis = "" if single else " along its last axis"
             raise InputError(name, f"is {quoted(values)}; it must be an array with {self.size} numbers{axis}")
 
     def numbers(self, z: Numbers) -> Numbers:
-        """Return the free numbers (..., d), SI, of designs `z` (..., d) in [0, 1]; NumPy arrays if z is one."""
+        """Return the free parameters (..., d), SI, of designs `z` (..., d) in [0, 1]; NumPy arrays if z is one."""
         self._require_size(z, "z")
         xp, low, high = self._bounds(z)
         log = np.asarray(self.logs)
@@ -216,7 +216,7 @@ class DesignSpace(eqx.Module):
         return self.scene_of(self.numbers(z))
 
     def scene_of(self, values: Array) -> Scene:
-        """Return the scene with the free numbers `values` (d,), SI."""
+        """Return the scene with the free parameters `values` (d,), SI."""
         self._require_size(values, "values", single=True)
         scene = put_numbers(self.scene, self.free, jnp.asarray(values))
         for tie in self.ties:
@@ -240,11 +240,11 @@ class DesignSpace(eqx.Module):
 
     @validated
     def parameters(self, scene: Scene) -> dict[str, float | list[float]]:
-        """Return the free numbers of a `scene` by name, in SI."""
+        """Return the free parameters of a `scene` by name, in SI."""
         return {n.name: (n.leaf(scene) if n.entry is None else n.leaf(scene)[n.entry]).tolist() for n in self.free}
 
     def words(self) -> list[tuple[str, str]]:
-        """Return the name for tables and the unit of each free number."""
+        """Return the name for tables and the unit of each free parameter."""
         return [(word, each.unit) for each in self.free for word in each.words(self.scene)]
 
     @validated

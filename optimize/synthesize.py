@@ -40,7 +40,7 @@ _CONVERGED = 1e-6
 """Largest decrease of the objective, relative to its value, that a converged design may still allow nearby."""
 
 _SAME_DESIGN_DISTANCE = 1e-3
-"""Largest distance of two designs that count as the same machine, relative to the ranges of the free numbers."""
+"""Largest distance of two designs that count as the same machine, relative to the ranges of the free parameters."""
 
 _SPREAD = 1e-3
 """Largest initial angle of the loads from the exact motion, rad."""
@@ -83,7 +83,7 @@ def synthesize(
       of the lowest valley
     - `seed` of these starts
     - `iterations` of the descent; typical: 50 to 200 (default 100)
-    - `rate`: first step of the descent, in parts of a free number's range; typical: 0.01 to 0.1 (default 0.05)
+    - `rate`: first step of the descent, in parts of a free parameter's range; typical: 0.01 to 0.1 (default 0.05)
     - `polishing`: steps of sequential quadratic programming; typical: 12 (the default)
     - `searcher`: the method before the polishing, "gradients" (Adam from the starts), or "cma": CMA-ES, which computes values
       alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `cma`); its few best designs are
@@ -213,7 +213,7 @@ def _begun(space: DesignSpace, begin: Synthesis) -> np.ndarray:
     if not isinstance(begin, Synthesis):
         raise InputError("begin", f"is {quoted(begin)}; it must be the Synthesis of an earlier search of this space")
     if begin.designs.shape[1] != space.size:
-        raise InputError("begin", f"has {begin.designs.shape[1]} free numbers; this space has {space.size}")
+        raise InputError("begin", f"has {begin.designs.shape[1]} free parameters; this space has {space.size}")
     return np.asarray(begin.designs)
 
 
@@ -340,7 +340,7 @@ def _table(
     values: np.ndarray,
     other: tuple[list[float], list[float]],
 ) -> tuple[Row, ...]:
-    """Return the rows of free numbers and quantities before and after the search."""
+    """Return the rows of free parameters and quantities before and after the search."""
     start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.free]) for s in (space.scene, scene))
     absent = [each.spec.zero_is_absent for each in space.free for _ in range(each.size)]
     numbers = zip(space.words(), absent & (start == 0.0) & (end != 0.0), start, end, strict=True)

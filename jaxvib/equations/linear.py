@@ -194,7 +194,7 @@ class JammedModel(LinearModel):
     def forward_acceleration(self, omega: Array) -> Array:
         """Return w^2 e^H B Y (scalar, m/s^2) at the load speed `omega`: minus the forward circular acceleration of the mount.
 
-        If the model has a modal form, the cost is O(nd), and derivatives with respect to numbers of the scene are missing.
+        If the model has a modal form, the cost is O(nd), and derivatives with respect to parameters of the scene are missing.
         """
         if self.modal is None:
             return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))

@@ -17,7 +17,7 @@ class ModalResponse(eqx.Module):
         D(w)^-1 = Z diag(1 / (i w - s)) W,      e^H B D(w)^-1 B^T e = sum_k r_k / (i w - s_k)
 
     For each frequency, a vector costs two products with matrices, and the receptance of the mount costs O(nd). There are no
-    derivatives with respect to numbers of the scene, because eigenvectors of equal frequencies have none.
+    derivatives with respect to parameters of the scene, because eigenvectors of equal frequencies have none.
 
     **Attributes**
 

@@ -84,9 +84,9 @@ def export_fmu(
     The file contains the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary for this
     platform. It needs neither Python nor jaxvib. The same scene gives the same bytes.
 
-    - Parameters are all numbers of the scene under their names (`machine.stiffness[0]`), with units and bounds; they may change
-      during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the classical Runge-Kutta
-      method of order 4
+    - Parameters of the FMU are all parameters of the scene under their names (`machine.stiffness[0]`), with units and bounds;
+      they may change during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the
+      classical Runge-Kutta method of order 4
     - Outputs are the states (`displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`), `acceleration.y1`,
       `foundation_force.up`, `rotor.angle` and `rotor.speed`
     - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m), which is added to
@@ -189,7 +189,7 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
     try:
         programs = scalar_program(equations.rates, *given), scalar_program(tangent, *given, *given[2:])
     except NotScalarizable as error:
-        problem = f"needs the operation {str(error)!r} of JAX, which is not available for single numbers"
+        problem = f"needs the operation {str(error)!r} of JAX, which is not available for scalars"
         raise InputError("scene", f"{problem}; remove the part that needs it") from error
     numbers = [f"p[{k}]" for k in range(parameters)]
     count = {"x": len(equations.state_signals), "u": len(equations.input_signals), "y": len(equations.output_signals)}

@@ -206,7 +206,7 @@ def has_events(scene: Scene) -> bool:
 
 
 def named_entries(scene: Scene) -> list[NamedNumber]:
-    """Return the name of each number of a scene, in the order of its leaves.
+    """Return the name of each parameter of a scene, in the order of its leaves.
 
     **Raises** `InputError` for a scene with a number that has no name.
     """

@@ -1,4 +1,4 @@
-"""Numbers of a scene that sliders change, their ranges, and the scene at their values."""
+"""Parameters of a scene that sliders change, their ranges, and the scene at their values."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _MACHINE_NUMBERS = ("machine.stiffness", "machine.link_stiffness", "machine.damp
 """Numbers of a machine that have sliders."""
 
 _MAX_SINGLE_SLIDERS = 12
-"""Maximum number of sliders for single numbers of a machine; in a larger machine, one slider changes all of a kind."""
+"""Maximum number of sliders for scalars of a machine; in a larger machine, one slider changes all of a kind."""
 
 _DECADES = tuple(np.geomspace(0.1, 10.0, 81).tolist())
 _SHARES = tuple((np.arange(1, 301) / 100.0).tolist())
 
 
 class Slider(NamedTuple):
-    """Slider for a number of a scene.
+    """Slider for a parameter of a scene.
 
-    The number of the scene is multiplied by value / `start`; at `start` it therefore keeps its value bit for bit.
+    The parameter of the scene is multiplied by value / `start`; at `start` it therefore keeps its value bit for bit.
 
     **Attributes**: `name` in the scene; `label`, the designer's name; `unit` on the slider; `steps`, the ascending values of
     the slider; `start`, the scene's value, which is one of them; `number` of the scene, None for the number of loads.
@@ -56,7 +56,7 @@ def sliders_of(scene: Scene) -> list[Slider]:
 
     - springs and dampers, masses and drags of the loads: a tenth to ten times the scene's values
     - rotor speed: up to three times the scene's value
-    - number of loads, if all loads have equal numbers
+    - number of loads, if all loads have equal parameters
 
     A number that is 0 has no slider, because no factor changes it.
 
@@ -119,7 +119,7 @@ def _has(scene: Scene, name: str) -> bool:
 
 
 def _shared(scene: Scene) -> bool:
-    """True if all loads have equal numbers and no load has its own station; an additional load is then like the others."""
+    """True if all loads have equal parameters and no load has its own station; an additional load is then like the others."""
     return scene.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 

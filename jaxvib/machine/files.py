@@ -396,16 +396,16 @@ _REST = """
 kind = "ball"               # ball, roller, pendulum
 count = 3
 mass = "800 g"              # of one load
-radius = "120 mm"           # of the circle of the loads' centres
-drag = "1.5 N s/m"          # viscous resistance of one load against the rotor, at that radius
-# ball_radius = "20 mm"     # of a ball or roller: gathered loads lie side by side, otherwise at one point
+radius = "120 mm"           # radius of the circle on which the centres of the loads run
+drag = "1.5 N s/m"          # viscous resistance of one load to motion relative to the rotor
+# ball_radius = "20 mm"     # of a ball or roller: gathered loads touch; without it they can be at one point
 # inertia = 0.0             # kg m^2 about the mass centre, pendulums only
 
 [drive]
 kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
 speed = "{speed}"
 
-[effects]                   # only those of the scene; an empty table is the usual case
+[effects]                   # effects of the scene; none by default
 # gravity = true            # gravity on the loads
 # static_imbalance = {{ moment = "5 g m" }}
 # cubic_support = [{{ stiffness = 1e9, platform = 1 }}]
@@ -430,7 +430,7 @@ stiffness = [5.0e4, 5.0e4]  # N/m, of the supports to the foundation
 damping = [40.0, 40.0]      # N s/m
 link_stiffness = 2.0e5      # N/m, between the platforms
 link_damping = 60.0         # N s/m
-# exciter = 2               # the platform with the auto-balancer
+# exciter = 2               # number of the platform with the exciter
 """
     + _REST.format(speed="1500 rpm"),
     "three_mass": """# Three platforms; the links are those between 1-2, 1-3 and 2-3 (0: no link).
@@ -442,7 +442,7 @@ stiffness = [0.0, 5.0e4, 0.0]
 damping = [0.0, 40.0, 0.0]
 link_stiffness = [1.0e5, 0.0, 1.0e5]
 link_damping = [20.0, 0.0, 20.0]
-exciter = 3                 # the platform with the auto-balancer
+exciter = 3                 # number of the platform with the exciter
 """
     + _REST.format(speed="1500 rpm"),
     "network": """# Any number of platforms, supports and links.
@@ -450,12 +450,12 @@ exciter = 3                 # the platform with the auto-balancer
 [machine]
 kind = "network"
 mass = [40.0, 40.0, 40.0, 37.6]       # kg; the exciter's platform includes the body of the exciter, without the loads
-stiffness = [2.0e4, 0.0, 0.0, 2.0e4]  # N/m, 0 where a platform has no support
+stiffness = [2.0e4, 0.0, 0.0, 2.0e4]  # N/m, 0 for a platform without a support
 damping = [20.0, 0.0, 0.0, 20.0]      # N s/m
 links = [[1, 2], [2, 3], [3, 4]]      # pairs of platforms
 link_stiffness = [1.0e5, 1.0e5, 1.0e5]
 link_damping = [20.0, 20.0, 20.0]
-exciter = 4                           # the platform with the auto-balancer
+exciter = 4                           # number of the platform with the exciter
 """
     + _REST.format(speed="1500 rpm"),
     **ROTORS,

@@ -223,7 +223,7 @@ class CircularLoads(Loads):
 
     @property
     def alike(self) -> bool:
-        """True if all loads share every number."""
+        """True if all loads have equal parameters."""
         return all(x is None or x.ndim == 0 for x in (self.mass, self.radius, self.drag, self.inertia))
 
     def position(self, *u: Array) -> tuple[Array, Array]:

@@ -197,18 +197,18 @@ TEMPLATE = """# A vertical rotor on one support, with balls in a torus as automa
 # Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "planar_rotor"
-mass = 6.87                 # kg, the torus included, balls not counted
-stiffness = "1372 N/m"      # of the support, alike in both directions
+mass = 6.87                 # kg, with the torus, without the balls
+stiffness = "1372 N/m"      # of the support, equal in both directions
 damping = 98.0              # N s/m
 
 [loads]
 kind = "torus_ball"         # ball, roller, pendulum, torus_ball
 count = 2
 mass = "64 g"               # of one ball
-radius = "200 mm"           # of the tube's middle line
+radius = "200 mm"           # of the centre line of the tube
 tube = "15 mm"              # radius of the tube's cross-section
-ball_radius = "12.5 mm"     # of a ball; what is left of the tube is the gap in which it rolls up and down
-# drag = 0.0                # N s/m, viscous resistance against the wall
+ball_radius = "12.5 mm"     # of a ball; the rest of the tube is the gap in which it moves up and down
+# drag = 0.0                # N s/m, viscous resistance at the wall
 
 [drive]
 kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
@@ -216,7 +216,7 @@ speed = "140 rad/s"
 
 [effects]                   # only those of the scene
 gravity = { along = "axis" }                   # the axis is vertical
-static_imbalance = { moment = "6.87 g m" }     # of the rotor: its mass times its eccentricity
+static_imbalance = { moment = "6.87 g m" }     # of the rotor: mass times eccentricity
 rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths the change of sign
 """
 """Scene file with comments."""

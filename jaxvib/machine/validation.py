@@ -1,4 +1,4 @@
-"""Validation of scenes. Public functions call it because `equinox.tree_at` replaces numbers of a scene without a check."""
+"""Validation of scenes. Public functions call it because `equinox.tree_at` replaces parameters of a scene without a check."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def validate_scene(scene: Scene) -> Scene:
 
 
 def allowed_unknowns(scene: Scene) -> Array | None:
-    """Return a traced Boolean, True if the constructors allow the traced numbers of a scene.
+    """Return a traced Boolean, True if the constructors allow the traced parameters of a scene.
 
     None if all numbers have values; they are then already validated.
 
@@ -82,7 +82,7 @@ def allowed_unknowns(scene: Scene) -> Array | None:
 
 
 def _allowed_value(scene: Scene) -> Array | None:
-    """Return None if the constructors allow the numbers of a scene, otherwise False.
+    """Return None if the constructors allow the parameters of a scene, otherwise False.
 
     All numbers have values here, as under `grad` without `jit`.
     """

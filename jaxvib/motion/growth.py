@@ -71,8 +71,8 @@ class Growth(Result):
     - `status`: a `GrowthStatus`
     - `exponent`: the largest Lyapunov exponent, 1/s, and its standard error `uncertainty`, over the later half of the stretches
     - `horizon`, s: time after which rounding is as large as the motion itself, ln(1/eps)/exponent. A derivative with respect to
-      a number of the scene has grown by 1/eps then, and says nothing about a change that is larger than rounding. Infinite for
-      a regular motion; for an undecided one the shortest that the rates allow, ln(1/eps)/(exponent + 3 uncertainty)
+      a parameter of the scene has grown by 1/eps then, and says nothing about a change that is larger than rounding. Infinite
+      for a regular motion; for an undecided one the shortest that the rates allow, ln(1/eps)/(exponent + 3 uncertainty)
     - `rates` (stretches,), 1/s: of each stretch; the stretches end at `time`, s
     """
 

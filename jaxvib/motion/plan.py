@@ -1,4 +1,4 @@
-"""Plans of runs: choices that depend on numbers of a scene, made on the host before a program is traced.
+"""Plans of runs: choices that depend on parameters of a scene, made on the host before a program is traced.
 
 Only this module tests which numbers are known. The method and static sizes (samples, steps, stretches) follow from known
 numbers; under a JAX transformation sizes have fixed values.

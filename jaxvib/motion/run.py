@@ -95,7 +95,7 @@ class Run(AbstractMeasured, PointAnswers, Result):
     - `coincident`: True if several loads started at one angle and stayed at one angle, as loads with the same numbers do even
       if that is unstable. If such a motion repeats itself, the linearized equations show whether loads a little apart leave it;
       its status is then `would_separate`, and it is not `settled`
-    - `engine` of the integration: "scalar" if the equations ran on single numbers, which takes 2.5 to 50 times less time, or
+    - `engine` of the integration: "scalar" if the equations ran on scalars, which takes 2.5 to 50 times less time, or
       "array", for states of more than 32 numbers and for 4 loads and more
     - `evaluations` of the vector field (0 if the method does not count them) and `seconds`: the cost, including the runs with
       larger steps for the error, and compilation if the program was new; `seconds` is NaN under a JAX transformation

@@ -1,4 +1,4 @@
-"""Vector field and state in the form for the fastest integration: equations on single numbers if the state is small."""
+"""Vector field and state in the form for the fastest integration: equations on scalars if the state is small."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Held: TypeAlias = PyTree[Array]
 _TURN = 2.0 * math.pi
 
 _LONG_ARRAY = 4
-"""Smallest number of entries in an array of the state for which arrays are used instead of single numbers. With arrays
+"""Smallest number of entries in an array of the state for which arrays are used instead of scalars. With arrays
 derivatives take less time and programs compile sooner; runs take the same time, and two thirds of it from 8 entries on."""
 
 _MOST_WRITTEN = 8
@@ -48,7 +48,7 @@ class PackedSystem(eqx.Module):
     all loads are wrapped by the same turns, which keeps their differences; `batch`: true if many runs advance together; the
     `solver`, if it is not `method`.
 
-    **Attributes**: `program`: the equations, on single numbers if `is_scalarized`, otherwise on arrays; None if JAX does not
+    **Attributes**: `program`: the equations, on scalars if `is_scalarized`, otherwise on arrays; None if JAX does not
     give access to programs; `size`: the number of numbers in the state; `is_on_scalars`: True if they are separate scalars;
     `args`: the arguments of `term`.
     """

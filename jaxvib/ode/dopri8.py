@@ -159,7 +159,7 @@ class UnrolledDopri8(AbstractDopri8):
     Compiling takes longer than for `LoopDopri8`, several times as long with derivatives.
 
     **Arguments**: `batch`: true if many runs advance together, each number of the state an array over them: fences are then
-    those for arrays, otherwise those for single numbers; `wrap` what is done to the state after each step, such as taking whole
+    those for arrays, otherwise those for scalars; `wrap` what is done to the state after each step, such as taking whole
     turns out of its angles.
 
     >>> import diffrax, jax, jax.numpy as jnp

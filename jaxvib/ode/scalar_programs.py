@@ -1,4 +1,4 @@
-"""Equivalent but faster forms of programs on single numbers, see `jaxvib.ode.scalarize`."""
+"""Equivalent but faster forms of programs on scalars, see `jaxvib.ode.scalarize`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small programs on arrays, rewritten as programs on single numbers.
+"""Small programs on arrays, rewritten as programs on scalars.
 
 XLA runs a program on arrays of two or three entries as a chain of small loops, and under `vmap` their entries lie interleaved
 in memory. The same program on numbers is one straight piece of code, and under `vmap` every number becomes a contiguous array
@@ -72,7 +72,7 @@ memory."""
 
 
 def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> Callable[..., PyTree[Scalars]]:
-    """`function`, traced for arguments of these shapes, on single numbers.
+    """`function`, traced for arguments of these shapes, on scalars.
 
     **Returns** a function of the same arguments in which every array is an object array of scalars, as are its results.
     Sines and cosines are those of `jaxvib.numerics.sincos`. Products with zeros that are constants of the program are omitted.
@@ -172,7 +172,7 @@ def scalars_of(tree: PyTree[Array]) -> list[Array]:
 
 
 def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared], Out]:
-    """`jax.vmap(function, in_axes=(0, None))`, on single numbers if `function` is small enough; for values only.
+    """`jax.vmap(function, in_axes=(0, None))`, on scalars if `function` is small enough; for values only.
 
     The program on scalars is fenced, therefore its time is proportional to the number of operations. It processes a large batch
     in blocks, therefore its memory does not grow with the batch. Its derivatives are right but may be slow.

@@ -63,7 +63,7 @@ def results(document: Mapping[str, Plain], units: Units, inner: bool = False) ->
 
 
 def parameters(scene: Scene) -> str:
-    """Return the numbers of a scene with their units, in a table for each of its parts."""
+    """Return the parameters of a scene with their units, in a table for each of its parts."""
     tables = tomllib.loads(scene_to_toml(scene))
     parts = []
     owners = [("", tables, scene.exciters[0])]

@@ -1,7 +1,7 @@
 """Outcome of a computation: its result, the error of its status, or the status `refused`.
 
-Numbers of a scene may have no value until a compiled program runs. Their validation is skipped when the scene is built; if one
-of them is not allowed, the result has the status `refused` and no numbers.
+Parameters of a scene may have no value until a compiled program runs. Their validation is skipped when the scene is built; if
+one of them is not allowed, the result has the status `refused` and no numbers.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def outcome(
     **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: text after the sentence of the
     status with that name.
 
-    **Returns** the result; under a JAX transformation with the status `refused` and NaN for numbers if a number of the scene is
-    one that its constructor would not take, such as a negative stiffness, or if `end` is not positive.
+    **Returns** the result; under a JAX transformation with the status `refused` and NaN for numbers if a parameter of the
+    scene is one that its constructor would not take, such as a negative stiffness, or if `end` is not positive.
 
     **Raises** `ComputationError`.
     """

@@ -1,4 +1,4 @@
-"""Axes of a study: numbers of the scene and of the start, over lists, ranges and samples."""
+"""Axes of a study: parameters of the scene and of the start, over lists, ranges and samples."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
         if np.unique(values).size < values.size:
             raise InputError(f"axes.{name}", "has a value twice; give each value once")
         axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, spot)
-    for end in (axis.low, axis.high):  # the constructors of the scene's parts check the ranges of single numbers
+    for end in (axis.low, axis.high):  # the constructors of the scene's parts check the range of each number
         validate_scene(put(scene, (spot,), jnp.asarray([end])))
     return axis
 

@@ -315,7 +315,7 @@ def _theory(
     """Return the lines in the plane on which exact jams of the stored scene fold or lose their stability, by kind.
 
     Lines exist only if one axis is the rotor speed. If the other axis is a number of the start, which has no influence on
-    steady motions, the lines are straight. If it is a number of the scene, they connect the points at `_ROWS` of its values.
+    steady motions, the lines are straight. If it is a parameter of the scene, they connect the points at `_ROWS` of its values.
     """
     if _SPEED not in (across, up):
         return {}

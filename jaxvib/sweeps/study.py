@@ -235,42 +235,42 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     return Quantity(name or function, str(table.get("unit", "")), found)
 
 
-TEMPLATE = """# A study: which numbers change from case to case, and what is measured in each. Run it: jaxvib sweep study.toml
-scene = "machine.toml"            # path of the scene file, from here
-# tier = "exact"                  # of quantities of a jam: leading (of light loads), exact, time [leading]
-# chunk = 1024                    # cases that are computed, and written, together
+TEMPLATE = """# A study: the numbers that vary from case to case, and the quantities measured in each case. Run: jaxvib sweep
+study.toml scene = "machine.toml"            # path of the scene file, relative to this file
+# tier = "exact"                  # method for quantities of a jam: leading (light loads), exact, time [leading]
+# chunk = 1024                    # number of cases computed and written together
 
 [axes]                            # every combination of these; SI or with units; names as in a design file
 "drive.speed" = { from = "600 rpm", to = "1800 rpm", count = 40 }
-"start.rate" = { from = "0 rpm", to = "1800 rpm", count = 40 }    # speed that the loads start with; start.angle, start.velocity
+"start.rate" = { from = "0 rpm", to = "1800 rpm", count = 40 }    # initial speed of the loads; also start.angle, start.velocity
 # "loads.drag" = { from = 0.5, to = 5.0, count = 10, scale = "log" }
 # "machine.stiffness[0]" = ["40 N/mm", "50 N/mm", "60 N/mm"]
 
-# Numbers with a range and no count are sampled together, for each combination of the others:
-# samples = 256                   # (these three stand above [axes])
+# Numbers with a range but no count are sampled together, for each combination of the others:
+# samples = 256                   # (write these three lines above [axes])
 # sampling = "low_discrepancy"    # or "random"
 # seed = 0
 # "machine.damping" = { from = 30.0, to = 50.0 }
 
-[run]                             # the full equations, from the start above; only for quantities that begin with run.
+[run]                             # time integration of the full equations; only for quantities that begin with run.
 until = "10 s"
-# start = "jam"                   # what axes leave open: rest, or near a jam mode [rest]
+# start = "jam"                   # initial state if no axis sets it: rest or jam [rest]
 # mode = 3
-# steps = 20000                   # equal ones, the same in all cases [one for each radian of what moves fastest]
+# steps = 20000                   # number of equal steps in all cases [one for each radian of the fastest motion]
 
 [[measure]]
 quantity = "run.regime"           # jammed, unbalanced (turning with the rotor), balanced, parted, swinging, unsettled
 [[measure]]
-quantity = "run.mode"             # the jam mode, 0 where the loads are not jammed
+quantity = "run.mode"             # number of the jam mode, 0 if the loads are not jammed
 [[measure]]
 quantity = "run.load_speed"       # and run.amplitude, run.foundation_force, run.settling_time, run.ripple, run.drift
 
 # [[measure]]                     # any quantity of a design file
 # quantity = "foundation_force"
 # mode = 3
-# name = "force"                  # what it is called in the store
+# name = "force"                  # its name in the store
 
-# [[measure]]                     # a function of a scene of your own, in a module that Python finds
+# [[measure]]                     # your own function of a scene, in a module that Python can import
 # function = "mine:stiffness_ratio"
 # unit = ""
 """

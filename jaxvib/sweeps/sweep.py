@@ -158,7 +158,7 @@ def sweep(
 
     Names of `axes`:
 
-    - a number of the scene by its name in a design ("machine.stiffness[0]", "loads.drag", "drive.speed")
+    - a parameter of the scene by its name in a design ("machine.stiffness[0]", "loads.drag", "drive.speed")
     - a number of the start ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]" m/s; without
       an index, all entries change together)
 

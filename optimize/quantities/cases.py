@@ -26,7 +26,7 @@ __all__ = ["expected", "quantile", "under", "worst"]
 
 @dataclass(frozen=True)
 class Changed:
-    """Case in which some numbers of the scene have other values."""
+    """Case in which some parameters of the scene have other values."""
 
     name: str
     values: tuple[tuple[str, float], ...]
@@ -158,7 +158,7 @@ class Robust(_OfPart):
 
 @validated
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
-    """Return a quantity at another operating point or under another load: some numbers of the scene have other values.
+    """Return a quantity at another operating point or under another load: some parameters of the scene have other values.
 
     **Arguments**
 

@@ -66,7 +66,7 @@ def _entries(field: str) -> tuple[str, str, str, str]:
     part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
     spec = spec_of(field) if part in ("machine", "loads") and "[" not in name else None
     if spec is None or len(spec.units) > 1:
-        raise InputError("field", f"is {quoted(field)}; it must name numbers of a scene, for example 'machine.stiffness'")
+        raise InputError("field", f"is {quoted(field)}; it must name parameters of a scene, for example 'machine.stiffness'")
     return part, name, spec.unit, spec.words.format(load="load") + (f" of all {spec.each}s" if spec.each else "")
 
 

@@ -64,7 +64,7 @@ def _least(rows: Array, right: Array) -> Array:
 
 
 def _along(vector: Array, held: Array, free: Array) -> Array:
-    """Project `vector` (d,) onto changes of free numbers that keep the held quantities."""
+    """Project `vector` (d,) onto changes of free parameters that keep the held quantities."""
     vector = vector * free
     if held.shape[0] == 0:
         return vector

@@ -29,7 +29,7 @@ _KEPT = 8
 """Number of designs that are polished."""
 
 _APART = 1e-2
-"""Smallest distance between polished designs in one free number, relative to its range."""
+"""Smallest distance between polished designs in one free parameter, relative to its range."""
 
 _NOWHERE = 1e12
 """Merit of a design without the objective."""

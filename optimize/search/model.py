@@ -10,7 +10,7 @@ from optimize.search.problem import Point, Problem, evaluate
 from optimize.search.quadratic import Solved, elastic
 
 _DIFFERENCE_STEP = 1e-5
-"""Step of central differences, as a fraction of the range of a free number."""
+"""Step of central differences, as a fraction of the range of a free parameter."""
 
 _MIN_SHARE_AT_KINK = 1e-4
 """Smallest share of a piece of the objective that belongs to a kink."""

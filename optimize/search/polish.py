@@ -35,7 +35,7 @@ _KINK_STEPS = 4
 """Number of first-order steps back onto a kink."""
 
 _ACTIVE_DISTANCE = 1e-6
-"""Largest distance of a demand or a free number from its limit, relative to the limit, at which it counts as active."""
+"""Largest distance of a demand or a free parameter from its limit, relative to the limit, at which it counts as active."""
 
 _MAX_PENALTY = 1e9
 """Largest penalty of a violated constraint, in units of the objective. A constraint that is still violated at this penalty

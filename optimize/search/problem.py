@@ -255,7 +255,7 @@ def looked_up(problem: Problem, z: np.ndarray) -> Known:
 
 
 def made(problem: Problem, numbers: np.ndarray) -> Scene:
-    """Return the scenes with these free numbers (s, d), SI, as NumPy arrays with a leading axis."""
+    """Return the scenes with these free parameters (s, d), SI, as NumPy arrays with a leading axis."""
     return in_chunks(problem.lanes, lambda x: _made(problem.space, x), numbers)
 
 

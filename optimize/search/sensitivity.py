@@ -14,7 +14,7 @@ from optimize.search.polish import FEASIBLE
 from optimize.search.problem import Problem
 
 _STEP = 0.01
-"""Relative change of a free number for its influence."""
+"""Relative change of a free parameter for its influence."""
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
@@ -63,7 +63,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
 
 
 def neighbours(problem: Problem, found: Found) -> np.ndarray:
-    """Return the free numbers (1 + 2 d, d), SI, of the best design and of its neighbours.
+    """Return the free parameters (1 + 2 d, d), SI, of the best design and of its neighbours.
 
     A neighbour has one number that is 1 % smaller or larger.
     """
@@ -73,7 +73,7 @@ def neighbours(problem: Problem, found: Found) -> np.ndarray:
 
 
 def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]:
-    """Return the influence of each free number, from the objective (1 + 2 d,) of the `neighbours`."""
+    """Return the influence of each free parameter, from the objective (1 + 2 d,) of the `neighbours`."""
     d = problem.space.size
     if not values[0]:
         return ()

@@ -180,7 +180,7 @@ def space_of(free, held=()):
         (lambda: space_of({"machine.stiffness": ("1 kg", "2 kg")}), "is not in N/m"),
         (lambda: space_of({"machine.stiffness": 3.0}), "give the bounds as (low, high)"),
         (lambda: space_of({"machine.stiffness": (1, 2), "machine.stiffness[0]": (1, 2)}), "is free already"),
-        (lambda: space_of({"loads.drag": (1, 2)}, [hold(total("machine.stiffness"))]), "more free numbers than held"),
+        (lambda: space_of({"loads.drag": (1, 2)}, [hold(total("machine.stiffness"))]), "more free parameters than held"),
         (lambda: space_of({"machine.stiffness": (1, 2)}, [jam_frequency(mode=3)]), "wrap quantities in optimize.hold"),
         (lambda: hold(jam_frequency(mode=3), 0.0), "other than 0"),
         (lambda: hold(3.0), "must be a Quantity"),

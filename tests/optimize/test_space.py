@@ -95,7 +95,7 @@ FREE = {"machine.stiffness": (1e4, 9e4)}
         (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", 0.0)}), "give a number greater than 0"),
         (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", True)}), "give a number greater than 0"),
         (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", "half")}), "give a number greater than 0"),
-        (lambda: DesignSpace(SCENE, FREE, [hold(total("machine.stiffness"), 8e4)] * 2), "more free numbers than held"),
+        (lambda: DesignSpace(SCENE, FREE, [hold(total("machine.stiffness"), 8e4)] * 2), "more free parameters than held"),
         (lambda: DesignSpace(scene(speed=1e-3), FREE, [hold(jam_frequency(mode=5))]), "give the value at which it is held"),
     ],
 )

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
 
 _VARY = click.option(
-    "--vary", required=True, metavar="NAME", help="Name of a number of the scene, such as loads.mass or machine.stiffness[0]."
+    "--vary",
+    required=True,
+    metavar="NAME",
+    help="Name of a parameter of the scene, such as loads.mass or machine.stiffness[0].",
 )
 _OMEGA = click.option(
     "--omega", nargs=2, required=True, metavar="FROM TO", help="Range of load speeds, such as '20 rad/s' '60 rad/s'."

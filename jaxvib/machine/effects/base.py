@@ -29,7 +29,7 @@ _AXES = {"up": 1, "axis": 2}
 
 
 class Typical(NamedTuple):
-    """Effect with usual numbers, for a scene that does not have it; `says` describes these numbers."""
+    """Effect with typical values, for a scene that does not have it; `says` describes these numbers."""
 
     effect: Effect
     says: str
@@ -106,13 +106,13 @@ class Effect(Part):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return the effect with usual numbers, which audits add; None for an effect without such numbers.
+        """Return the effect with typical values, which audits add; None for an effect without such numbers.
 
         **Arguments**
 
         - `machine` and `loads` of the scene
         - `speed` of the rotor, rad/s
-        - `amplitude` (nd,) of the motion, m, of tilts rad
+        - `amplitude` (nd,) of the motion, m (rad for tilts)
         """
         return None
 

@@ -1,4 +1,4 @@
-"""Units, bounds and words of the numbers of a scene, as metadata of the fields.
+"""Units, bounds and words of the parameters of a scene, as metadata of the fields.
 
 Constructors use this metadata to read their arguments. The module `named` uses it to name the numbers of a whole scene.
 """

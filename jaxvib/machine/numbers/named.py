@@ -1,4 +1,4 @@
-"""Numbers of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
+"""Parameters of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
 
 Every floating-point number of a machine, a load, a drive or an effect has a name. Its unit, bounds and words are in `numbers`.
 """
@@ -123,7 +123,7 @@ class NamedNumber(NamedTuple):
 
 
 def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
-    """Return all continuous numbers of a scene by name.
+    """Return all continuous parameters of a scene by name.
 
     An array of one unit has one name. In an array of several units each entry has its own name.
 
@@ -258,7 +258,9 @@ def read_value(name: str, value: Number) -> float:
     spec, index = spec_of(name), re.search(r"\[(\d+)\]$", str(name))
     entry = int(index[1]) if index else None
     if spec is None or (len(spec.units) > 1 and (entry or 0) >= len(spec.units)):
-        raise InputError(str(name), "is not a number of a scene; give a name such as 'machine.stiffness[0]' or 'drive.speed'")
+        raise InputError(
+            str(name), "is not a parameter of a scene; give a name such as 'machine.stiffness[0]' or 'drive.speed'"
+        )
     return NamedNumber(name, (), entry, 1, spec).value(value, name)
 
 

@@ -284,8 +284,8 @@ _ROTOR = """
 kind = "pendulum"           # ball, roller, pendulum
 count = 4
 mass = "50 g"               # of one load
-radius = "80 mm"            # of the mass centre from the axis
-drag = 0.14                 # N s/m at that radius; a bearing's viscous friction mu (N m s) is drag = mu / radius^2
+radius = "80 mm"            # distance of the mass centre from the axis
+drag = 0.14                 # N s/m at that radius; viscous bearing friction mu (N m s) gives drag = mu / radius^2
 # inertia = 0.0             # kg m^2 about the mass centre, pendulums only
 
 [drive]
@@ -293,7 +293,7 @@ kind = "run_up"             # constant_speed, spin_up, run_up, dc_motor, inducti
 speed = "460 rad/s"
 acceleration = 230.0        # rad/s^2
 
-[effects]                   # only those of the scene; an empty table is the usual case
+[effects]                   # effects of the scene; none by default
 gravity = true              # gravity on the loads
 static_imbalance = { moment = "8 g m" }
 # moment_imbalance = { moment = 1e-4 }    # kg m^2
@@ -310,7 +310,7 @@ TEMPLATES = {
 [machine]
 kind = "planar_rotor"
 mass = 37.0                 # kg, with the body of the exciter, without the loads
-stiffness = "1160 N/mm"     # of the support, across and up
+stiffness = "1160 N/mm"     # of the support, horizontal and vertical
 damping = 840.0             # N s/m
 """
     + _ROTOR,
@@ -325,8 +325,8 @@ polar_inertia = 0.093                     # kg m^2, about the axis of rotation
 stiffness = ["604 N/mm", "555 N/mm"]      # of the two supports
 damping = [439.0, 404.0]                  # N s/m
 position = [0.165, -0.155]                # m, of the supports
-stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number if all run in one plane
-# stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m instead of those of the supports
+stations = [0.28, 0.25, -0.25, -0.28]     # m, positions of the loads; one number if all run in one plane
+# stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of stiffness and position of the supports
 """
     + _ROTOR,
 }

@@ -68,7 +68,7 @@ class AbstractMeasured(eqx.Module):
     **Attributes**
 
     - `omega`, rad/s: mean speed of the loads over whole turns, and `load_speed` (count,), rad/s: the same for each load
-    - `amplitude` (nd,), m, of tilts rad, and `foundation_force`, N: zero to peak, that is half of peak to peak; for a force
+    - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, that is half of peak to peak; for a force
       with two directions the root of the sum of both squares; typical: 0.5 to 10 mm, 10 N to 10 kN
     - `drift`: the largest of three relative changes from the first to the second half of those turns
     - `settled`: True if the drift is below 1e-3

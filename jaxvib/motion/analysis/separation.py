@@ -1,11 +1,11 @@
 """Stability of a motion with all loads at nearly one angle against their separation.
 
-Loads that share every number and start at one angle stay at one angle in exact arithmetic, whether or not the motion is stable.
-A run alone therefore does not show that they would separate. The linearized equations along the run do:
+Loads that have equal parameters and start at one angle stay at one angle in exact arithmetic, whether or not the motion is
+stable. A run alone therefore does not show that they would separate. The linearized equations along the run do:
 
     x' = A(t) x,    growth = ln(spectral radius of the transition matrix over whole turns of the loads) / duration
 
-For loads that share every number on one track, x is the difference of two loads: it does not move the carrier, and all such
+For loads that have equal parameters on one track, x is the difference of two loads: it does not move the carrier, and all such
 differences obey the same equations. Otherwise x is the whole state. The transition matrix is a product of exponentials (a
 Magnus method of order 4 on the samples of the run): strong drag needs no smaller steps.
 """

@@ -40,7 +40,7 @@ class Spectrum(Result):
 
     - `time` (P,), s: the middles of the pieces
     - `frequency` (nf,), rad/s; its resolution is about 2 pi over the length of a piece
-    - `amplitude` (P, nf, nd), m, of tilts rad
+    - `amplitude` (P, nf, nd), m (rad for tilts)
     - `force` (P, nf, nb), N, on the foundation
     - `rotor_speed` and `load_speed` (P,), rad/s: means of the pieces
     - `resonances` (nd,), rad/s

@@ -325,7 +325,7 @@ def _at_rest(scene: Scene) -> Amplitudes:
 
 
 def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[..., Array], Args]:
-    """Return the averaged equations on the integrator's vector, and their arguments; on single numbers if there are few."""
+    """Return the averaged equations on the integrator's vector, and their arguments; on scalars if there are few."""
 
     def on_arrays(t: Array, y: Array, args: tuple[Averaged, _Units]) -> Array:
         field, units = args

@@ -36,7 +36,7 @@ class CriterionStatus(eqx.Enumeration):
 
     judged = "stability was decided at every rotor speed"
     free = "no support resists one of the motions of the machine: its lowest resonance is 0, and it can drift"
-    not_finite = "the speeds could not be computed: a number of the scene is not allowed or exceeds the precision"
+    not_finite = "the speeds could not be computed: a parameter of the scene is not allowed or exceeds the precision"
 
 
 class CharacteristicSpeeds(Result):
@@ -145,7 +145,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     range damping cannot change the sign, since Re(b^H D^-1 b) = y^H (K - w^2 M_S) y with y = D^-1 b. A damper between
     the exciter's platform and the foundation moves no speed at all: it adds to the imaginary part of 1/A alone.
 
-    **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every number of the scene,
+    **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every parameter of the scene,
     forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).
     Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes judges
     many machines.

@@ -111,7 +111,7 @@ def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
 
 
 def scanned_speed(model: JammedModel, omega: Array) -> Array:
-    """Return `rotor_speed_at` in modal form, for a search: O(nd), without derivatives by numbers of the scene."""
+    """Return `rotor_speed_at` in modal form, for a search: O(nd), without derivatives by parameters of the scene."""
     return _speed_for(model, omega, model.forward_acceleration(omega))
 
 

@@ -66,8 +66,8 @@ class AbstractJam(Result):
     - `omega`: speed of the loads, rad/s; `rotor_speed`, rad/s
     - `stable`: True if the slope dn/dOmega > 0, for light loads that stay together (`phase_jams` shows if they do)
     - `slope`: dn/dOmega
-    - `displacement` (nd,): complex amplitudes at load angle Omega t, m, of tilts rad
-    - `amplitude` (nd,), m, of tilts rad, zero to peak; typical: 0.5 to 10 mm
+    - `displacement` (nd,): complex amplitudes at load angle Omega t, m (rad for tilts)
+    - `amplitude` (nd,), m (rad for tilts), zero to peak; typical: 0.5 to 10 mm
     - `foundation_force`, N, zero to peak; for two directions of the force it is the root of the summed squares of their peaks
       (sqrt 2 times the force of a circular whirl)
     - `coordinates` (nd,): their names
@@ -228,8 +228,8 @@ def jam_modes(scene: Scene) -> JamModes:
     Resonances closer to each other than their damping share one peak of the branch: their modes are one pair, with the
     number of the resonance nearest to the peak, and the status of the others is `absent`.
 
-    **Returns** `JamModes`; derivatives of every number with respect to every number of the scene are exact (implicit function
-    theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
+    **Returns** `JamModes`; derivatives of every number with respect to every parameter of the scene are exact (implicit
+    function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
 
     **Raises** `InputError` for
 

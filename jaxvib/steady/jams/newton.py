@@ -37,7 +37,7 @@ def damped_newton(
 
     - `balance(x, given)`: returns the residuals, of size 1 or less far from a root, and auxiliary values
     - `iterations`: maximum number of steps; the iteration ends earlier if only rounding errors are left
-    - `on_numbers`: evaluate on single numbers, see `scalarize`, which takes a third of the time for many starts
+    - `on_numbers`: evaluate on scalars, see `scalarize`, which takes a third of the time for many starts
 
     **Returns** the root and the auxiliary values there.
 
@@ -81,7 +81,7 @@ def damped_newton(
 
 
 def _on_arrays(step: Callable[[_State, Given], _State], begin: _State, given: Given) -> Callable[..., Sequence[Array]]:
-    """Return the step on the arrays of a state, with the sine and cosine of programs on single numbers if JAX allows."""
+    """Return the step on the arrays of a state, with the sine and cosine of programs on scalars if JAX allows."""
     program, structure, known = arrays_program(step, begin, given), jax.tree.structure(begin), jax.tree.leaves(given)
     if program is None:
         return lambda *now: jax.tree.leaves(step(jax.tree.unflatten(structure, now), given))

@@ -73,7 +73,7 @@ def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple
 
 
 def equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
-    """Return groups of loads with equal numbers, as indices."""
+    """Return groups of loads with equal parameters, as indices."""
     direction = np.asarray(balance.direction)
     rows = np.concatenate(
         [np.real(direction), np.imag(direction), np.stack([balance.unbalance, balance.drag, balance.averaged.inertia], 1)],

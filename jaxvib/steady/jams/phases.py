@@ -68,8 +68,8 @@ class AbstractPhaseJam(Result):
     - `phase` (count,), rad; 0 for the first load
     - `pattern`: a `PhasePattern`
     - `growth`, 1/s, of the fastest growing small disturbance, and `stable`: True if it is negative
-    - `displacement` (nd,): complex amplitudes at Omega t, m, of tilts rad
-    - `amplitude` (nd,), m, of tilts rad, zero to peak
+    - `displacement` (nd,): complex amplitudes at Omega t, m (rad for tilts)
+    - `amplitude` (nd,), m (rad for tilts), zero to peak
     - `foundation_force`, N, zero to peak (for two directions the root of the summed squares of their peaks: sqrt 2 times the
       force of a circular whirl)
     - `torque` (count,), N m: the mean torque of the vibration on each load
@@ -243,7 +243,7 @@ def loads_with_drag(scene: Scene) -> CircularLoads:
 def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_numbers: bool = False) -> tuple[Array, Array]:
     """Solve the torque balance for the load speed and the phases (count,) by Newton's method, differentiable by the balance.
 
-    `on_numbers`: evaluate on single numbers (`damped_newton`), which is faster for many starts and takes longer to compile.
+    `on_numbers`: evaluate on scalars (`damped_newton`), which is faster for many starts and takes longer to compile.
     """
 
     def residuals(x: Array, given: TorqueBalance) -> tuple[Array, None]:

@@ -71,15 +71,15 @@ class Orbit(Result):
     - `residual` of the torque balance, relative
     - `error`: estimate of the relative error of the speeds (and, rad, of psi), from the number of harmonics and from rounding
     - `omega` and `rotor_speed`, rad/s; `slope`: dn/dOmega along the branch
-    - `amplitude` (nd,), m, of tilts rad, and `foundation_force`, N: zero to peak, (max - min)/2 over the period. For two
+    - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, (max - min)/2 over the period. For two
       directions of the force: root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
     - `power`, W: mean power that the loads take from the rotor, by drag and dry friction
     - `stable`: True if every load keeps to this motion, that is `multiplier` < 1
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
     - `multipliers`, complex: all of them, those of loads that separate from each other last
     - `trivial`: the multiplier that is 1, as computed
-    - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m, of tilts rad, `force_harmonics` (nb, K), N: the
-      c_k. Loads that share every number have one deviation (G = 1), otherwise each has its own (G = count)
+    - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m (rad for tilts), `force_harmonics` (nb, K), N: the
+      c_k. Loads that have equal parameters have one deviation (G = 1), otherwise each has its own (G = count)
     - `deviation_orders` and `orders`: the k of these harmonics
     - `offsets` (count,), rad: the angle by which each load is ahead of phi
     - `units` (nd,) of the amplitudes, "m" or "rad"

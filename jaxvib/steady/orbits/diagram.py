@@ -65,7 +65,7 @@ class ExactBranches(Result):
     **Attributes**
 
     - `omega` and `rotor_speed` (P,), rad/s; `slope`: dn/dOmega
-    - `amplitude` (P, nd), m, of tilts rad, and `foundation_force` (P,), N, zero to peak, as in `Orbit`
+    - `amplitude` (P, nd), m (rad for tilts), and `foundation_force` (P,), N, zero to peak, as in `Orbit`
     - `power` (P,), W
     - `stable`, `multiplier` (P,) and `multipliers` (P, ...), as in `Orbit`
     - `residual` and `error` (P,), and `status`, an `OrbitStatus` each

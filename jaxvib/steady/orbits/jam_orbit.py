@@ -57,7 +57,7 @@ def jam_orbit(
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
     trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton's method from the leading order.
 
-    - Loads that share every number are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
+    - Loads that have equal parameters are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
       arcsin(r/R)) / (r/R); if they would have to pull at each other, on the average of a period, the status is
       `would_separate`)
     - Loads that differ have a psi_j each: they lie next to each other in the order that their torques require
@@ -78,8 +78,8 @@ def jam_orbit(
       the default is 16 (33), and the status shows if it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
-    **Returns** `Orbit`; derivatives of its numbers with respect to every number of the scene by the implicit function theorem,
-    forward and reverse.
+    **Returns** `Orbit`; derivatives of its numbers with respect to every parameter of the scene by the implicit function
+    theorem, forward and reverse.
 
     **Raises** `InputError` for wrong arguments, loads without drag, and a `mode` of a machine with gyroscopic coupling (its
     resonances move with the rotor's speed; there a load speed may have motions at several rotor speeds, and `omega` gives that

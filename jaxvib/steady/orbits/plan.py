@@ -1,4 +1,4 @@
-"""Plans of exact jams: choices that depend on numbers of a scene, made on the host before a program is traced.
+"""Plans of exact jams: choices that depend on parameters of a scene, made on the host before a program is traced.
 
 Only this module tests which numbers are known. Under a JAX transformation the number of collocation points is fixed.
 """

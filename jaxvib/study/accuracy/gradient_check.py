@@ -186,7 +186,7 @@ def check_gradients(
     - `quantity`: a function of a `Scene` that returns one number, such as
       `lambda s: jv.jam_modes(s).select(3).foundation_force`
     - `free`: names of the numbers, such as "machine.stiffness", "loads.drag" or "effects.stop[0].gap": all their entries;
-      default: all numbers of the scene; typical: 5 to 20. A number that is 0 is moved by steps of its typical size; one at a
+      default: all parameters of the scene; typical: 5 to 20. A number that is 0 is moved by steps of its typical size; one at a
       bound, such as a damping of 0, is left out. Each number takes 22 evaluations
     - `routes`: "forward" and "reverse" mode of JAX through the quantity; name those that it has (`simulate` has reverse unless
       it is given `diffrax.ForwardMode()`, and then forward)

@@ -28,7 +28,7 @@ class JamValues(Protocol):
 
     @property
     def amplitude(self) -> Array:
-        """Amplitudes (nd,) m, of tilts rad, zero to peak."""
+        """Amplitudes (nd,) m (rad for tilts), zero to peak."""
         ...
 
     @property

@@ -48,7 +48,7 @@ class Audit(Result):
 
     - `accuracy` that was requested, relative
     - `motion` that was compared, as text
-    - `kind` of the scene's own motion, `omega`, rad/s, `amplitude` (nd,), m, of tilts rad, `foundation_force`, N, and `fold`,
+    - `kind` of the scene's own motion, `omega`, rad/s, `amplitude` (nd,), m (rad for tilts), `foundation_force`, N, and `fold`,
       rad/s
     - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if no time was taken)
     - `effects`, `tiers` and `numbers`: lists of `EffectRow`, `TierRow`, `NumberRow`
@@ -119,8 +119,8 @@ def audit(
 ) -> Audit:
     """Compute the change and the cost of each effect and each tier on a scene; find negligible and missing effects.
 
-    - Each effect of the scene is taken out; each that it lacks and could have is put in, with usual numbers (`Effect.typical`).
-      The same quantities of both scenes are computed
+    - Each effect of the scene is taken out; each that it lacks and could have is put in, with typical values
+      (`Effect.typical`). The same quantities of both scenes are computed
     - For a scene that jams at a constant rotor speed this is its jam, by the exact orbit or, if that is refused, by the full
       equations until nothing changes. For any other scene it is the end of a run. That motion is judged, not the way to it
     - The coupling of a rotor's tilts and the limit of a motor's power are taken out in the same way

@@ -44,7 +44,7 @@ class MotionValues(NamedTuple):
     **Attributes**
 
     - `kind`: text that differs for different kinds of motion; `remark` on the computation
-    - `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad; `foundation_force` N
+    - `omega` of the loads, rad/s; `amplitude` of each coordinate, m (rad for tilts); `foundation_force` N
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
     - `uncertainty`: relative uncertainty of these values
     - `closest`: smallest distance of two loads in units of their diameter, NaN for points and for coincident loads

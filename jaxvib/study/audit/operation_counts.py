@@ -40,7 +40,7 @@ def operation_counts() -> list[OperationCount]:
     """Count the operations that each effect, drive, machine and kind of loads adds to the equations of motion.
 
     The scene is a platform with a ball at constant speed. An effect that this scene cannot have is counted in the simplest
-    scene that can have it. The counts do not depend on the numbers of the scene. **Returns** a list of `OperationCount`.
+    scene that can have it. The counts do not depend on the parameters of the scene. **Returns** a list of `OperationCount`.
 
     >>> rows = operation_counts()
     >>> [row.added for row in rows if row.kind == "constant_speed"], min(row.added for row in rows if row.part == "effect") > 0

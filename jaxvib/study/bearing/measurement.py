@@ -87,23 +87,23 @@ def _options(dry: object = False, instrument: Number = 0.0) -> tuple[bool, float
     return dry, float(number(instrument, "", "identify.instrument", low=0.0))
 
 
-TEMPLATE = """# A pendulum was let go on a bearing that stands still; its angle was recorded while it swung down.
+TEMPLATE = """# Recorded swing of a pendulum that was released on a stationary bearing.
 [record]
-file = "swing.csv"          # two columns, for example: time (s), angle (deg); path from here
-# columns = ["t", "phi"]    # their names, where they are not called time and angle
-# angle_unit = "deg"        # where the header does not say it
-# from = "1 s"              # leave out what was before, such as the hand that let go
+file = "swing.csv"          # two columns, for example: time (s), angle (deg); path relative to this file
+# columns = ["t", "phi"]    # names of the columns, if they are not time and angle
+# angle_unit = "deg"        # if the header does not state it
+# from = "1 s"              # start of the part to use, for example after the release
 # until = "60 s"
 
 [pendulum]
 mass = "300 g"
-length = "250 mm"           # from the bearing's axis to the mass centre
+length = "250 mm"           # from the axis of the bearing to the mass centre
 inertia = 0.00625           # kg m^2 about the mass centre: a rod of length L has m L^2/12
-bearing = "20 mm"           # diameter, where dry friction acts
+bearing = "20 mm"           # diameter at which dry friction acts
 # g = 9.81                  # m/s^2
 
 [identify]
-dry = true                  # find mu2 as well as mu1
-instrument = 0.03           # relative uncertainty of the moment of inertia, from ruler and scales
+dry = true                  # identify mu2 as well as mu1
+instrument = 0.03           # relative uncertainty of the moment of inertia, from its measurement
 """
 """Commented example of a measurement file."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class ThresholdCurve(Result):
-    """Threshold of capture over a number of the scene.
+    """Threshold of capture over a parameter of the scene.
 
     Returned by `threshold_curve`.
 

@@ -197,7 +197,7 @@ def test_quantities_in_time():
         (lambda: expected(3.0, {"machine.stiffness": 0.05}), "must be a Quantity"),
         (lambda: amplitude(mode=9)(SCENE), "numbered 1 to 5"),
         (lambda: static_deflection(7)(SCENE), "platforms 1 to 2"),
-        (lambda: total("machine.length"), "must name numbers of a scene"),
+        (lambda: total("machine.length"), "must name parameters of a scene"),
     ],
 )
 def test_wrong_wishes_are_said_in_one_sentence(make, says):

@@ -176,7 +176,7 @@ def test_contact_forces_are_those_that_trailing_loads_need():
 def test_loads_side_by_side_need_room_and_one_size():
     with pytest.raises(jv.InputError, match=r"ball_radius is 0\.09 m; 3 side by side .* below 0\.0866025 m"):
         side_by_side(ball_radius=0.09)
-    with pytest.raises(jv.InputError, match="share every number"):
+    with pytest.raises(jv.InputError, match="needs equal loads"):
         side_by_side(mass=[0.5, 0.5, 0.6])
     with pytest.raises(jv.InputError, match=r"ball_radius"):
         side_by_side(ball_radius=-0.01)
