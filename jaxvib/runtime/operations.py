@@ -1,14 +1,18 @@
-"""Number of operations of a program, and removal of unused operations."""
+"""Text and number of operations of a program, and removal of unused operations."""
 
 from __future__ import annotations
 
+import dataclasses
+import enum
+import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax import Array
 
-from jaxvib.runtime.compat import HAS_JAXPRS, jaxpr_as_fun, rewritten
+from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, jaxpr_as_fun, rewritten
 
 
 def operations(function: Callable[..., Any], *arguments: Any) -> int:
@@ -40,6 +44,82 @@ def _programs(value: Any) -> Iterator[Any]:
     elif isinstance(value, (list, tuple)):
         for each in value:
             yield from _programs(each)
+
+
+_WITHOUT_EFFECT = ("name", "debug_info", "source_info")
+"""Parameters of operations that do not change results."""
+
+
+def program_text(program: ClosedJaxpr) -> list[str]:
+    """Return a program as text, one operation a line; it is the same in every process.
+
+    The text has the operations with their parameters, literals and constants, the operands of each, and the shapes and types of
+    the results. Names, source lines and Python functions are left out.
+
+    >>> program_text(jax.make_jaxpr(lambda x: 2.0 * x)(np.float32(1.0)))
+    ['arguments v0:float32[]', 'v1:float32[] = mul[...] ...2.0 v0', 'results v1']
+    """
+    return list(_lines(program))
+
+
+def calls_python(program: ClosedJaxpr) -> bool:
+    """Return True if a program calls a Python function, other than a run-time check of Equinox.
+
+    >>> calls_python(jax.make_jaxpr(lambda x: jax.pure_callback(np.sin, x, x))(1.0))
+    True
+    """
+    called = [e.params["callback"] for e in _walk(program.jaxpr) if e.primitive.name in ("pure_callback", "io_callback")]
+    functions = [getattr(each, "callback_func", each) for each in called]
+    return not all(str(getattr(each, "__module__", "")).startswith("equinox.") for each in functions)
+
+
+def _lines(closed: Any, depth: int = 0) -> Iterator[str]:
+    jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
+    names: dict[Any, str] = {}
+
+    def named(atom: Any) -> str:
+        if hasattr(atom, "val"):
+            return _text(atom.val)
+        return names.setdefault(atom, f"v{len(names)}")
+
+    indent = "  " * depth
+    for variable, value in zip(jaxpr.constvars, constants, strict=False):
+        yield f"{indent}{named(variable)} = {_text(value)}"
+    yield f"{indent}arguments {' '.join(f'{named(v)}:{v.aval.str_short()}' for v in jaxpr.invars)}"
+    for equation in jaxpr.eqns:
+        inner: list[Any] = []
+        parameters = sorted((key, value) for key, value in equation.params.items() if key not in _WITHOUT_EFFECT)
+        shown = ", ".join(f"{key}={_text(value, inner)}" for key, value in parameters)
+        operands = " ".join(named(atom) for atom in equation.invars)
+        results = " ".join(f"{named(v)}:{v.aval.str_short()}" for v in equation.outvars)
+        yield f"{indent}{results} = {equation.primitive.name}[{shown}] {operands}"
+        for each in inner:
+            yield from _lines(each, depth + 1)
+    yield f"{indent}results {' '.join(named(atom) for atom in jaxpr.outvars)}"
+
+
+def _text(value: Any, inner: list[Any] | None = None) -> str:
+    """Return a parameter or constant as text. Programs are appended to `inner`; functions and objects are named by type."""
+    if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
+        if inner is None:
+            return "program"
+        inner.append(value)
+        return f"program{len(inner)}"
+    if value is None or isinstance(value, (bool, int, float, complex, str, enum.Enum, np.dtype)):
+        return repr(value)
+    if isinstance(value, (np.ndarray, np.generic, jax.Array)):
+        array = np.asarray(value)
+        if array.size == 1:
+            return f"{array.dtype}:{array.item()!r}"
+        return f"{array.dtype}{list(array.shape)}:{hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:12]}"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_text(x, inner)}" for key, x in sorted(value.items(), key=str)) + "}"
+    if isinstance(value, (tuple, list)):
+        return f"{type(value).__name__}({', '.join(_text(x, inner) for x in value)})"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = ", ".join(f"{f.name}={_text(getattr(value, f.name), inner)}" for f in dataclasses.fields(value))
+        return f"{type(value).__name__}({fields})"
+    return type(value).__name__
 
 
 def pruned(function: Callable[..., Sequence[Array]], *like: Array) -> Callable[..., list[Array]]:

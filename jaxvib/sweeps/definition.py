@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import uuid
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -17,23 +16,16 @@ from jaxvib.motion.start import Start
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.compat import enumeration_names
 from jaxvib.sweeps.axes import Grid, Spot
-from jaxvib.sweeps.identity import UnknownIdentity, digest, identity
+from jaxvib.sweeps.identity import digest
 from jaxvib.sweeps.measures import Measure
 from optimize.quantities.quantity import Tier
-
-UNKNOWN = "unknown"
-"""Key of the reason in the identity of a value that cannot be compared."""
 
 _OPTIONS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
 """Options of JAX that change results."""
 
 
-def identify(value: object) -> Plain:
-    """Describe a value, see `identity`. The description of a value that cannot be compared is unique in every call."""
-    try:
-        return identity(value)
-    except UnknownIdentity as error:
-        return {UNKNOWN: str(error), "token": uuid.uuid4().hex}
+PYTHON = "calls Python"
+"""Begin of the digest of a program that cannot be compared with others."""
 
 
 class CaseStatus(eqx.Enumeration):
@@ -62,22 +54,22 @@ class SweepStatus(eqx.Enumeration):
 class Study:
     """Validated study, see `study`.
 
-    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures` and their `identities` when the study was built;
-    `plan` of the runs, None if there are no runs; their `start` and `mode`; `tier`; `specs`, the values of the axes as the
-    user wrote them; `forms`, shape and type of each measure in one case.
+    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures`; `plan` of the runs, None if there are none; their
+    `start` and `mode`; `tier`; `specs`, the values of the axes as the user wrote them; `forms`, shape and type of each measure
+    in one case; `program`, the digest of the program of a case when the study was built.
     """
 
     scene: Scene
     grid: Grid
     names: tuple[str, ...]
     measures: tuple[Measure, ...]
-    identities: dict[str, Plain]
     plan: BatchPlan | None
     start: Start
     mode: int | None
     tier: Tier
     specs: dict[str, Plain]
     forms: tuple[jax.ShapeDtypeStruct, ...] = ()
+    program: str = ""
 
     @property
     def spots(self) -> tuple[Spot, ...]:
@@ -85,13 +77,9 @@ class Study:
         return tuple(axis.spot for axis in self.grid.axes)
 
     @property
-    def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None, str]:
-        """Static arguments of the compiled program, in addition to the scene and the cases.
-
-        They include the digest of the measures' identities, because a function compares equal to itself after its global
-        numbers have changed, and would otherwise get the previous program.
-        """
-        return self.spots, self.measures, self.plan, self.start, self.mode, digest(self.identities)
+    def choices(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None]:
+        """Static arguments of the program of a case."""
+        return self.spots, self.measures, self.plan, self.start, self.mode
 
     @property
     def size(self) -> int:
@@ -105,32 +93,23 @@ class Study:
         options: dict[str, Plain] = {name: str(getattr(jax.config, name)) for name in _OPTIONS}
         return {
             "scene": scene_to_toml(self.scene),
-            "scene_values": identify(self.scene),
             "axes": self.specs,
-            "axis_values": {axis.name: identify(axis) for axis in self.grid.axes},
             "samples": self.grid.samples,
             "sampling": self.grid.sampling,
             "seed": self.grid.seed,
             "tier": self.tier,
-            "measure": self.identities,
+            "measure": {name: measure.unit for name, measure in zip(self.names, self.measures, strict=True)},
             "run": None if self.plan is None else {**self.plan._asdict(), "start": self.start, "mode": self.mode},
             "tile": list(self.grid.tile),
             "precision": str(self.scene.drive.speed.dtype),
             "options": options | {"EQX_ON_ERROR": os.environ.get("EQX_ON_ERROR")},
+            "program": self.program,
         }
 
     @property
     def key(self) -> str:
         """Text that is unique for the study."""
         return digest(self.record)
-
-    def changed(self) -> str | None:
-        """Return the name of a measure whose function, or a value in it, has changed since the study was built, or None."""
-        for name, measure in zip(self.names, self.measures, strict=True):
-            before, now = self.identities[name], identify(measure)
-            if before != now and not (isinstance(before, dict) and UNKNOWN in before):
-                return name
-        return None
 
     def nothing(self, cases: int) -> list[np.ndarray]:
         """Return placeholders for the measures of cases without a value: NaN, or -1 for integers."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import uuid
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,12 @@ from jaxvib.motion.batch import BATCH_SIZE, PARTS, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.motion.stiffness import fastest_decay, steps_of
+from jaxvib.results.fields import Plain
+from jaxvib.runtime.operations import calls_python, program_text
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
-from jaxvib.sweeps.definition import CASE_STATUSES, Study
+from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, Study
+from jaxvib.sweeps.identity import digest
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
 
@@ -56,12 +60,8 @@ def _each(
     plan: BatchPlan | None,
     start: Start,
     mode: int | None,
-    identities: str,
 ) -> tuple[tuple[Array, ...], Array]:
-    """Compute the measures of each case (cases, axes), and True for each case whose motion stayed finite.
-
-    `identities` is the digest of the identities of the measures, see `Study.program`.
-    """
+    """Compute the measures of each case (cases, axes), and True for each case whose motion stayed finite."""
 
     def one(value: Array) -> tuple[tuple[Array, ...], Array]:
         this = put(scene, spots, value)
@@ -84,7 +84,13 @@ def _each(
     return jax.lax.map(one, values, batch_size=BATCH_SIZE)
 
 
-_cases = cached(_each)
+@cached
+def _cases(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tuple[Array, ...], Array]:
+    """Compute cases by a program of its own for each digest `program`.
+
+    A function compares equal to itself after its global numbers have changed, and would otherwise get the previous program.
+    """
+    return _each(scene, values, *choices)
 
 
 @cached
@@ -115,11 +121,22 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
     return BatchPlan(until, window, _SAMPLES, *counts, implicit=implicit)
 
 
-def shapes(study: Study) -> list[jax.ShapeDtypeStruct]:
-    """Return shape and type of each measure of one case by tracing the program. Errors of tracing are passed on."""
+def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
+    """Return shape and type of each measure of one case, and the digest of the program of a case.
+
+    The digest differs if any number or operation differs on which results depend: numbers of the scene, and whatever the
+    functions of measures refer to. It begins with `PYTHON` and differs each time if a measure calls Python from its program,
+    because Python cannot be compared. Errors of tracing are passed on.
+    """
     values = jnp.zeros((1, len(study.spots)))
-    found, _ = jax.eval_shape(lambda v: _each(study.scene, v, *study.program), values)
-    return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in found]
+
+    def cases(values: Array) -> tuple[tuple[Array, ...], Array]:
+        return _each(study.scene, values, *study.choices)
+
+    program, (found, _) = jax.make_jaxpr(cases, return_shape=True)(values)
+    text: list[Plain] = [*program_text(program)]
+    identity = f"{PYTHON} {uuid.uuid4().hex}" if calls_python(program) else digest(text)
+    return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in found], identity
 
 
 def compute(study: Study, chunk: int) -> Chunk:
@@ -144,7 +161,7 @@ def _computed(
     filled = np.repeat(values[which[:1]], study.size, axis=0)
     filled[which] = values[which]
     try:
-        found, finite = _cases(study.scene, jnp.asarray(filled), *study.program)
+        found, finite = _cases(study.scene, jnp.asarray(filled), study.program, *study.choices)
         return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
     except RuntimeError as error:  # raised by a running program; an error of its compilation would concern all cases
         if "RESOURCE_EXHAUSTED" in str(error):

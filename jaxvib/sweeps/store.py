@@ -30,7 +30,7 @@ from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence
 from jaxvib.sweeps import seals
 from jaxvib.sweeps.axes import SAMPLE
-from jaxvib.sweeps.definition import CASE_STATUSES, UNKNOWN, CaseStatus, Study
+from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, CaseStatus, Study
 from jaxvib.sweeps.identity import difference
 from jaxvib.sweeps.measures import RunMeasure
 from jaxvib.sweeps.program import Chunk
@@ -133,17 +133,17 @@ class Store:
     def require_same(self, study: Study) -> None:
         """Require that the store belongs to this study and to the installed versions.
 
-        **Raises** `InputError` if it belongs to others, or if this cannot be determined.
+        **Raises** `InputError` if it belongs to others.
         """
-        for name, mine in study.identities.items():
-            if isinstance(mine, dict) and UNKNOWN in mine and self.record["measure"].get(name) != mine:
-                problem = f"{mine[UNKNOWN]}; the numbers in {str(self.path)!r} may come from different code"
-                raise InputError(f"measure.{name}", f"{problem}; name another store")
         if (found := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
-            name, mine, its = found[0].replace(".tuple[", "[").replace(".dict[", "["), *found[1:]
+            name, mine, its = found
             part = re.split(r"[.\[]", name)[0]
             problem = f"is {str(self.path)!r}, which holds another study: its {part} differs"
             where = "" if part == name else f" ({name} is {_short(its)} there and {_short(mine)} here)"
+            if study.program.startswith(PYTHON):
+                where = " (a measure calls Python from its program, whose results cannot be compared)"
+            elif name == "program":
+                where = " (a number of the scene, the function of a measure, or a value that it refers to)"
             raise InputError("store", f"{problem}{where}; name another store, or run the study of this store")
         for name, version in versions().items():
             if self.attributes["versions"].get(name) != version:

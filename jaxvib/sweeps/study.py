@@ -16,9 +16,9 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
 from jaxvib.sweeps.axes import SAMPLINGS, AxisSpec, Grid, axis_of, corners, require_apart, tile_of
-from jaxvib.sweeps.definition import Study, identify
+from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
-from jaxvib.sweeps.program import planned, shapes
+from jaxvib.sweeps.program import planned, traced_program
 from jaxvib.units import Number, count, number
 from optimize.files import quantity_from_table
 from optimize.quantities.quantity import TIERS, Quantity, Tier
@@ -98,10 +98,9 @@ def study(
     most = count(_CHUNK["time" if runs else chosen] if chunk is None else chunk, "chunk")
     grid = grid._replace(tile=tile_of(grid.shape, most))
     specs = {name: _plain(spec) for name, spec in axes.items()}
-    identities = {name: identify(m) for name, m in zip(names, measures, strict=True)}
-    made = Study(scene, grid, names, measures, identities, plan, start, mode, chosen, specs)
+    made = Study(scene, grid, names, measures, plan, start, mode, chosen, specs)
     try:
-        forms = shapes(made)
+        forms, program = traced_program(made)
     except (InputError, ComputationError):
         raise
     except Exception as error:  # any error of a user's function
@@ -113,7 +112,7 @@ def study(
             raise InputError(
                 f"measure.{name}", f"has shape {form.shape}; a scalar is needed" + (", with one axis" * axes_count)
             )
-    return dataclasses.replace(made, forms=tuple(forms))
+    return dataclasses.replace(made, forms=tuple(forms), program=program)
 
 
 def _is_name(name: str) -> bool:

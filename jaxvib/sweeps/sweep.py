@@ -22,8 +22,9 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, sentence
 from jaxvib.sweeps.axes import AxisSpec
-from jaxvib.sweeps.definition import CASE_STATUSES, CaseStatus, Study, SweepStatus
+from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, CaseStatus, Study, SweepStatus
 from jaxvib.sweeps.execute import Report, in_this_process, timed
+from jaxvib.sweeps.program import traced_program
 from jaxvib.sweeps.store import ChunkState, Store
 from jaxvib.sweeps.study import Measures, study
 from jaxvib.units import Number, count
@@ -237,9 +238,9 @@ def _computed(
     report: Report | None,
 ) -> Sweep:
     """Compute the missing chunks of a store that this process has locked, and recompute the damaged ones."""
-    if (changed := new_study.changed()) is not None:
-        problem = "is a function whose code or data changed after the study was made"
-        raise InputError(f"measure.{changed}", f"{problem}; make the study again")
+    if not new_study.program.startswith(PYTHON) and traced_program(new_study)[1] != new_study.program:
+        problem = "have a function that has changed since the study was made, or that gives another program each time"
+        raise InputError("measures", f"{problem} (a clock, random numbers, a file); pass such numbers as constants")
     kept.require_same(new_study)
     states = kept.states(writing=True)
     damaged = np.flatnonzero(states == ChunkState.damaged)

@@ -11,8 +11,6 @@ the results. It is the same in every process for one version of JAX. Names, sour
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import enum
 import hashlib
 import json
 import pathlib
@@ -27,14 +25,12 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.equations.averaged import amplitudes_of, averaged_field
+from jaxvib.runtime.operations import program_text
 
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from scenes import BALLS, ROTOR, TWO_MASS, loads, machines, published
 
 RECORDED = pathlib.Path(__file__).parents[2] / "data" / "golden.json"
-
-LEFT_OUT = ("name", "debug_info", "source_info")
-"""Parameters of operations that do not belong to the program."""
 
 SPEED = jv.ConstantSpeed(120.0)
 
@@ -166,66 +162,14 @@ def program(scene: jv.Scene, question: Callable[[jv.Scene], Any]) -> list[str]:
         return [leaf for leaf in jax.tree.leaves(question(eqx.combine(values, rest))) if eqx.is_array(leaf)]
 
     try:
-        traced = jax.make_jaxpr(asked)(numbers)
+        return program_text(jax.make_jaxpr(asked)(numbers))
     except jv.InputError as error:
         return [f"refused: {error.field}"]
-    return list(_lines(traced))
 
 
 def digest(lines: list[str]) -> str:
     """The number of operations and a hash of the lines."""
     return f"{len(lines)} {hashlib.sha256(chr(10).join(lines).encode()).hexdigest()[:16]}"
-
-
-def _lines(closed: Any, depth: int = 0) -> Iterator[str]:
-    jaxpr, constants = getattr(closed, "jaxpr", closed), getattr(closed, "consts", ())
-    names: dict[Any, str] = {}
-
-    def named(atom: Any) -> str:
-        if hasattr(atom, "val"):
-            return _value(atom.val)
-        return names.setdefault(atom, f"v{len(names)}")
-
-    indent = "  " * depth
-    for variable, value in zip(jaxpr.constvars, constants, strict=False):
-        yield f"{indent}{named(variable)} = {_value(value)}"
-    yield f"{indent}arguments {' '.join(f'{named(v)}:{v.aval.str_short()}' for v in jaxpr.invars)}"
-    for equation in jaxpr.eqns:
-        inner, parameters = [], []
-        for key, value in sorted(equation.params.items()):
-            if key not in LEFT_OUT:
-                words = _value(value, inner)
-                parameters.append(f"{key}={words}")
-        operands = " ".join(named(atom) for atom in equation.invars)
-        results = " ".join(f"{named(v)}:{v.aval.str_short()}" for v in equation.outvars)
-        yield f"{indent}{results} = {equation.primitive.name}[{', '.join(parameters)}] {operands}"
-        for each in inner:
-            yield from _lines(each, depth + 1)
-    yield f"{indent}results {' '.join(named(atom) for atom in jaxpr.outvars)}"
-
-
-def _value(value: Any, inner: list[Any] | None = None) -> str:
-    """A parameter or constant in words: programs are appended to `inner`, functions and other objects named by their type."""
-    if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
-        if inner is None:
-            return "program"
-        inner.append(value)
-        return f"program{len(inner)}"
-    if value is None or isinstance(value, (bool, int, float, complex, str, enum.Enum, np.dtype)):
-        return repr(value)
-    if isinstance(value, (np.ndarray, np.generic, jax.Array)):
-        array = np.asarray(value)
-        if array.size == 1:
-            return f"{array.dtype}:{array.item()!r}"
-        return f"{array.dtype}{list(array.shape)}:{hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:12]}"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_value(x, inner)}" for key, x in sorted(value.items(), key=str)) + "}"
-    if isinstance(value, (tuple, list)):
-        return f"{type(value).__name__}({', '.join(_value(x, inner) for x in value)})"
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = ", ".join(f"{f.name}={_value(getattr(value, f.name), inner)}" for f in dataclasses.fields(value))
-        return f"{type(value).__name__}({fields})"
-    return type(value).__name__
 
 
 def programs(only: str = "") -> Iterator[tuple[str, list[str]]]:
