@@ -75,7 +75,7 @@ def _misprints() -> str:
         for n in NUMBERS
         if n.misprint is not None
     ]
-    return _table(["place", "printed", "right", "proved by"], rows)
+    return _table(["place: quantity", "printed", "correct", "computed from"], rows)
 
 
 def _different() -> str:
@@ -87,7 +87,7 @@ def _numbers() -> str:
     rows = [
         [f"{n.paper} {n.place}", n.quantity, _printed(n), f"{n.within:g}", n.note] for n in NUMBERS if n.verdict == "reproduced"
     ]
-    return _table(["place", "quantity", "printed", "within", "setting"], rows)
+    return _table(["place", "quantity", "printed", "bound of the difference", "setting"], rows)
 
 
 def _printed(number: PrintedNumber) -> str:

@@ -215,7 +215,7 @@ def _meaningless(scene: Scene) -> Answer:
 CASES = (
     Case(
         "1e5 turns",
-        hard="single precision cannot even count the time: errors of each step add up 3e6 times",
+        hard="single precision cannot represent the time, and the errors of 3e6 steps add up",
         quantity="mean load speed in the jam at the end",
         against="shooting with SciPy",
         scene=lambda: published(eps=0.05),
@@ -225,7 +225,7 @@ CASES = (
     ),
     Case(
         "energy over 1e4 turns",
-        hard="no losses: the errors of all steps add up",
+        hard="without losses the errors of all steps add up",
         quantity="energy at the end",
         against="energy at the start",
         scene=_lossless,
@@ -235,7 +235,7 @@ CASES = (
     ),
     run_case(
         "run-up through the resonance, fast",
-        hard="the drive's acceleration jumps at the end",
+        hard="the acceleration of the drive jumps at the end of the run-up",
         scene=lambda: _passing(RunUp(60.0, acceleration=100.0)),
         answer=_FAST[0],
         reference=_FAST[1],
@@ -243,7 +243,7 @@ CASES = (
     ),
     run_case(
         "run-up through the resonance, slow",
-        hard="the load is caught at the resonance or not: the passage decides about the later motion",
+        hard="small differences during the passage decide if the load is caught at the resonance",
         scene=lambda: _passing(RunUp(60.0, acceleration=3.0)),
         answer=_SLOW[0],
         reference=_SLOW[1],
@@ -251,7 +251,7 @@ CASES = (
     ),
     run_case(
         "motor caught by the resonance",
-        hard="the rotor itself is caught: its speed is an unknown on which the vibration acts",
+        hard="the rotor itself is caught: its speed is an unknown, which the vibration changes",
         scene=lambda: _passing(DCMotor(60.0, stall_torque=3.0, inertia=0.2)),
         answer=_STALLED[0],
         reference=_STALLED[1],
@@ -259,9 +259,9 @@ CASES = (
     ),
     Case(
         "period doubling",
-        hard="the motion repeats after two turns, not after one: an average over a turn, or a single picture, misses it",
-        quantity="displacement after 100 turns, and after 101",
-        against="the sharp law from event to event, SciPy's DOP853 between them",
+        hard="the motion repeats after two turns, not after one; an average over one turn does not show this",
+        quantity="displacements after 100 and after 101 turns",
+        against="non-smooth law, integrated from event to event by SciPy's DOP853",
         scene=_doubled,
         answer=_turn_by_turn,
         reference=_turn_by_turn_again,
@@ -269,8 +269,8 @@ CASES = (
     ),
     Case(
         "gradient of a long run",
-        hard="the derivative runs through 1500 units of time; in a stable jam it converges as the motion does",
-        quantity="derivatives of the load speed at the end by each support's stiffness",
+        hard="a derivative through 1500 units of time; in a stable jam it converges like the motion",
+        quantity="derivatives of the load speed at the end with respect to the support stiffnesses",
         against="shooting: -(dn/dk)/(dn/dOmega)",
         scene=lambda: published(eps=0.05),
         answer=_slopes,
@@ -279,9 +279,9 @@ CASES = (
     ),
     Case(
         "chaos, growth of derivatives",
-        hard="derivatives of a long run are meaningless, however exactly they are computed: a status has to say so",
+        hard="derivatives of a long run are meaningless even if they are exact; a status must state this",
         quantity="largest Lyapunov exponent of Ueda's attractor",
-        against="SciPy's DOP853 on its variational equation",
+        against="variational equation, integrated by SciPy's DOP853",
         scene=_ueda,
         answer=_exponent,
         reference=_exponent_again,
@@ -289,9 +289,9 @@ CASES = (
     ),
     Case(
         "chaos, gradient of a run",
-        hard="forward mode gives 17 digits of a number that describes no change larger than rounding",
-        quantity="derivative of the displacement after 100 turns by the damping, checked",
-        against="no right answer exists, only a status",
+        hard="forward mode gives 17 digits of a derivative that is valid only for changes smaller than rounding errors",
+        quantity="checked derivative of the displacement after 100 turns with respect to the damping",
+        against="no correct value exists, only a status",
         scene=_ueda,
         answer=_meaningless,
         reference=lambda scene: Reference([0.0]),

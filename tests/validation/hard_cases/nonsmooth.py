@@ -217,7 +217,7 @@ def _bent(
         name,
         hard=hard,
         quantity="state at the end of a run",
-        against="the sharp law from event to event, SciPy's DOP853 on the reference model between them",
+        against="reference model with the non-smooth law, integrated from event to event by SciPy's DOP853",
         scene=scene,
         # the error that a run claims is its own, that of its smoothed friction is not in it
         answer=final_state(until, start, steps=_FINE_TOLERANCE, claims=law is not _dry)[0],
@@ -229,7 +229,7 @@ def _bent(
 CASES = (
     _bent(
         "stop 1e4 times as stiff",
-        "a bounce lasts a hundredth of a period, and the force bends where it begins",
+        "a bounce lasts a hundredth of a period, and the slope of the force jumps at its beginning",
         lambda: _one(Stop(4e8, gap=1e-3, side="above")),
         _moving,
         1.0,
@@ -238,7 +238,7 @@ CASES = (
     ),
     _bent(
         "stop that damps",
-        "the force jumps where the stop is met and where it lets go",
+        "the force jumps at the beginning and at the end of the contact with the stop",
         lambda: _one(Stop(4e6, gap=1e-3, damping=4e3, side="above")),
         _moving,
         1.0,
@@ -247,7 +247,7 @@ CASES = (
     ),
     _bent(
         "contact of two balls",
-        "bounces of a millisecond, many of them while the balls come to rest against each other",
+        "many bounces of a millisecond until the balls are at rest relative to each other",
         lambda: _two_balls(1e6, 20.0),
         _meeting,
         0.5,
@@ -256,7 +256,7 @@ CASES = (
     ),
     _bent(
         "friction, from zero speed",
-        "a slow rotor carries the pendulum until it slips, and catches it again: sticking begins and ends at no sliding speed",
+        "a slow rotor carries the pendulum until it slips, and later it sticks again; both happen at a sliding speed of zero",
         lambda: _friction(0.3, 0.25),
         _hanging(0.0, 0.25),
         2.0,
@@ -265,7 +265,7 @@ CASES = (
     ),
     _bent(
         "friction, reversing",
-        "the pendulum swings, its speed against the rotor changes its sign, and it comes to rest",
+        "the pendulum swings, its speed relative to the rotor changes sign, and it comes to rest",
         lambda: _friction(0.15, 0.05),
         _hanging(1.2),
         8.0,
@@ -274,7 +274,7 @@ CASES = (
     ),
     _bent(
         "friction, sticking to a rotor that runs up",
-        "the bearing carries the pendulum over the top, what holds it changes its sign each turn",
+        "the bearing carries the pendulum over the top, and the friction torque changes sign in each turn",
         lambda: _friction(2.5, 40.0, drive=RunUp(40.0, acceleration=4.0)),
         _hanging(0.0),
         6.0,

@@ -111,7 +111,7 @@ CASES = (
     *(
         jam_case(
             f"light fold, 1e-8 {side}",
-            hard="two modes merge: the load speed has an infinite slope, and 8 digits of the rotor's speed decide over both",
+            hard="two modes merge: the load speed has an infinite slope, and the 8th digit of the rotor speed decides",
             scene=lambda sign=sign: published(_LIGHT_FOLD * (1.0 + sign * 1e-8)),
             named=((), ("at_fold",)),
         )
@@ -133,23 +133,23 @@ CASES = (
     ),
     jam_case(
         "no damping at all",
-        hard="the vibration has no bound at a resonance, and no torque away from it",
+        hard="the vibration is unbounded at a resonance, and exerts no torque at other speeds",
         scene=lambda: published(damping=0.0),
     ),
     jam_case(
         "damping 1e-8 of critical",
-        hard="peaks 1e-8 wide and 1e8 high, between the points of any even grid",
-        against="roots of n(Omega) between points that crowd to 1e-15 of the resonances",
+        hard="peaks of relative width 1e-8 and height 1e8 lie between the points of any uniform grid",
+        against="roots of n(Omega) between points that approach the resonances to 1e-15",
         scene=lambda: published(damping=1e-8),
     ),
     jam_case(
         "overdamped, modes",
-        hard="no resonance is left: folds vanish, and one mode remains",
+        hard="there is no resonance and no fold, and one mode remains",
         scene=lambda: published(damping=5.0),
     ),
     run_case(
         "overdamped, run",
-        hard="decay rates 2e4 apart make the equations stiff",
+        hard="decay rates with a ratio of 2e4 make the equations stiff",
         scene=lambda: published(damping=50.0, eps=0.05),
         answer=_RUN,
         reference=_RUN_AGAIN,
@@ -157,9 +157,9 @@ CASES = (
     ),
     Case(
         "n1 = n2 exactly, gradient",
-        hard="the platforms' own frequencies coincide, where the formula of the criterion paper divides 0 by 0",
-        quantity="derivatives of the foundation force of the slowest jam by each stiffness",
-        against="differences of dense complex algebra",
+        hard="equal partial natural frequencies of the platforms; a formula of the criterion paper divides 0 by 0 there",
+        quantity="derivatives of the foundation force of the slowest jam with respect to each stiffness",
+        against="finite differences of dense complex linear algebra",
         scene=published,
         answer=_force_slopes,
         reference=_force_slopes_again,
@@ -167,14 +167,14 @@ CASES = (
     ),
     jam_case(
         "link of stiffness 0",
-        hard="a platform without excitation: a resonance that no load feels",
+        hard="a platform without excitation has a resonance that does not act on the loads",
         scene=_foundation_only,
     ),
     Case(
         "link of 1e-9, gradient",
-        hard="two natural frequencies 1e-9 apart",
-        quantity="derivatives of the foundation force of the slowest jam by each stiffness",
-        against="differences of dense complex algebra",
+        hard="two natural frequencies differ by 1e-9",
+        quantity="derivatives of the foundation force of the slowest jam with respect to each stiffness",
+        against="finite differences of dense complex linear algebra",
         scene=lambda: published(0.6, link_natural=1e-5, link_damping=0.0),
         answer=_force_slopes,
         reference=_force_slopes_again,
@@ -182,9 +182,9 @@ CASES = (
     ),
     Case(
         "three platforms alike, no links",
-        hard="a threefold natural frequency: derivatives of single ones do not exist, that of their sum does",
+        hard="a threefold natural frequency: the derivative of one of the three does not exist, that of their sum does",
         quantity="natural frequencies, and derivatives of the sum of their squares",
-        against="a symmetric eigenproblem, and the trace of M^-1 K",
+        against="symmetric eigenvalue problem, and the trace of M^-1 K",
         scene=lambda: _alike(0.0),
         answer=_frequencies,
         reference=_frequencies_again,
@@ -192,9 +192,9 @@ CASES = (
     ),
     Case(
         "three platforms alike, weak links",
-        hard="three natural frequencies 1e-9 apart, derivatives of each grow as the inverse of that",
+        hard="three natural frequencies differ by 1e-9, and derivatives of each are inversely proportional to this difference",
         quantity="natural frequencies, and derivatives of the sum of their squares",
-        against="a symmetric eigenproblem, and the trace of M^-1 K",
+        against="symmetric eigenvalue problem, and the trace of M^-1 K",
         scene=lambda: _alike(2e-5),
         answer=_frequencies,
         reference=_frequencies_again,
@@ -202,7 +202,7 @@ CASES = (
     ),
     jam_case(
         "three platforms alike, jams",
-        hard="three resonances at one speed, of which the load feels one",
+        hard="three resonances have the same frequency, and only one of them acts on the load",
         scene=lambda: _alike(0.0),
     ),
 )

@@ -62,7 +62,7 @@ jam_case = partial(
     reference=_mode_speeds_again,
     within=(1e-9, 1e-3),
 )
-run_case = partial(Case, quantity="state at the end of a run", against="SciPy's DOP853 on the reference model")
+run_case = partial(Case, quantity="state at the end of a run", against="reference model, integrated by SciPy's DOP853")
 
 
 def light_force_slope(scene: Scene, mode_near: float, step: float = 1e-5) -> np.ndarray:

@@ -97,7 +97,7 @@ def _platform_2_again(own: int) -> float:
 
 _number = partial(PrintedNumber, "antiphase")
 _formula = partial(PrintedNumber, "antiphase", within=1e-9, note=_SETTING)
-_three_loads = partial(_number, printed=3.0, within=1e-6, note="three loads, each with three times the drag, mode 3 at n = 3")
+_three_loads = partial(_number, printed=3.0, within=1e-6, note="three loads, each with three times the drag; mode 3 at n = 3")
 
 NUMBERS = (
     _number("5.3, after (40)", "resonance 1", 0.3333, lambda: _resonance(0), within=5e-5),
@@ -118,20 +118,20 @@ NUMBERS = (
         5.0,
         lambda: float(np.sum(_modes().folds.exists)) + 1.0,
         within=0.0,
-        note="pieces between folds",
+        note="counted as the pieces of the branch between folds",
     ),
-    _three_loads("5.3, figures 3, 4", "amplitude with three loads", computed=lambda: _ratio("amplitude", 1)),
-    _three_loads("5.3, figures 3, 4", "force with three loads", computed=lambda: _ratio("foundation_force")),
-    _formula("(16)", "speed at which the supports' forces cancel", _ideal, lambda: _quiet()[0]),
+    _three_loads("5.3, figures 3, 4", "amplitude with three loads / with one load", computed=lambda: _ratio("amplitude", 1)),
+    _three_loads("5.3, figures 3, 4", "force with three loads / with one load", computed=lambda: _ratio("foundation_force")),
+    _formula("(16)", "speed at which the support forces cancel", _ideal, lambda: _quiet()[0]),
     _formula(
         "(13)",
-        "platform 1 there",
+        "motion of platform 1 at the speed of (16)",
         lambda: _NATURAL[1] ** 2 / (_NATURAL[0] ** 2 - _NATURAL[1] ** 2),
         lambda: _quiet()[1],
     ),
     _formula(
         "(13)",
-        "platform 2 there",
+        "motion of platform 2 at the speed of (16)",
         lambda: -(_NATURAL[0] ** 2) / (_NATURAL[0] ** 2 - _NATURAL[1] ** 2),
         lambda: _quiet()[2],
     ),
@@ -141,9 +141,9 @@ NUMBERS = (
         lambda: _platform_2_again(0),
         _platform_2,
         misprint=Misprint(
-            "n1, h1 of the exciter's platform",
+            "n1, h1 of the platform with the exciter",
             "n2, h2",
-            "steady motion of the machine's equations, supports that differ",
+            "steady motion by the equations of the machine, with unequal supports",
             lambda: _platform_2_again(1),
         ),
     ),

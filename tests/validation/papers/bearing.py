@@ -90,7 +90,7 @@ NUMBERS = (
         _viscous,
         within=5e-5,
         unit="N m s",
-        note="the formula on a swing of a rod of 0.3 kg and 0.5 m, 3 deg at first, integrated with the paper's mu1",
+        note="the formula applied to a simulated swing: a rod of 0.3 kg and 0.5 m, released at 3 deg, mu1 of the paper",
     ),
     _on_rod("before (3)", "J = m l^2/3", lambda: 0.3 * 0.5**2 / 3.0, lambda: float(_ROD.total_inertia), unit="kg m^2"),
     _on_rod(
@@ -132,15 +132,17 @@ NUMBERS = (
     ),
     _number(
         "text on gravity",
-        "gravity's share of the load",
+        "largest change of the radial load by gravity",
         0.5,
         _share_of_gravity,
         within=0.5,
         unit="%",
-        note=f"an upper bound without a speed; at the slowest published jam, {_JAM} rad/s, reached at "
-        f"{math.sqrt(9.81 / (0.005 * _LENGTH)):.1f}",
+        note=f"an upper bound, printed without a speed; computed at the slowest published jam, {_JAM} rad/s; the bound is "
+        f"reached at {math.sqrt(9.81 / (0.005 * _LENGTH)):.1f} rad/s",
     ),
     _measured("scatter of 20 measurements", 2.1, reason="the twenty measurements are not printed"),
-    _measured("error of the instruments", 3.0, reason="neither the rod nor the errors of its mass and its length are printed"),
+    _measured(
+        "error of the instruments", 3.0, reason="neither the data of the rod nor the errors of its mass and length are printed"
+    ),
 )
 """Equations (2), (3), the measured friction and the statements on the radial load."""

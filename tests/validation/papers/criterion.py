@@ -120,7 +120,7 @@ NUMBERS = (
     ),
     _number(
         "(16)",
-        "where balancing begins, with damping",
+        "lowest speed of balancing, with damping",
         1.0,
         lambda: float(characteristic_speeds(_machine(1.0, damping=_H)).damped_resonances[0]),
         within=1e-6,
@@ -130,12 +130,12 @@ NUMBERS = (
     _one("(14)", "X2", lambda: _answer_again().imag, lambda: _answer().imag),
     _one(
         "(10)",
-        "X1 by (4), (10)",
+        "X1 from (4) and (10)",
         lambda: -_answer_again().real,
         lambda: _answer().real,
         misprint=Misprint(
             "s_y = - s sin(q tau)",
-            "+ s sin(q tau), as (11) and (14) have it",
+            "+ s sin(q tau), as in (11) and (14)",
             "receptance of the machine",
             lambda: _answer_again().real,
         ),
@@ -159,7 +159,7 @@ NUMBERS = (
         lambda: math.prod(_two_speeds()) ** 2,
         misprint=Misprint(
             "n1^2 n2^2 + (n1^2 + rho n12^2) n12^2",
-            "n1^2 n2^2 + n12^2 (n1^2 + rho n2^2), as (34) has it",
+            "n1^2 n2^2 + n12^2 (n1^2 + rho n2^2), as in (34)",
             "q1^2 q2^2 q~^2 of the machine",
             lambda: _static()[1] * _static()[0],
         ),

@@ -25,7 +25,7 @@ _STIFFNESS, _POSITION, _LENGTH = (0.604e6, 0.555e6), (0.165, -0.155), 0.08
 VARIANTS = {
     "printed": "c2 = k1 L1 - k2 L2, b as printed",
     "uncoupled": "c2 = 0, b as printed",
-    "uncoupled, both dampers": "c2 = 0, b3 = 21.56 N m s as b1, b2, L1, L2 imply (the printed 10.41 is one support's share)",
+    "uncoupled, both dampers": "c2 = 0, b3 = 21.56 N m s from b1, b2, L1, L2 (the printed 10.41 is that of one support)",
 }
 """Readings of the printed data under which a part of what the paper reports comes out."""
 
@@ -34,7 +34,7 @@ def published_rotor(mu: float = 9.2e-4, variant: str = "printed", *, eccentricit
     """The rotor with four pendulums of the paper, run up at 230 rad/s^2 to 460 rad/s.
 
     **Arguments**: `mu` N m s, of the pendulums' bearings; `variant` one of `VARIANTS`; `eccentricity` m (the printed 25*10^-1
-    is no length; the ripple says about 2.2e-4).
+    is not a length; 2.2e-4 reproduces the ripple).
 
     Source: Artyunin 2013, section IV; the length 0.08 m of the pendulums is printed as "L1=L2=0,8".
     """

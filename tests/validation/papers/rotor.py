@@ -141,7 +141,7 @@ def _least_that_jams() -> float:
 
 
 _READING = f"run-up of 6 s with {VARIANTS[_BOTH]}"
-_ECCENTRICITY = "e = 0.22 mm (the printed 25*10^-1 m^2 is no length; this one makes the ripple of the first jam)"
+_ECCENTRICITY = "e = 0.22 mm (it reproduces the ripple of the first jam; the printed 25*10^-1 m^2 is not a length)"
 
 _number = partial(PrintedNumber, "rotor")
 _speed_number = partial(_number, "section V", unit="rad/s", within=0.05)
@@ -158,7 +158,7 @@ NUMBERS = (
             within=0.005,
             unit="rad/s",
             differs=differs,
-            reason="no reading of the data gives both; nearest: c2 = 0 with four pendulums",
+            reason="no interpretation of the data gives both; the closest one is c2 = 0 with four pendulums",
         )
         for k, differs in ((0, 176.51), (1, 272.81))
     ),
@@ -170,11 +170,11 @@ NUMBERS = (
         _tilt_damping,
         within=5e-3,
         unit="N m s",
-        note="10.41 is the share of one damper with L1 and L2 exchanged",
+        note="10.41 is the contribution of one damper with L1 and L2 exchanged",
         misprint=Misprint(
             "10.41 N m s",
             "21.56 N m s",
-            "damping matrix of the two dampers that b1 and b2 ask for",
+            "damping matrix of the two dampers that b1 and b2 imply",
             _DAMPER_1 * _L1**2 + _DAMPER_2 * _L2**2,
         ),
     ),
@@ -185,32 +185,32 @@ NUMBERS = (
         reason="with the printed c2 = 13635 N no first jam is stable at 9.2e-4 N m s",
     ),
     _friction_number(
-        "friction that holds 169.6 rad/s",
+        "friction with the first jam at 169.6 rad/s",
         7.5e-4,
         lambda: _holding(_first_jams(), _FIRST, 169.6),
         within=2.5e-4,
-        note="the printed window, 0.5e-3 to 1.0e-3, is its middle and bound; c2 = 0",
+        note="value and bound are the middle and the half-width of the printed window, 0.5e-3 to 1.0e-3; c2 = 0",
     ),
     _friction_number(
-        "friction above which the first jam is gone",
+        "friction above which the first jam does not exist",
         1.0e-3,
         _last_stable,
         within=5e-5,
         differs=9.292e-4,
-        reason="c2 = 0; the pendulums part from each other at less, by 7 %",
+        reason="c2 = 0; the pendulums separate already at a friction that is 7 % lower",
     ),
     _number(
         "section IV",
-        "pendulum's length",
+        "length of a pendulum",
         0.8,
         _length,
         within=_HALF_WINDOW,
         unit="m",
-        note="the bound is half of the range of lengths with which the printed window of friction holds 169.6 rad/s",
-        misprint=Misprint("0.8 m", "0.08 m", "the friction that holds the printed jam", 0.08),
+        note="the bound is half of the range of lengths with a jam at 169.6 rad/s in the printed window of friction",
+        misprint=Misprint("0.8 m", "0.08 m", "friction at which the printed jam exists", 0.08),
     ),
     _friction_number(
-        "friction that holds 271.1 rad/s",
+        "friction with the second jam at 271.1 rad/s",
         1.75e-2,
         lambda: _holding(_second_jams(), _SECOND, 271.1),
         within=2.5e-3,
@@ -218,17 +218,17 @@ NUMBERS = (
         reason="the printed window is 1.5e-2 to 2.0e-2; data as printed",
     ),
     _speed_number(
-        quantity="second jam in the middle of its window",
+        quantity="second jam at the middle of the printed friction window",
         printed=271.1,
         computed=_second_in_the_middle,
         differs=276.88,
-        reason="at 1.75e-2 N m s, data as printed; the printed speed needs less friction",
+        reason="at 1.75e-2 N m s, data as printed; the printed speed requires a smaller friction",
     ),
     _speed_number(
         quantity="first jam",
         printed=169.6,
         computed=lambda: _speed(_FIRST),
-        note=f"mu = {_FIRST:g}, inside the printed window; {_READING}",
+        note=f"mu = {_FIRST:g} N m s, inside the printed window; {_READING}",
     ),
     _speed_number(
         quantity="ripple of the first jam", printed=3.1, computed=lambda: _ripple(_FIRST), note=f"{_READING}; {_ECCENTRICITY}"
@@ -237,7 +237,7 @@ NUMBERS = (
         quantity="second jam",
         printed=271.1,
         computed=lambda: _speed(_SECOND),
-        note=f"mu = {_SECOND:g}, chosen for it, outside the printed window; {_READING}",
+        note=f"mu = {_SECOND:g} N m s, chosen to give this speed, outside the printed window; {_READING}",
     ),
     _speed_number(
         quantity="ripple of the second jam",
@@ -252,32 +252,32 @@ NUMBERS = (
         _least_that_jams,
         within=5e-5,
         differs=8.5304e-5,
-        reason="m g l/Omega: less cannot carry a pendulum over the top; 5e-5 swings, 3e-4 is jammed",
+        reason="m g l/Omega: less friction cannot carry a pendulum over the top; at 5e-5 they swing, at 3e-4 they are jammed",
     ),
     _friction_number(
-        "least friction that balances",
+        "lowest friction at which the pendulums balance the rotor",
         2.0e-2,
         lambda: min(_ended("balanced")),
         within=5e-4,
         differs=1.75e-2,
-        reason=f"of the frictions tried ({', '.join(f'{mu:g}' for mu in _TRIED)}); {_READING}",
+        reason=f"lowest of the computed values ({', '.join(f'{mu:g}' for mu in _TRIED)}); {_READING}",
     ),
     _friction_number(
-        "friction above which nothing balances",
+        "friction above which they do not balance it",
         4.0e-2,
         lambda: min(_ended("unbalanced"), default=math.nan),
         within=5e-4,
-        reason=f"5e-2 balances within 6 s: the paper looked earlier, or at another data set; {_READING}",
+        reason=f"at 5e-2 they balance it within 6 s; the paper may have evaluated an earlier time or other data; {_READING}",
     ),
     *(
-        _measured(name, speed, reason="a measurement; the friction of the bearings on the stand is not printed")
-        for name, speed in (("first jam on the stand", 165.5), ("second jam on the stand", 251.2))
+        _measured(name, speed, reason="a measurement; the friction of the bearings on the test rig is not printed")
+        for name, speed in (("first jam on the test rig", 165.5), ("second jam on the test rig", 251.2))
     ),
     _measured(
         "inertia below which pendulums balanced",
         0.3060,
         unit="kg cm^2",
-        reason="a measurement; the pendulum's moment of inertia is printed in kg m^2 and kg cm^2 and with a digit less in turn",
+        reason="a measurement; the moment of inertia of a pendulum is printed in kg m^2 and kg cm^2, with different digits",
     ),
 )
 """The data of section IV, critical speeds, jams and limits of friction of section V, measured speeds of section III."""

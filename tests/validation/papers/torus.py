@@ -127,15 +127,20 @@ def _least_speed(k: int) -> float:
     return float(found.paper[k] + found.difference[0, k])
 
 
-_TOO_SLOW = "not captured from the printed speed in so few turns"
-_MOVING = "chaotic: the border moves when the steps are doubled"
+_TOO_SLOW = "not captured from the printed speed within 2000 turns"
+_MOVING = "chaotic: the boundary of captures changes when the number of steps is doubled"
 
 _CHAOTIC = {
     (0.1, 0.005, 4e-5, 3.5): _MOVING,
     (0.1, 0.005, 4e-5, 5.1): _MOVING,
     (0.145, 0.005, 4e-5, 2.7): _MOVING,
     (0.1, 0.003, 4e-5, 2.9): _MOVING,
-    (0.1, 0.010, 4e-5, 5.1): "chaotic: lone failures among captures reach up to -0.87, at other speeds with other steps",
+    (
+        0.1,
+        0.010,
+        4e-5,
+        5.1,
+    ): "chaotic: single failures among captures up to -0.87, at other speeds with another number of steps",
 }
 """Damping, stiffness, friction and gap of entries whose computed speed is not certain, and the reason."""
 
@@ -155,11 +160,11 @@ def _speeds() -> list[PrintedNumber]:
 def _speed(k: int, row: PublishedRow, gap: float, speed: float) -> PrintedNumber:
     where = (row.damping, row.stiffness, row.friction, gap)
     n, p, friction = row.damping, row.stiffness, 1e5 * row.friction
-    borders = "the paper's one number may be any border between captures and failures that alternate near the rotor's speed"
+    borders = "captures and failures alternate; the printed number may be any boundary between them"
     return PrintedNumber(
         "torus",
         f"table {1 if p == 0.005 else 2}, n = {n:g}, p = {p:g}, k = {friction:g}e-5 m",
-        f"least initial speed, gap {gap:g}",
+        f"lowest initial speed, gap {gap:g} mm",
         speed,
         lambda: _least_speed(k),
         within=0.04 if p == 0.010 else 0.08,
@@ -171,7 +176,7 @@ def _speed(k: int, row: PublishedRow, gap: float, speed: float) -> PrintedNumber
     )
 
 
-_formula = partial(PrintedNumber, "torus", note="two balls, gap 2.5, psi = 0.4, a = 0.3")
+_formula = partial(PrintedNumber, "torus", note="two balls, gap 2.5 mm, psi = 0.4, a = 0.3")
 
 NUMBERS = (
     _formula(
@@ -181,11 +186,11 @@ NUMBERS = (
         _angle_of_touching_balls,
         within=1e-9,
         unit="rad",
-        misprint=Misprint("2 arctan(r/R)", "2 arcsin(r/R)", "balls set side by side", lambda: 2.0 * _half_angle(math.asin)),
+        misprint=Misprint("2 arctan(r/R)", "2 arcsin(r/R)", "balls placed side by side", lambda: 2.0 * _half_angle(math.asin)),
     ),
     _formula(
         "(8), (9), last terms",
-        "unbalance in the climb of ball 1",
+        "unbalance in the equation of a of ball 1",
         lambda: _pull(printed_torus),
         _own_pull,
         within=1e-6,
@@ -196,15 +201,15 @@ NUMBERS = (
     ),
     _formula(
         "(8), (9), friction",
-        "friction in the climb per normal force",
+        "friction in the equation of a, per normal force",
         lambda: _braking(printed_torus),
         _own_braking,
         within=6.0,
         unit="1/m",
-        note="the bound is 2 %: the rotor answers to the friction too",
+        note="the bound is 2 %, because the rotor responds to the friction too",
         misprint=Misprint(
-            "lever R1 (with which the tables come out nearer)",
-            "lever R1 - r",
+            "lever arm R1 (it reproduces the tables more closely)",
+            "lever arm R1 - r",
             "the same equations, with and without rolling friction",
             lambda: _braking(gap_torus),
         ),
@@ -217,8 +222,8 @@ NUMBERS = (
         within=1e-6,
         unit="N",
         misprint=Misprint(
-            "R, rotor's acceleration left out",
-            "R + (R1 - r) sin a, with it",
+            "R, without the acceleration of the rotor",
+            "R + (R1 - r) sin a, with the acceleration of the rotor",
             "constraint force of the same equations",
             _force_corrected,
         ),
