@@ -201,10 +201,7 @@ class Run(AbstractMeasured, PointAnswers, Result):
         from jaxvib.draw.motion.histories import time_histories  # slow import
 
         structure = self.scene.machine.structure()
-        whole, end = (
-            [np.asarray(x) for x in (t.time, t.state.displacement, t.state.azimuth_rate, t.rotor_speed, t.foundation_force)]
-            for t in (self.window if self.trajectory is None else self.trajectory, self.window)
-        )
+        whole, end = map(_histories, (self.window if self.trajectory is None else self.trajectory, self.window))
         named = dict(names=structure.coordinates, units=structure.units, directions=structure.foundation_directions)
         return time_histories(whole, end, **named, unit=unit, ax=ax)
 
@@ -270,6 +267,14 @@ class Run(AbstractMeasured, PointAnswers, Result):
             named = {f"axis at {1e3 * s:+.4g} mm": machine.rows_at(jnp.asarray(s)) for s in stations}
         paths = {name: tuple((moved @ np.asarray(rows).T).T) for name, rows in named.items()}
         return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)
+
+
+def _histories(kept: Trajectory) -> list[np.ndarray]:
+    """Return time, displacements, speeds of all loads and of all rotors, and forces."""
+    loads = [np.asarray(own.rate[0]) for own in kept.state.exciters if own.rate]
+    rotors = np.stack([np.asarray(speed) for speed in kept.rotor_speeds], axis=1)
+    speeds = np.concatenate(loads, axis=1) if loads else np.zeros((rotors.shape[0], 0))
+    return [np.asarray(kept.time), np.asarray(kept.state.displacement), speeds, rotors, np.asarray(kept.foundation_force)]
 
 
 def _require_turns(time: np.ndarray, speed: float) -> None:

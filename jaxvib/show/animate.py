@@ -21,7 +21,6 @@ from jaxvib.motion.run import Run
 from jaxvib.show.motion import Stretch, of_orbit, of_run
 from jaxvib.show.sketch import checked_scene, fit
 from jaxvib.show.views import view_of
-from jaxvib.show.wheel import Pose
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.units import Number, number
 
@@ -147,7 +146,8 @@ def _fastest(motion: Run | Orbit, scene: Scene) -> float:
     """Return the highest speed of rotor and loads, rad/s."""
     if isinstance(motion, Run):
         kept = motion.window
-        return float(max(np.max(np.abs(kept.rotor_speed)), np.max(np.abs(kept.state.azimuth_rate)), 1e-300))
+        speeds = [*kept.rotor_speeds, *(own.rate[0] for own in kept.state.exciters if own.rate)]
+        return max(float(np.max(np.abs(each), initial=1e-300)) for each in speeds)
     return float(max(motion.rotor_speed, motion.omega)) if np.isfinite(motion.rotor_speed) else float(scene.drive.speed)
 
 
@@ -165,16 +165,13 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     fit(stage, view)
     given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
     chosen = view.magnified(shown.displacement) if given is None else given
-    reach = chosen * view.wheel.scale
-    farthest = float(np.max(np.abs(shown.displacement), initial=0.0)) * view.wheel.scale
+    reach = chosen * view.scale
+    farthest = float(np.max(np.abs(shown.displacement), initial=0.0)) * view.scale
     if chosen * farthest > (most_seen := _PICTURES_AWAY * (top - bottom)):
         raise InputError(
             "magnify", f"is {chosen:g}, which moves the machine out of the figure; at most {most_seen / farthest:.3g}"
         )
-    poses = [
-        Pose(shown.displacement[k], shown.velocity[k], tuple(u[k] for u in shown.angle), float(shown.turn[k]))
-        for k in range(shown.time.size)
-    ]
+    poses = list(map(shown.pose, range(shown.time.size)))
     forces = np.array([view.support_forces(pose) for pose in poses])
     most = max(float(np.max(np.abs(forces), initial=0.0)), float(np.max(np.abs(shown.force))), 1e-300)
     per_newton = 0.7 / most

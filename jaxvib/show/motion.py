@@ -12,6 +12,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.run import Run
+from jaxvib.show.wheel import Pose, RotorPose
 from jaxvib.steady.orbits.describe import Orbit
 
 _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
@@ -21,16 +22,19 @@ _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
 class Stretch(NamedTuple):
     """Motion at some times.
 
-    **Attributes**: `time` (nt,) s; `displacement`, `velocity` (nt, nd); `angle`, the loads' coordinates, (nt, count) each;
-    `turn`, the angle of the rotor, (nt,) rad; `force` on the foundation, (nt, nb) N.
+    **Attributes**: `time` (nt,) s; `displacement`, `velocity` (nt, nd); `rotors`, a `RotorPose` for each exciter, whose arrays
+    have a leading axis over the times; `force` on the foundation, (nt, nb) N.
     """
 
     time: np.ndarray
     displacement: np.ndarray
     velocity: np.ndarray
-    angle: tuple[np.ndarray, ...]
-    turn: np.ndarray
+    rotors: tuple[RotorPose, ...]
     force: np.ndarray
+
+    def pose(self, k: int) -> Pose:
+        """Return the pose at time `k`."""
+        return Pose(self.displacement[k], self.velocity[k], jax.tree.map(lambda x: x[k], self.rotors))
 
 
 def of_run(run: Run, time: np.ndarray) -> Stretch:
@@ -45,7 +49,9 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
     h = t[k + 1] - t[k]
     share = (time - t[k]) / h
     state = kept.state
-    rate = np.max(np.abs(np.asarray(state.azimuth_rate)[np.unique(np.concatenate([k, k + 1]))]), initial=0.0)
+    near = np.unique(np.concatenate([k, k + 1]))
+    speeds = [own.rate[0] if own.rate else rotor for own, rotor in zip(state.exciters, kept.rotor_speeds, strict=True)]
+    rate = max(float(np.max(np.abs(np.asarray(each)[near]), initial=0.0)) for each in speeds)
     if rate * np.max(h) > _MAX_ANGLE_BETWEEN_SAMPLES:
         most = int(np.ceil(t.size * rate * np.max(h) / _MAX_ANGLE_BETWEEN_SAMPLES))
         problem = f"has {t.size} samples, between which loads turn by up to {rate * np.max(h):.3g} rad"
@@ -61,13 +67,15 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
         return [np.asarray(leaf, float) for leaf in jax.tree.leaves(parts)]
 
     q, v = np.asarray(state.displacement, float), np.asarray(state.velocity, float)
-    angle = [cubic(_whole(u, w, t), w) for u, w in zip(arrays(state.angle), arrays(state.rate), strict=True)]
-    speed = np.asarray(kept.rotor_speed, float)
-    turn = cubic(_whole(np.asarray(kept.rotor_angle, float), speed, t), speed)
+    rotors = []
+    for own, *rotor in zip(state.exciters, kept.rotor_angles, kept.rotor_speeds, strict=True):
+        angle = [cubic(_whole(u, w, t), w) for u, w in zip(arrays(own.angle), arrays(own.rate), strict=True)]
+        turn, speed = arrays(rotor)
+        rotors.append(RotorPose(tuple(angle), cubic(_whole(turn, speed, t), speed)))
     force = np.asarray(kept.foundation_force, float)
     between = (1.0 - share)[:, None] * force[k] + share[:, None] * force[k + 1]
     velocity = (1.0 - share)[:, None] * v[k] + share[:, None] * v[k + 1]
-    return Stretch(time, cubic(q, v), velocity, tuple(angle), turn, between)
+    return Stretch(time, cubic(q, v), velocity, tuple(rotors), between)
 
 
 def _kept(run: Run, time: np.ndarray) -> Trajectory:
@@ -105,4 +113,5 @@ def of_orbit(orbit: Orbit, scene: Scene, time: np.ndarray) -> Stretch:
     q, v, (phi,), _ = jax.vmap(orbit.at)(jnp.asarray(theta))
     wave = np.exp(1j * np.asarray(orbit.orders)[:, None] * theta)
     force = np.real(np.asarray(orbit.force_harmonics) @ wave).T
-    return Stretch(time, np.asarray(q), np.asarray(v), (np.asarray(phi),), float(orbit.rotor_speed) * time, force)
+    rotor = RotorPose((np.asarray(phi),), float(orbit.rotor_speed) * time)
+    return Stretch(time, np.asarray(q), np.asarray(v), (rotor,), force)

@@ -9,7 +9,7 @@ from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.sketch import checked_scene
 from jaxvib.show.views import view_of
-from jaxvib.show.wheel import Pose, at_rest, caption, places_of
+from jaxvib.show.wheel import Pose, RotorPose, at_rest, caption, places_of
 from jaxvib.steady.jams.jam import Jam
 
 _FRAMES = 20
@@ -47,14 +47,14 @@ def moving(scene: Scene, jam: Jam) -> str:
     angles = theta[:, None] + np.zeros_like(first)
     own = places_of(scene.loads, (angles, *others))  # one call for all poses
     poses = [
-        Pose(q, v, (angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in own])
+        Pose(q, v, (RotorPose((angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in own]),))
         for k, (q, v, angle) in enumerate(zip(displacement, velocity, angles, strict=True))
     ]
     forces = [view.support_forces(pose) for pose in poses]
     totals = [np.array([force[:, 1].sum()]) for force in forces]
     most = max(float(np.max(np.abs(np.concatenate([np.ravel(x) for x in (*forces, *totals)])))), 1e-300)
     magnified = view.magnified(displacement)
-    reach = magnified * view.wheel.scale
+    reach = magnified * view.scale
     frames = [[*view.parts(p, reach), *view.arrows(p, total, 0.7 / most)] for p, total in zip(poses, totals, strict=True)]
     slower = _SECONDS * omega / (2.0 * np.pi)
     head = (

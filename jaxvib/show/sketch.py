@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.boundary import validated
+from jaxvib.draw.machine.deck import ellipses, magnification
 from jaxvib.draw.machine.parts import put
-from jaxvib.draw.style import Drawn, panels
+from jaxvib.draw.style import COLORS, Drawn, panels
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
-from jaxvib.show.views import View, view_of
+from jaxvib.show.view import View
+from jaxvib.show.views import view_of
 from jaxvib.show.wheel import at_rest, caption
+from jaxvib.steady.points import Deck
 from jaxvib.units.known import require_known
 
 _INCH = 0.62
@@ -18,17 +22,24 @@ _INCH = 0.62
 
 
 @validated
-def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
+def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) -> Drawn:
     """Draw a scene at rest: its masses, springs, dampers, rotor and loads, with their values and units.
 
     Platforms are drawn above each other, numbered from the foundation upward. A rotor is drawn along its axis, a rotor with
     tilt also from the side. Loads are spread over their circle so that each is visible. Only the loads and their circle are to
-    scale.
+    scale. A body in a plane is drawn to scale about the points to which something is attached, with its springs in their
+    directions.
 
-    **Arguments**: `scene`, of any machine; `ax`: axes to draw onto.
+    **Arguments**
 
-    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an argument that is not a scene, or a scene
-    with traced numbers (within `jit` or `grad`).
+    - `scene`, of any machine
+    - `deck`: the motion of points of a body in a plane, from `Run.deck`; their ellipses are drawn, magnified
+    - `ax`: axes to draw onto
+
+    **Returns** a matplotlib figure, or the given `ax`.
+
+    **Raises** `InputError` for an argument that is not a scene, a scene with traced numbers (within `jit` or `grad`), or a
+    `deck` on a machine without points (x, y).
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -45,8 +56,23 @@ def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
         put(axis, part)
     for text in view.texts(pose, 0.0):
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
+    if deck is not None:
+        _draw_deck(axis, view, deck)
     axis.set_title(caption(scene), loc="left", fontsize="small", y=1.0)  # a fixed y is faster than automatic placement
     return figure if ax is None else ax
+
+
+def _draw_deck(axis: Axes, view: View, deck: Deck) -> None:
+    if view.scene.machine.places != "plane":
+        raise InputError("deck", f"needs a body in a plane, not a machine of kind {quoted(view.scene.machine.kind)}")
+    points, amplitude = np.asarray(deck.points), np.asarray(deck.amplitude)
+    magnify = magnification(points, amplitude)
+    for path in ellipses(points, amplitude, magnify):
+        axis.plot(*(view.scale * path).T, color=COLORS[1], lw=1.4, zorder=4.0)
+        axis.plot(*(view.scale * path[0]), "o", color=COLORS[1], ms=3.5, zorder=4.0)
+    _, right, bottom, _ = view.limits
+    note = f"ellipses drawn {magnify:g} x as large"
+    axis.text(right, bottom, note, ha="right", va="bottom", fontsize="x-small", color="#555555")
 
 
 def checked_scene(scene: object) -> Scene:

@@ -2,117 +2,27 @@
 
 from __future__ import annotations
 
-import abc
 import functools
 
 import numpy as np
 
-from jaxvib.draw.machine.parts import Part, Text, arrow, box, circle, damper, ground, spring
+from jaxvib.draw.machine.parts import Part, Text, box, circle, ground
 from jaxvib.draw.style import COLORS, GUIDE, Look
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.layout import Tie, lanes
-from jaxvib.show.wheel import Pose, Wheel, places_of, shown
-
-__all__ = ["View", "view_of"]
-
-_INK: Look = {"color": "#333333", "lw": 1.2, "zorder": 2.0}
-_BED: Look = {"color": "black", "lw": 1.4, "zorder": 1.0}
-_BODY: Look = {"fc": "#c9d7e8", "ec": "black", "lw": 1.3, "zorder": 2.5}
-_FORCE: Look = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
+from jaxvib.show.plane import PlaneView
+from jaxvib.show.view import BED, BODY, RotorView, View, spring_text, tie_parts
+from jaxvib.show.wheel import Pose, places_of, shown
 
 
-def _tie(
-    start: tuple[float, float], end: tuple[float, float], stiffness: float, damping: float, length: float = 1.5
-) -> list[Part]:
-    """Return a spring and a damper side by side; one whose value is 0 is omitted. `length` is their length at rest."""
-    both = stiffness > 0.0 and damping > 0.0
-    off = 0.17 if both else 0.0
-    side = np.array([start[1] - end[1], end[0] - start[0]]) / max(np.hypot(end[0] - start[0], end[1] - start[1]), 1e-9)
-    a, b = np.asarray(start), np.asarray(end)
-    found = []
-    if stiffness > 0.0:
-        found.append(Part(spring(tuple(a + off * side), tuple(b + off * side), coils=round(4.0 * length)), _INK))
-    if damping > 0.0:
-        found.append(Part(damper(tuple(a - off * side), tuple(b - off * side), 0.24, 0.6 / length), _INK))
-    return found
-
-
-def _spring_text(stiffness: float, damping: float) -> str:
-    """Return the values of a spring and a damper, one line for each."""
-    return "\n".join([shown(stiffness, "N/m")] * (stiffness > 0.0) + [shown(damping, "N s/m")] * (damping > 0.0))
-
-
-class View(abc.ABC):
-    """Drawing of a scene in its own units of length.
-
-    **Attributes**: `limits` (left, right, bottom, top) of the drawing; `wheel`, the rotor with the loads.
-    """
-
-    limits: tuple[float, float, float, float]
-    wheel: Wheel
-
-    def __init__(self, scene: Scene):
-        carrier = scene.machine.carrier()
-        self.scene, self.mount = scene, scene.mount()
-        self.mass, self.stiffness, self.damping = (
-            np.asarray(x, float) for x in (carrier.mass, carrier.stiffness, carrier.damping)
-        )
-        self.foundation_stiffness, self.foundation_damping = (
-            np.asarray(x, float) for x in (carrier.foundation_stiffness, carrier.foundation_damping)
-        )
-
-    @abc.abstractmethod
-    def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """Return the drawn parts, the same parts in the same order for every pose.
-
-        `reach` is the number of units of the drawing per metre of displacement.
-        """
-
-    def magnified(self, displacement: np.ndarray) -> float:
-        """Return the magnification of displacements (nt, nd), relative to the circle of the loads, at which the largest one is
-        clearly visible; one digit. The argument `reach` of `parts` is this factor times `wheel.scale`."""
-        length = [k for k, unit in enumerate(self.scene.machine.structure().units) if unit == "m"]
-        largest = float(np.max(np.abs(displacement[:, length]), initial=1e-300))
-        return float(f"{0.3 / largest / self.wheel.scale:.1g}")
-
-    @abc.abstractmethod
-    def texts(self, pose: Pose, reach: float) -> list[Text]:
-        """Return the names and values of the parts; the arguments are those of `parts`."""
-
-    @abc.abstractmethod
-    def supports(self) -> list[tuple[float, float]]:
-        """Return the positions of the supports on the foundation."""
-
-    @abc.abstractmethod
-    def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return the force of each support on the foundation, (supports, 2) N, across and up.
-
-        Supports that are effects are not included.
-        """
-
-    def arrows(self, pose: Pose, total: np.ndarray, per_newton: float) -> list[Part]:
-        """Return arrows of the forces on the foundation.
-
-        The force of each support is drawn at the support, the `total` (nb,) N in black beside the machine.
-        """
-        whole = (0.0, float(total[0])) if total.size == 1 else (float(total[0]), float(total[1]))
-        found = [
-            Part(arrow((x, y), (per_newton * fx, per_newton * fy)), _FORCE, True)
-            for (x, y), (fx, fy) in zip(self.supports(), self.support_forces(pose), strict=True)
-        ]
-        _, right, bottom, top = self.limits
-        at = (right - 0.8, bottom + 0.5 * (top - bottom))
-        return [*found, Part(arrow(at, (per_newton * whole[0], per_newton * whole[1]), 0.16), {**_FORCE, "fc": "black"}, True)]
-
-
-class PlatformView(View):
+class PlatformView(RotorView):
     """Platforms above each other, numbered from the foundation upward, with each spring in a separate lane."""
 
     pitch, thick, lane = 1.9, 0.34, 2.0
 
     def __init__(self, scene: Scene):
-        super().__init__(scene)
+        super().__init__(scene, 0.6)
         n = self.mass.shape[0]
         self.rows = [np.asarray(scene.machine.rows_at(level))[0] for level in range(1, n + 1)]
         self.exciter = int(np.argmax(self.rows @ np.asarray(self.mount.rows[0])[0])) + 1
@@ -123,7 +33,6 @@ class PlatformView(View):
             Tie(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j])) for j in range(n) for i in range(j)
         ]
         self.ties = [tie for tie in self.ties if tie.stiffness > 0.0 or tie.damping > 0.0] + [Tie(self.exciter, self.exciter)]
-        self.wheel = Wheel(scene, 0.6)
         order = lanes(self.ties, n)
         widths = [2.0 * self.wheel.rim + 0.2 if self.ties[k].exciter else self.lane for k in order]
         starts = np.concatenate([[0.0], np.cumsum(widths)])
@@ -140,18 +49,18 @@ class PlatformView(View):
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation, the springs and dampers, the platforms, the exciter."""
-        found = [Part(ground((-0.2, 0.0), (self.width, 0.0)), _BED)]
+        found = [Part(ground((-0.2, 0.0), (self.width, 0.0)), BED)]
         for k, tie in enumerate(self.ties):
             if not tie.exciter:
                 low, high = (self._height(level, pose, reach) for level in (tie.low, tie.high))
                 low += 0.5 * self.thick if tie.low else 0.0
                 length = (tie.high - tie.low) * self.pitch - self.thick
                 ends = (self.x[k], low), (self.x[k], high - 0.5 * self.thick)
-                found += _tie(*ends, tie.stiffness, tie.damping, length)
+                found += tie_parts(*ends, tie.stiffness, tie.damping, length)
         for level, (left, right) in enumerate(self.spans, start=1):
             y = self._height(level, pose, reach)
-            found.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), _BODY, True))
-        return found + self.wheel.parts((self.x[len(self.ties) - 1], self._height(self.exciter, pose, reach)), pose)
+            found.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), BODY, True))
+        return found + self.wheel.parts((self.x[len(self.ties) - 1], self._height(self.exciter, pose, reach)), pose.rotors[0])
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return the masses on the platforms and the values beside the springs."""
@@ -160,7 +69,7 @@ class PlatformView(View):
             if not tie.exciter:
                 middle = 0.5 * self.pitch * (tie.low + tie.high if tie.high - tie.low == 1 else 2 * tie.high - 1)
                 place = (self.x[k] + 0.42, middle)
-                found.append(Text(*place, _spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
+                found.append(Text(*place, spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
         for level, (left, right) in enumerate(self.spans, start=1):
             # The text is on the longer piece of the platform beside the exciter.
             x = self.x[len(self.ties) - 1]
@@ -181,16 +90,16 @@ class PlatformView(View):
         return np.array([[0.0, force[tie.high - 1]] for tie in self.ties if tie.low == 0])
 
 
-class FrontView(View):
+class FrontView(RotorView):
     """Rotor seen along its axis, on a spring and a damper in each direction.
 
     For loads that move along the axis, the section of their track is drawn too.
     """
 
     def __init__(self, scene: Scene):
-        super().__init__(scene)
-        self.wheel = Wheel(scene, 1.0)
-        self.section = len(scene.loads.position(*scene.loads.rest())) > 2
+        super().__init__(scene, 1.0)
+        loads = scene.exciter.loads
+        self.section = loads is not None and len(loads.position(*loads.rest())) > 2
         self.limits = (-3.2, 5.5 if self.section else 3.6, -3.2, 1.8)
 
     def _centre(self, pose: Pose, reach: float) -> tuple[float, float]:
@@ -202,10 +111,10 @@ class FrontView(View):
         x, y = self._centre(pose, reach)
         k, c = self.foundation_stiffness[1], self.foundation_damping[1]
         stiffness, damping = float(np.max(k)), float(np.max(c))
-        found = [Part(ground((-1.2, -2.4), (1.6, -2.4)), _BED), Part(ground((-2.7, 1.2), (-2.7, -1.6)), _BED)]
-        found += _tie((x, -2.4), (x, y - self.wheel.rim), stiffness, damping)
-        found += _tie((-2.7, y), (x - self.wheel.rim, y), stiffness, damping)
-        found += self.wheel.parts((x, y), pose)
+        found = [Part(ground((-1.2, -2.4), (1.6, -2.4)), BED), Part(ground((-2.7, 1.2), (-2.7, -1.6)), BED)]
+        found += tie_parts((x, -2.4), (x, y - self.wheel.rim), stiffness, damping)
+        found += tie_parts((-2.7, y), (x - self.wheel.rim, y), stiffness, damping)
+        found += self.wheel.parts((x, y), pose.rotors[0])
         return found + (self._section(pose) if self.section else [])
 
     def _section(self, pose: Pose) -> list[Part]:
@@ -224,7 +133,7 @@ class FrontView(View):
         found.append(
             Part(centre + scale * np.stack([away - middle, along], 1), {"color": GUIDE, "ls": ":", "lw": 0.8, "zorder": 3.1})
         )
-        across, up, along = (np.broadcast_to(x, (loads.count,)) for x in places_of(loads, pose.angle))
+        across, up, along = (np.broadcast_to(x, (loads.count,)) for x in places_of(loads, pose.rotors[0].angle))
         for j in range(loads.count):
             place = centre + scale * np.array([np.hypot(across[j], up[j]) - middle, along[j]])
             look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "alpha": 0.75, "lw": 0.8, "zorder": 3.5}
@@ -233,7 +142,7 @@ class FrontView(View):
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return the mass, and the values of the supports, which are equal in both directions."""
-        label = _spring_text(float(np.max(self.foundation_stiffness[1])), float(np.max(self.foundation_damping[1])))
+        label = spring_text(float(np.max(self.foundation_stiffness[1])), float(np.max(self.foundation_damping[1])))
         small: Look = {"fontsize": "small"}
         mass = f"M = {shown(float(self.mass[0, 0]), 'kg')}"
         found = [
@@ -255,51 +164,51 @@ class FrontView(View):
         return np.array([[0.0, force[1]], [force[0], 0.0]])
 
 
-class ShaftView(View):
+class ShaftView(RotorView):
     """Rotor with tilt: the shaft from the side, with distances from the centre of mass, and on the right along the axis."""
 
     def __init__(self, scene: Scene):
-        super().__init__(scene)
+        super().__init__(scene, 0.8)
         self.stands = scene.machine.shaft_supports() or []
         self._rows = functools.cache(lambda s: np.asarray(scene.machine.rows_at(s)))
-        self.stations = np.asarray(self.mount.distances(scene.loads.count), float)
+        loads = scene.exciter.loads
+        self.stations = np.asarray(self.mount.distances(1 if loads is None else loads.count), float)
         all_places = [0.0, *self.stations, *(s for s, _, _ in self.stands)]
         low, high = min(all_places), max(all_places)
         half = 0.5 * (high - low) or 0.1
-        self.middle, self.scale = 0.5 * (low + high), 2.6 / half
-        self.wheel = Wheel(scene, 0.8)
+        self.middle, self.along = 0.5 * (low + high), 2.6 / half
         self.front = 5.0
         self.limits = (-3.5, self.front + 2.6, -3.0, 1.75)
 
     def _x(self, s: float) -> float:
-        return self.scale * (s - self.middle)
+        return self.along * (s - self.middle)
 
     def _y(self, s: float, pose: Pose, reach: float, axis: int = 1) -> float:
         return reach * float(self._rows(float(s))[axis] @ pose.displacement)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return foundation, supports, shaft and body, a disc with loads at each station, and the rotor along its axis."""
-        found = [Part(ground((-3.2, -2.2), (3.2, -2.2)), _BED)]
+        found = [Part(ground((-3.2, -2.2), (3.2, -2.2)), BED)]
         for s, k, c in self.stands:
-            found += _tie((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
-        ends = [self.middle - 3.1 / self.scale, self.middle + 3.1 / self.scale]
+            found += tie_parts((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
+        ends = [self.middle - 3.1 / self.along, self.middle + 3.1 / self.along]
         line = np.array([[self._x(s), self._y(s, pose, reach)] for s in ends])
         found.append(Part(line, {"color": "black", "lw": 3.5, "zorder": 2.6, "solid_capstyle": "round"}))
-        body = [-0.9 / self.scale, 0.9 / self.scale]
+        body = [-0.9 / self.along, 0.9 / self.along]
         corners = [(s, side) for s, side in ((body[0], -1), (body[1], -1), (body[1], 1), (body[0], 1))]
         points = np.array([[self._x(s), self._y(s, pose, reach) + 0.38 * side] for s, side in corners])
-        found.append(Part(points, _BODY, True))
-        up = self.wheel.places(pose)[1]
+        found.append(Part(points, BODY, True))
         for s in np.unique(self.stations):
             x, y = self._x(s), self._y(s, pose, reach)
             disc = box(x - 0.09, x + 0.09, y - self.wheel.rim, y + self.wheel.rim)
             found.append(Part(disc, {"fc": "#f4f4f4", "ec": "black", "lw": 1.2, "zorder": 3.0}, True))
-        for j, s in enumerate(self.stations):
+        up = [] if self.wheel.loads is None else self.wheel.places(pose.rotors[0])[1]
+        for j, (s, _) in enumerate(zip(self.stations, up, strict=False)):
             place = (self._x(s), self._y(s, pose, reach) + float(up[j]))
             look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "lw": 0.8, "zorder": 3.4 + 0.01 * j}
             found.append(Part(circle(place, self.wheel.size, 31), look, True))
         centre = (self.front + self._y(0.0, pose, reach, 0), self._y(0.0, pose, reach))
-        return found + self.wheel.parts(centre, pose)
+        return found + self.wheel.parts(centre, pose.rotors[0])
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return mass, inertias and supports, and the positions of supports and stations from the centre of mass."""
@@ -310,7 +219,7 @@ class ShaftView(View):
             inertia += f"\nC = {shown(float(np.max(np.abs(np.asarray(turning)))), 'kg m²')}"
         found = [Text(self._x(0.0), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
         for s, k, c in self.stands:
-            text = f"{_spring_text(k, c)}\nat {1e3 * s:+.4g} mm"
+            text = f"{spring_text(k, c)}\nat {1e3 * s:+.4g} mm"
             right = s >= 0.0
             place = self._x(s) + (0.42 if right else -0.42)
             found.append(Text(place, -1.55, text, {**small, "va": "center", "ha": "left" if right else "right"}))
@@ -338,9 +247,11 @@ class ShaftView(View):
 def view_of(scene: Scene) -> View:
     """Return the drawing of a scene, chosen by the kind of places of its machine."""
     machine = scene.machine
-    if machine.places == "plane" or (machine.places == "point" and machine.mounting().axes != (0, 1)):
+    if machine.places == "point" and machine.mounting().axes != (0, 1):
         problem = (
-            f"is {machine.kind!r}; sketches are available for machines with platforms or a shaft, or that move across and up"
+            f"is {machine.kind!r}; sketches are available for machines with platforms, a shaft or bodies, or that move across "
+            "and up"
         )
         raise InputError("machine.kind", problem)
-    return {"platform": PlatformView, "shaft": ShaftView, "point": FrontView}[machine.places](scene)
+    views = {"platform": PlatformView, "shaft": ShaftView, "point": FrontView, "plane": PlaneView}
+    return views[machine.places](scene)

@@ -8,27 +8,34 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.draw.machine.parts import Part, circle
+from jaxvib.draw.machine.parts import Part, circle, sector
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.machine.loads import Loads
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 
-__all__ = ["Pose", "Wheel", "at_rest", "caption", "places_of", "shown"]
+
+class RotorPose(NamedTuple):
+    """Positions of a rotor and its loads at an instant.
+
+    **Attributes**: `angle`, the loads' coordinates, (count,) each; `turn`, the angle of the rotor, rad; `own`, the loads'
+    positions relative to its centre, (count,) each, or None if they have not been computed yet.
+    """
+
+    angle: tuple[np.ndarray, ...]
+    turn: np.ndarray | float
+    own: Sequence[np.ndarray] | None = None
 
 
 class Pose(NamedTuple):
     """Positions of all parts at an instant.
 
-    **Attributes**: `displacement` (nd,) m and `velocity` (nd,) m/s, for tilts rad and rad/s; `angle`, the loads' coordinates,
-    (count,) each; `turn`, the angle of the rotor, rad; `own`, the loads' positions relative to its centre, (count,) each, or
-    None if they have not been computed yet.
+    **Attributes**: `displacement` (nd,) m and `velocity` (nd,) m/s, for tilts rad and rad/s; `rotors`, a `RotorPose` for each
+    exciter.
     """
 
     displacement: np.ndarray
     velocity: np.ndarray
-    angle: tuple[np.ndarray, ...]
-    turn: float
-    own: Sequence[np.ndarray] | None = None
+    rotors: tuple[RotorPose, ...]
 
 
 _UNITS = {
@@ -36,6 +43,7 @@ _UNITS = {
     "m": (("mm", 1e3),),
     "N/m": (("N/mm", 1e-3), ("N/m", 1.0)),
     "N s/m": (("N s/m", 1.0),),
+    "kg m": (("kg m", 1.0), ("g m", 1e3)),
     "kg m²": (("kg m²", 1.0), ("kg cm²", 1e4)),
 }
 
@@ -69,47 +77,71 @@ def track_radius(loads: Loads) -> float:
 
 def at_rest(scene: Scene) -> Pose:
     """Return the pose of a sketch: no displacement, and loads spread evenly so that each is visible."""
-    first, *others = (np.asarray(u, float) for u in scene.loads.rest())
-    spread = first + 2.0 * np.pi * np.arange(scene.loads.count) / scene.loads.count + np.pi * 5.0 / 6.0
     zero = np.zeros(len(scene.machine.structure().coordinates))
-    return Pose(zero, zero, (spread, *others), 0.0)
+    return Pose(zero, zero, tuple(RotorPose(_spread(exciter.loads), 0.0) for exciter in scene.exciters))
+
+
+def _spread(loads: Loads | None) -> tuple[np.ndarray, ...]:
+    if loads is None:
+        return ()
+    first, *others = (np.asarray(u, float) for u in loads.rest())
+    return (first + 2.0 * np.pi * np.arange(loads.count) / loads.count + np.pi * 5.0 / 6.0, *others)
 
 
 def caption(scene: Scene) -> str:
-    """Return a short description of loads, drive and effects for the title of a sketch."""
-    loads, drive = scene.loads, scene.drive
-    each = " each" if loads.count > 1 else ""
-    named = loads.kind.replace("_", " ") + ("s" if loads.count > 1 else "")
-    words = [f"{loads.count} {named}, m = {_span(np.asarray(loads.mass), 'kg')}{each}"]
-    words += [f"R = {shown(track_radius(loads), 'm')}"]
-    drag = getattr(loads, "drag", None)
-    if drag is not None:
-        words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")
-    speed = float(drive.speed)
-    lines = [", ".join(words), f"{drive.kind.replace('_', ' ')}: {30.0 / np.pi * speed:.5g} rpm ({speed:.5g} rad/s)"]
+    """Return a short description of loads, unbalances, drives and effects for the title of a sketch."""
+    lines: dict[str, list[int]] = {}
+    for k, exciter in enumerate(scene.exciters):
+        lines.setdefault("\n".join(_words_of(exciter)), []).append(k)
+    if len(scene.exciters) == 1:
+        found = list(lines)
+    else:
+        found = [f"exciter {', '.join(map(str, own))}: {line.replace(chr(10), ', ')}" for line, own in lines.items()]
     if scene.all_effects:
-        lines.append("with " + ", ".join(effect.kind.replace("_", " ") for effect in scene.all_effects))
-    return "\n".join(lines)
+        found.append("with " + ", ".join(dict.fromkeys(effect.kind.replace("_", " ") for effect in scene.all_effects)))
+    return "\n".join(found)
+
+
+def _words_of(exciter: Exciter) -> list[str]:
+    """Return lines with the loads and the unbalance of an exciter, and with its drive."""
+    loads, drive, words = exciter.loads, exciter.drive, []
+    if exciter.unbalance is not None:
+        words.append(f"unbalance {shown(float(exciter.unbalance), 'kg m')}")
+    if loads is not None:
+        each = " each" if loads.count > 1 else ""
+        named = loads.kind.replace("_", " ") + ("s" if loads.count > 1 else "")
+        words += [f"{loads.count} {named}, m = {_span(np.asarray(loads.mass), 'kg')}{each}"]
+        words += [f"R = {shown(track_radius(loads), 'm')}"]
+        drag = getattr(loads, "drag", None)
+        if drag is not None:
+            words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")
+    speed = float(drive.speed)
+    turning = ", clockwise" if exciter.direction == -1 else ""
+    return [", ".join(words), f"{drive.kind.replace('_', ' ')}: {30.0 / np.pi * speed:.5g} rpm ({speed:.5g} rad/s){turning}"]
 
 
 class Wheel:
-    """Rotor of a scene with its loads, seen along its axis; `radius` of the loads' circle in the drawing."""
+    """Rotor of an exciter with its loads and its unbalance, seen along its axis.
 
-    def __init__(self, scene: Scene, radius: float):
-        self.loads, self.radius = scene.loads, radius
-        self.scale = radius / track_radius(scene.loads)
-        own = getattr(scene.loads, "ball_radius", None)
+    **Attributes**: `radius` of the loads' circle in the drawing, `rim` of the rotor; `scale`, units of the drawing per metre
+    """
+
+    def __init__(self, exciter: Exciter, radius: float):
+        self.loads, self.radius, self.direction = exciter.loads, radius, exciter.direction
+        self.unbalanced = exciter.unbalance is not None
+        self.scale = radius / (0.1 if self.loads is None else track_radius(self.loads))
+        own = getattr(self.loads, "ball_radius", None)
         self.size = 0.12 * radius / 0.7 if own is None else max(float(own) * self.scale, 0.05)
         self.rim = radius + max(1.15 * self.size, 0.1)
 
-    def places(self, pose: Pose) -> list[np.ndarray]:
+    def places(self, pose: RotorPose) -> list[np.ndarray]:
         """Return the loads' positions relative to the axis in the drawing: across, up, and along if they move along it."""
+        assert self.loads is not None
         own = places_of(self.loads, pose.angle) if pose.own is None else pose.own
         return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in own]
 
-    def parts(self, centre: tuple[float, float], pose: Pose) -> list[Part]:
-        """Return the rim, the loads' circle, two spokes that turn with the rotor, and the loads."""
-        x, y = centre
+    def parts(self, centre: tuple[float, float], pose: RotorPose) -> list[Part]:
+        """Return the rim, the loads' circle, two spokes and the unbalance, which turn with the rotor, and the loads."""
         found = [
             Part(circle(centre, self.rim), {"fc": "#f4f4f4", "ec": "black", "lw": 1.4, "zorder": 3}, True),
             Part(circle(centre, self.radius), {"color": GUIDE, "lw": 0.7, "ls": ":", "zorder": 3.1}),
@@ -118,8 +150,21 @@ class Wheel:
             e = np.array([np.cos(turn), np.sin(turn)])
             look = {"color": "#9a9a9a", "lw": 1.0, "zorder": 3.2}
             found.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look, axis=centre))
-        mark = circle(tuple(centre + 0.82 * self.rim * np.array([np.cos(pose.turn), np.sin(pose.turn)])), 0.05)
-        found.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre))
+        if self.unbalanced:
+            found.append(
+                Part(sector(centre, 0.85 * self.rim, pose.turn), {"fc": "#555555", "ec": "black", "zorder": 3.3}, True, centre)
+            )
+        else:
+            mark = circle(tuple(centre + 0.82 * self.rim * np.array([np.cos(pose.turn), np.sin(pose.turn)])), 0.05)
+            found.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre))
+        found += self._load_parts(centre, pose)
+        found.append(Part(circle(centre, 0.04, 13), {"fc": "black", "ec": "none", "zorder": 3.6}, True))
+        return found
+
+    def _load_parts(self, centre: tuple[float, float], pose: RotorPose) -> list[Part]:
+        if self.loads is None:
+            return []
+        (x, y), found = centre, []
         across, up, *_ = self.places(pose)
         for j in range(self.loads.count):
             color = COLORS[j % len(COLORS)]
@@ -128,5 +173,4 @@ class Wheel:
                 found.append(Part(np.array([centre, place]), {"color": color, "lw": 2.0, "zorder": 3.4}))
             look = {"fc": color, "ec": "black", "lw": 0.8, "zorder": 3.5 + 0.001 * j}
             found.append(Part(circle(place, self.size, 31), look, True))
-        found.append(Part(circle(centre, 0.04, 13), {"fc": "black", "ec": "none", "zorder": 3.6}, True))
         return found

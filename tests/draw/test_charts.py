@@ -89,7 +89,7 @@ def test_an_audits_picture_grows_by_a_line_for_each_effect():
 def test_the_smaller_of_two_bands_lies_in_front_of_the_larger():
     time = np.linspace(0.0, 50.0, 4000)
     motion = np.sin(20.0 * time)[:, None] * [1e-3, 3e-3]
-    arrays = (time, motion, np.ones((time.size, 2)), 2.0 * np.ones_like(time), motion[:, :1])
+    arrays = (time, motion, np.ones((time.size, 2)), 2.0 * np.ones((time.size, 1)), motion[:, :1])
     axis = time_histories(arrays, arrays, names=("y1", "y2"), directions=("up",)).axes[0]
     depths = {line.get_label(): line.get_zorder() for line in axis.lines}
     assert depths["y1"] > depths["y2"] > axis.xaxis.get_zorder()  # of the grid

@@ -123,7 +123,7 @@ def test_band_contains_the_signal():
     middle, low, high = band(t, y, 50)
     assert middle.size == 50 and np.all(high >= np.interp(middle, t, y)) and np.all(low <= np.interp(middle, t, y))
     np.testing.assert_allclose(high[-1], 10.0, rtol=0.01)
-    arrays = (t, np.stack([y, -y], 1), np.ones((t.size, 2)), 2.0 * np.ones_like(t), y[:, None])
+    arrays = (t, np.stack([y, -y], 1), np.ones((t.size, 2)), 2.0 * np.ones((t.size, 1)), y[:, None])
     figure = time_histories(arrays, arrays, names=("y1", "y2"), directions=("up",))
     left, right = figure.axes[:2]
     assert len(left.collections) == 2 and [text.get_text() for text in left.get_legend().get_texts()] == ["y1", "y2"]

@@ -14,7 +14,7 @@ from jaxvib.machine.files import TEMPLATES
 from jaxvib.show.layout import Tie, lanes
 from jaxvib.show.motion import of_orbit, of_run
 from jaxvib.show.views import view_of
-from jaxvib.show.wheel import Pose, at_rest
+from jaxvib.show.wheel import Pose, RotorPose, at_rest
 
 SCENE = jv.Scene(
     jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
@@ -73,14 +73,15 @@ def test_forces_of_supports_add_up_to_the_force_on_the_bed():
         scene = jv.scene_from_toml(TEMPLATES[kind])
         view, rest = view_of(scene), at_rest(scene)
         q, v = rng.normal(size=(2, rest.displacement.size))
-        total = np.sum(view.support_forces(Pose(q, v, rest.angle, 0.0)), axis=0)
+        total = np.sum(view.support_forces(Pose(q, v, rest.rotors)), axis=0)
         force = np.asarray(scene.machine.carrier().foundation_force(q, v))
         np.testing.assert_allclose(total[1], force[-1], rtol=1e-9)
 
 
 def test_what_moves_is_drawn_where_it_is():
     view, rest = view_of(SCENE), at_rest(SCENE)
-    pose = rest._replace(displacement=np.array([0.01]), angle=(np.array([0.0, np.pi / 2.0]),))
+    turned = RotorPose((np.array([0.0, np.pi / 2.0]),), 0.0)
+    pose = rest._replace(displacement=np.array([0.01]), rotors=(turned,))
     before, after = view.parts(rest, 5.0), view.parts(pose, 5.0)
     lifted = {
         float(np.round(np.mean(b.points - a.points), 6)) for a, b in zip(before, after, strict=True) if len(a.points) == 5
@@ -97,12 +98,14 @@ def test_a_run_between_its_samples(run):
     some = slice(1000, 1200)
     found = of_run(run, t[some])
     np.testing.assert_allclose(found.displacement, kept.state.displacement[some], rtol=1e-9)
-    np.testing.assert_allclose(np.exp(1j * found.angle[0]), np.exp(1j * np.asarray(kept.state.angle[0][some])), rtol=1e-9)
+    np.testing.assert_allclose(
+        np.exp(1j * found.rotors[0].angle[0]), np.exp(1j * np.asarray(kept.state.angle[0][some])), rtol=1e-9
+    )
     # Every other sample, from its neighbours, is what it was.
     coarse = thinned(run, 2)
     found = of_run(coarse, t[some])
     np.testing.assert_allclose(found.displacement, kept.state.displacement[some], atol=1e-5 * float(run.amplitude[0]))
-    np.testing.assert_allclose(np.exp(1j * found.turn), np.exp(60j * t[some]), atol=1e-6)
+    np.testing.assert_allclose(np.exp(1j * found.rotors[0].turn), np.exp(60j * t[some]), atol=1e-6)
 
 
 def test_an_orbit_is_the_run_that_settled_on_it(orbit):
@@ -110,7 +113,7 @@ def test_an_orbit_is_the_run_that_settled_on_it(orbit):
     found = of_orbit(orbit, SCENE, time)
     force = SCENE.machine.stiffness[0] * found.displacement + SCENE.machine.damping[0] * found.velocity
     np.testing.assert_allclose(found.force, force, rtol=1e-6, atol=1e-6 * float(orbit.foundation_force))
-    np.testing.assert_allclose(found.turn, float(orbit.rotor_speed) * time)
+    np.testing.assert_allclose(found.rotors[0].turn, float(orbit.rotor_speed) * time)
 
 
 def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):

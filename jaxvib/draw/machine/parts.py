@@ -12,7 +12,7 @@ from matplotlib.patches import Polygon
 
 from jaxvib.draw.style import Look
 
-__all__ = ["Part", "Text", "arrow", "box", "circle", "damper", "ground", "put", "spring"]
+__all__ = ["Part", "Text", "arrow", "box", "circle", "damper", "ground", "put", "sector", "spring", "turning_arrow"]
 
 Point = tuple[float, float]
 
@@ -91,6 +91,22 @@ def circle(centre: Point, radius: float, points: int = 61) -> np.ndarray:
 def _unit_circle(points: int) -> np.ndarray:
     turn = np.linspace(0.0, 2.0 * np.pi, points)
     return np.stack([np.cos(turn), np.sin(turn)], axis=1)
+
+
+def sector(centre: Point, radius: float, turn: float | np.ndarray, half: float = 1.0) -> np.ndarray:
+    """Return a sector of a circle about the direction `turn`, to the angle `half` on both sides; angles in rad."""
+    angle = np.linspace(turn - half, turn + half, 25)
+    arc = np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([[centre], arc, [centre]])
+
+
+def turning_arrow(centre: Point, radius: float, direction: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return an arc above a centre, and the head that shows the direction of rotation, 1 anticlockwise or -1 clockwise."""
+    angle = 0.5 * np.pi + direction * np.linspace(-0.8, 0.8, 21)
+    arc = np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    along = direction * np.array([-np.sin(angle[-1]), np.cos(angle[-1])])
+    across = np.array([-along[1], along[0]])
+    return arc, arc[-1] + np.array([0.2 * along, 0.09 * across, -0.09 * across, 0.2 * along])
 
 
 def arrow(start: Point, way: Point, width: float = 0.09) -> np.ndarray:

@@ -74,14 +74,14 @@ def time_histories(
 
     **Arguments**
 
-    - `whole`, `end`: tuples of time (nt,), s; displacement (nt, nd), m or rad; load speeds (nt, count) and rotor speed (nt,),
-      rad/s; force (nt, nb), N. The last periods are those of `end`
+    - `whole`, `end`: tuples of time (nt,), s; displacement (nt, nd), m or rad; load speeds (nt, count) and rotor speeds
+      (nt, exciters), rad/s; force (nt, nb), N. The last periods are those of `end`
     - `names`, `units` (nd,): names of the coordinates and their units, "m" or "rad"; `units` None: all m
     - `directions` (nb,): names of the directions of the force
 
     >>> import numpy as np
     >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
-    >>> figure = time_histories(*[(t, q, one, t, one)] * 2, names=("y", "theta"), units=("m", "rad"))
+    >>> figure = time_histories(*[(t, q, one, one, one)] * 2, names=("y", "theta"), units=("m", "rad"))
     >>> [axes.get_ylabel() for axes in figure.axes][::2]
     ['displacement, mm', 'tilt, mrad', 'speed, rad/s', 'foundation force, N']
     """
@@ -108,7 +108,12 @@ def time_histories(
     for k, name in enumerate(load_names(whole[2].shape[1])):
         _band(left, whole[0], scale * whole[2][:, k], k, name, bins)
         right.plot(part[0], scale * part[2][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
-    left.plot(whole[0], scale * whole[3], color="black", ls="--", lw=1.1, label="rotor")
+    rotors = whole[3].shape[1]
+    for k in range(rotors):
+        look = {"color": "black" if rotors == 1 else COLORS[k % len(COLORS)], "ls": "--", "lw": 1.1}
+        left.plot(whole[0], scale * whole[3][:, k], label="rotor" if rotors == 1 else f"rotor {k}", **look)
+        if whole[2].shape[1] == 0:
+            right.plot(part[0], scale * part[3][:, k], **look)
     left.set_ylabel(f"speed, {unit}")
     legend_above(left, 6)
     left, right = axes[-2:]

@@ -190,7 +190,6 @@ def test_numbers_of_supports_and_places_have_names():
             lambda: jv.jam_modes(jv.Scene(SCREEN, jv.balls(count=1, mass=0.1, radius=0.1, drag=1.0), DRIVES[2])),
             "turns with the",
         ),
-        (lambda: jv.sketch(scene_of(1)), "machine.kind is 'plane_body'"),
     ],
 )
 def test_wrong_input_ends_in_one_sentence(make, says):
