@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from programs import golden
-from programs.golden import QUESTIONS, digest, program, recorded, scenes
+from programs.golden import QUESTIONS, digest, program, recorded, scenes, scenes_of_exciters
 
 import jaxvib as jv
 
@@ -44,11 +44,12 @@ def test_a_changed_program_has_another_digest(changed):
 
 
 def test_scenes_hold_every_load_drive_and_effect():
-    found = scenes().values()
-    kinds = (
-        {scene.machine.kind for scene in found} | {scene.loads.kind for scene in found} | {scene.drive.kind for scene in found}
-    )
-    assert kinds >= {"one_mass", "two_mass", "three_mass", "network", "planar_rotor", "rotor"}
+    found = [*scenes().values(), *scenes_of_exciters().values()]
+    exciters = [exciter for scene in found for exciter in scene.exciters]
+    kinds = {scene.machine.kind for scene in found} | {exciter.drive.kind for exciter in exciters}
+    kinds |= {exciter.loads.kind for exciter in exciters if exciter.loads is not None}
+    assert {exciter.carries for exciter in exciters} == {("loads",), ("unbalance",), ("loads", "unbalance")}
+    assert kinds >= {"one_mass", "two_mass", "three_mass", "network", "planar_rotor", "rotor", "plane_body"}
     assert kinds >= {"ball", "roller", "pendulum", "torus_ball"}
     assert kinds >= {"constant_speed", "spin_up", "run_up", "dc_motor", "induction_motor"}
     effects = {type(effect) for scene in found for effect in scene.all_effects}

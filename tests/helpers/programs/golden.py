@@ -81,6 +81,29 @@ def scenes() -> dict[str, jv.Scene]:
     return {name: jv.Scene(*parts) for name, parts in found.items()} | {"published": published().scene()}
 
 
+def scenes_of_exciters() -> dict[str, jv.Scene]:
+    """Scenes with several exciters, unbalances and both directions."""
+    two, loads_of_two = machines()["two_mass"], jv.balls(**BALLS)
+    motors = [jv.DCMotor(120.0, stall_torque=8.0, inertia=0.2), jv.InductionMotor(110.0, 8.0, 0.2, inertia=0.2)]
+    support = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.2, 1.2)]
+    body = jv.plane_body(mass=2000.0, inertia=600.0, supports=support)
+    imbalance = jv.StaticImbalance(0.005)
+    pendulums = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1)
+    turning = [(motors[0], -0.2, 1), (motors[1], 0.3, -1)]
+    found = {
+        "two exciters on platforms": (
+            two,
+            [jv.Exciter(loads_of_two, SPEED, at=1), jv.Exciter(pendulums, motors[0], at=2, effects=(imbalance,))],
+        ),
+        "exciter with unbalance and loads": (two, [jv.Exciter(loads_of_two, motors[1], unbalance=0.3, at=2)]),
+        "body in a plane, motors of opposite directions": (
+            body,
+            [jv.Exciter(drive=m, unbalance=1.5, at=(x, 0.4), direction=direction) for m, x, direction in turning],
+        ),
+    }
+    return {name: jv.Scene(machine, exciters=exciters) for name, (machine, exciters) in found.items()}
+
+
 def state_of(scene: jv.Scene) -> jv.State:
     """A state of the scene away from equilibrium."""
     leaves, structure = jax.tree.flatten(jv.initial_state(scene, "rest"))
@@ -126,7 +149,7 @@ def simulate(scene: jv.Scene) -> Any:
 
 def ensemble(scene: jv.Scene) -> Any:
     def make(speed):
-        return eqx.tree_at(lambda s: s.drive.speed, scene, speed), state_of(scene)
+        return eqx.tree_at(lambda s: s.exciters[0].drive.speed, scene, speed), state_of(scene)
 
     return jv.ensemble(make, jnp.linspace(50.0, 60.0, 4), 2.0, stepsize_controller=jv.EqualSteps(400), estimate=False)
 
@@ -148,8 +171,17 @@ LONG = {
         "stop",
     ),
     "jam_orbit": ("two masses", "balls side by side", "unequal pendulums", "gravity", "dry friction", "planar rotor", "stop"),
-    "simulate": ("two masses", "run-up", "DC motor", "rotor with stations", "torus, balls spin and slide", "contact"),
-    "ensemble": ("two masses", "torus", "imbalance and a motor"),
+    "simulate": (
+        "two masses",
+        "run-up",
+        "DC motor",
+        "rotor with stations",
+        "torus, balls spin and slide",
+        "contact",
+        "two exciters on platforms",
+        "body in a plane, motors of opposite directions",
+    ),
+    "ensemble": ("two masses", "torus", "imbalance and a motor", "exciter with unbalance and loads"),
 }
 """Questions that take long to trace, and the scenes that they are traced for."""
 
@@ -174,7 +206,7 @@ def digest(lines: list[str]) -> str:
 
 def programs(only: str = "") -> Iterator[tuple[str, list[str]]]:
     """All recorded programs by the names of scene and question."""
-    for scene_name, scene in scenes().items():
+    for scene_name, scene in (scenes() | scenes_of_exciters()).items():
         for question_name, question in QUESTIONS.items():
             name = f"{scene_name}: {question_name}"
             if scene_name in LONG.get(question_name, (scene_name,)) and only in name:
@@ -201,7 +233,7 @@ def main() -> int:
     options.add_argument("--show", nargs=2, metavar=("SCENE", "QUESTION"), help="print one program")
     given = options.parse_args()
     if given.show:
-        print("\n".join(program(scenes()[given.show[0]], QUESTIONS[given.show[1]])))
+        print("\n".join(program((scenes() | scenes_of_exciters())[given.show[0]], QUESTIONS[given.show[1]])))
         return 0
     after = {name: digest(lines) for name, lines in programs()}
     found = changes(recorded()["programs"], after)
