@@ -5,6 +5,11 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.runtime.cache import use_cache
 from jaxvib.runtime.cpu import prepare_cpu
 
+# Units of texts and figures
+from jaxvib.display import display_units
+
+# Units of texts and figures
+
 # Machines
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
@@ -122,6 +127,7 @@ __all__ = [
     "InputError",
     "ComputationError",
     "prepare_cpu",
+    "display_units",
     "use_cache",
     # Machines
     "Machine",

@@ -10,13 +10,14 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import shown_unit
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.units import count, shown_unit
+from jaxvib.units import count
 from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Synthesis
 from optimize.space import DesignSpace

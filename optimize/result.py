@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxvib.display import shown_unit
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.motion.run import Run
 from jaxvib.results.fields import Plain, in_unit, plain
 from jaxvib.results.result import Result
-from jaxvib.units import shown_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

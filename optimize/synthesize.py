@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import call_user, validated
+from jaxvib.display import speed_text
 from jaxvib.equations.linear import jammed_loads, require_drag
 from jaxvib.equations.state import State
 from jaxvib.errors import ComputationError, InputError, quoted
@@ -289,7 +290,7 @@ def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]
     except ComputationError as error:
         return None, str(error)
     if not abs(float(run.omega / orbit.omega) - 1.0) < _SAME_DESIGN_DISTANCE:
-        return None, f"the motion left mode {mode} and settled at {float(run.omega):.6g} rad/s"
+        return None, f"the motion left mode {mode} and settled at {speed_text(run.omega, 6)}"
     return run, ""
 
 

@@ -18,7 +18,7 @@ FLOORS = (
     ("jaxvib.equations",),
     ("jaxvib.machine",),
     ("jaxvib.ode", "jaxvib.draw", "jaxvib.results", "jaxvib.units"),
-    ("jaxvib.numerics",),
+    ("jaxvib.numerics", "jaxvib.display"),
     ("jaxvib.runtime",),
     ("jaxvib.boundary",),
     ("jaxvib.errors", "jaxvib.imported"),

@@ -20,7 +20,7 @@ from jaxvib.errors import ComputationError, InputError, legible, quoted
 if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
 
-__all__ = ["SPEED", "UNIT", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
+__all__ = ["SPEED", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
 
 
 def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
@@ -31,7 +31,8 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
 
     **Raises** `InputError` for an effect that the scene does not have, and for a text that is not a speed.
     """
-    from jaxvib.machine.drive import ConstantSpeed  # slow imports, which --help does not need
+    from jaxvib.display import speed_text  # slow imports, which --help does not need
+    from jaxvib.machine.drive import ConstantSpeed
     from jaxvib.machine.files import load_scene
 
     scene = load_scene(path)
@@ -39,7 +40,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
         scene = scene.replace(drive=ConstantSpeed(speed))
     elif constant and scene.drive.ideal and not scene.drive.constant:
         end = float(scene.drive.speed)
-        click.echo(f"constant speed of {end:.6g} rad/s: the final speed of the drive ({scene.drive.kind})", err=True)
+        click.echo(f"constant speed of {speed_text(end, 6)}: the final speed of the drive ({scene.drive.kind})", err=True)
         scene = scene.replace(drive=ConstantSpeed(end))
     there = [effect.kind for effect in scene.all_effects]
     for kind in without:
@@ -55,12 +56,6 @@ WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave
 
 SPEED = click.option("--speed", help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
 """Option of commands about motions at a constant rotor speed."""
-
-
-UNIT = click.option(
-    "--unit", type=click.Choice(["rad/s", "rpm", "Hz"]), default="rpm", show_default=True, help="Unit of speeds in figures."
-)
-"""Option of commands that plot speeds."""
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
@@ -165,7 +160,7 @@ def app() -> None:
 
 
 def shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options --json, --out and --report to a command, which gets them as one `Output`."""
+    """Add the options --json, --out, --report and --unit to a command, which gets the first three as one `Output`."""
 
     @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
     @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write figures and data into this folder.")
@@ -174,8 +169,18 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
         type=click.Path(path_type=Path, dir_okay=False),
         help="Write a report with inputs, results and figures to this file (.html).",
     )
+    @click.option(
+        "--unit",
+        type=click.Choice(["rpm", "Hz", "rad/s", "SI"]),
+        default="rpm",
+        show_default=True,
+        help="Unit of speeds; SI: all numbers in SI units. JSON documents are always in SI units.",
+    )
     @functools.wraps(command)  # also copies the command's own options, which click stores on the function
-    def wrapped(as_json: bool, out: Path | None, report: Path | None, **rest: Any) -> None:
+    def wrapped(as_json: bool, out: Path | None, report: Path | None, unit: str, **rest: Any) -> None:
+        from jaxvib.display import display_units  # slow import, which --help does not need
+
+        display_units(speed="rad/s" if unit == "SI" else unit, si=unit == "SI")  # pyright: ignore[reportArgumentType]
         command(output=Output(as_json, out, report, rest.get("scene")), **rest)
 
     return wrapped

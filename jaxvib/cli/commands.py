@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import UNIT, Output, app, shared
+from jaxvib.cli.app import Output, app, shared
 from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import SpeedUnit
     from jaxvib.motion.start import Start
 
 
@@ -63,7 +62,6 @@ def new(kind: str, output: Output) -> None:
 @click.option("--max-steps", type=int, help="Largest number of time steps.")
 @click.option("--window", is_flag=True, help="Save no trajectory, only the measurements over the last turns.")
 @CSV
-@UNIT
 @shared
 def simulate(
     scene: Path,
@@ -77,7 +75,6 @@ def simulate(
     max_steps: int | None,
     window: bool,
     csv: Path | None,
-    unit: SpeedUnit,
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its picture."""
@@ -98,7 +95,7 @@ def simulate(
         save="window" if window else "all",
         progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, until) else None,
     )
-    output.picture("history.png", lambda: run.plot(unit=unit))
+    output.picture("history.png", lambda: run.plot())
     output.keep("run.npz", run)
     output.csv(csv, run, "time")
     output.done(run_document(run), run.summary, "simulate", run)

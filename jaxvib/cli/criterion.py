@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,23 +9,18 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import UNIT, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import SpeedUnit
-
-_RPM = 30.0 / math.pi
 
 
 @app.command("criterion")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--check", is_flag=True, help="Add the exact boundaries, from Floquet multipliers of the full equations.")
-@UNIT
 @WITHOUT
 @shared
-def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...], output: Output) -> None:
+def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output) -> None:
     """List the speeds at which coincident loads of SCENE stay together, and at which they spread and balance the rotor, by the
     empirical criterion."""
     from jaxvib.steady.balance.criterion import criterion_table  # slow import, which --help does not need
@@ -56,29 +50,32 @@ def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
         pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
         figure, (axis,) = panels(1)
-        pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact, unit)
+        pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
         return figure
 
     output.picture("criterion.png", figure)
 
     def text() -> str:
-        rows = [[label, f"{w:.6g}", f"{_RPM * w:.5g}"] for label, w in judged.speeds.labelled()]
-        damped = [[label, f"{w:.6g}", f"{_RPM * w:.5g}"] for label, w in judged.speeds.labelled(damped=True)]
+        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
+        rows = [[label, f"{scale * w:.6g}"] for label, w in judged.speeds.labelled()]
+        damped = [[label, f"{scale * w:.6g}"] for label, w in judged.speeds.labelled(damped=True)]
         kinds = [("balancing", "loads spread and balance"), ("gathering", "loads stay together")]
-        spans = [[words, *_ends(span)] for name, words in kinds for span in document[name]]
-        spans += [["balancing, exactly", *_ends(span)] for span in exact or []]
+        spans = [[words, *_ends(span, scale)] for name, words in kinds for span in document[name]]
+        spans += [["balancing, exactly", *_ends(span, scale)] for span in exact or []]
         lines = [
             document["status"],
-            table("characteristic speeds, no damping", ["", "rad/s", "rpm"], rows),
-            table("sign changes with this damping", ["", "rad/s", "rpm"], damped),
-            table("rotor speeds", ["", "from, rad/s", "to, rad/s"], spans),
+            table("characteristic speeds, no damping", ["", unit], rows),
+            table("sign changes with this damping", ["", unit], damped),
+            table("rotor speeds", ["", f"from, {unit}", f"to, {unit}"], spans),
         ]
         if check:
-            lines.append(f"exact stability was computed up to {top:.5g} rad/s")
+            lines.append(f"exact stability was computed up to {speed_text(top)}")
         return "\n".join(lines)
 
     output.done(document, text, "criterion", judged)
 
 
-def _ends(span: Sequence[float | None]) -> list[str]:
-    return ["no end" if end is None else f"{end:.6g}" for end in span]
+def _ends(span: Sequence[float | None], scale: float) -> list[str]:
+    return ["no end" if end is None else f"{scale * end:.6g}" for end in span]

@@ -9,20 +9,17 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED, UNIT, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import CSV, fields_of
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import SpeedUnit
-
-_RPM = 30.0 / math.pi
+    pass
 
 
 @app.command("modes")
 @click.argument("scene", type=click.Path(path_type=Path))
 @SPEED
-@UNIT
 @click.option("--exact", is_flag=True, help="Compute exact periodic motions of the full equations in place of light-load jams.")
 @click.option(
     "--phases", is_flag=True, help="Compute light-load jams with unequal phases (default for a rotor without --exact)."
@@ -33,7 +30,6 @@ _RPM = 30.0 / math.pi
 def modes(
     scene: Path,
     speed: str | None,
-    unit: SpeedUnit,
     exact: bool,
     phases: bool,
     without: tuple[str, ...],
@@ -57,17 +53,17 @@ def modes(
             "--phases", "cannot be combined with --exact; jams with unequal phases are computed for light loads only"
         )
     if exact:
-        _exact(loaded, unit, csv, output)
+        _exact(loaded, csv, output)
         return
     if phases or loaded.mounting().axes != (1,):
         if csv is not None:
             raise InputError(
                 "--csv", "writes branches over the load speed, which jams with unequal phases do not have; use --json"
             )
-        _phases(loaded, unit, output)
+        _phases(loaded, output)
         return
     found = jax.device_get(jv.jam_modes(loaded))  # NumPy arrays, because indexing JAX arrays would compile programs
-    output.picture("branches.png", lambda: jv.branches(loaded).plot(unit=unit))
+    output.picture("branches.png", lambda: jv.branches(loaded).plot())
     if csv is not None:
         output.csv(csv, jv.branches(loaded), "point")
     jams = [found.select(k) for k in found.mode_numbers()]
@@ -90,11 +86,13 @@ def modes(
     }
 
     def text() -> str:
+        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
         rows = [
             [
                 f"{int(jam.mode)}",
-                f"{float(jam.omega):.5g}",
-                f"{_RPM * float(jam.omega):.5g}",
+                f"{scale * float(jam.omega):.5g}",
                 {"stable by slope": "stable", "unstable by slope": "unstable"}.get(jam.judgement, "cannot stay"),
                 _stability_text(growth[int(jam.mode)]),
                 *(f"{1e3 * float(a):.4g}" for a in jam.amplitude),
@@ -102,19 +100,16 @@ def modes(
             ]
             for jam in jams
         ]
-        speed = float(loaded.drive.speed)
-        resonances = ", ".join(f"{float(w):.5g} rad/s ({_RPM * float(w):.4g} rpm)" for w in found.resonances)
         head = [
             "mode",
-            "rad/s",
-            "rpm",
+            unit,
             "by slope",
             "loads free",
             *(f"{name}, mm" for name in loaded.machine.structure().coordinates),
             "force",
         ]
         lines = [
-            f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
+            f"rotor {speed_text(loaded.drive.speed)}; resonances {speed_text(found.resonances)}",
             table("jam modes (light loads); amplitudes are zero to peak, the foundation force is in N", head, rows)
             if rows
             else "no jam mode at this speed",
@@ -145,13 +140,13 @@ def _left_out(scene: jv.Scene) -> list[str]:
     return [f"amplitudes and forces are the loads' alone: the {named} adds a vibration at the rotor speed"] if named else []
 
 
-def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
+def _phases(scene: jv.Scene, output: Output) -> None:
     """Print the jams of light loads at any phases."""
     from jaxvib.results.status import sentence
     from jaxvib.steady.jams.phases import degrees
 
     found = jv.phase_jams(scene)
-    output.picture("phases.png", lambda: found.plot(unit=unit))
+    output.picture("phases.png", lambda: found.plot())
     jams = [found.select(k) for k in range(found.omega.shape[0])]
     document = {
         "rotor_speed": scene.drive.speed,
@@ -167,10 +162,12 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     }
 
     def text() -> str:
+        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
         rows = [
             [
-                f"{float(jam.omega):.5g}",
-                f"{_RPM * float(jam.omega):.5g}",
+                f"{scale * float(jam.omega):.5g}",
                 "stable" if jam.stable else "unstable",
                 sentence(jam.pattern),
                 " ".join(f"{degrees(float(a)):.4g}" for a in jam.phase),
@@ -178,19 +175,19 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
             ]
             for jam in jams
         ]
-        speed = float(scene.drive.speed)
-        head = ["rad/s", "rpm", "", "loads stand", "at, degrees", "foundation force, N"]
-        title = f"light-load jams with unequal phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
+        rotor = speed_text(scene.drive.speed)
+        head = [unit, "", "loads stand", "at, degrees", "foundation force, N"]
+        title = f"light-load jams with unequal phases; rotor {rotor}"
         if not rows:
-            return f"no jam at {speed:.5g} rad/s"
-        kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({sentence(jam.pattern)})" for jam in jams if jam.stable)
+            return f"no jam at {rotor}"
+        kept = ", ".join(f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable)
         conclusion = f"loads can stay jammed at {kept}" if kept else "none of them is stable: light loads cannot stay jammed"
         return "\n".join([table(title, head, rows), conclusion, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
 
 
-def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -> None:
+def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
     """Print the exact jams, with those that do not exist for light loads, and the special points."""
     from jaxvib.steady.orbits.search import exact_mode_speeds  # slow import: it needs the time integrator
 
@@ -199,7 +196,7 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
     known = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
     diagram = jv.branches(scene, exact=True)
-    output.picture("branches.png", lambda: diagram.plot(unit=unit))
+    output.picture("branches.png", lambda: diagram.plot())
     output.csv(csv, diagram, "point")
     document = {
         "rotor_speed": scene.drive.speed,
@@ -218,12 +215,14 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
     }
 
     def text() -> str:
+        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
         names = scene.machine.structure().coordinates
         rows = [
             [
                 f"{k}",
-                f"{float(jam.omega):.6g}",
-                f"{_RPM * float(jam.omega):.6g}",
+                f"{scale * float(jam.omega):.6g}",
                 jam.judgement,
                 f"{float(jam.multiplier):.5g}",
                 *(f"{1e3 * float(a):.5g}" for a in jam.amplitude),
@@ -231,15 +230,15 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
             ]
             for k, jam in known.items()
         ]
-        head = ["mode", "rad/s", "rpm", "exactly", "multiplier", *(f"{name}, mm" for name in names), "foundation force, N"]
-        points = [[p.kind.replace("_", " "), f"{p.omega:.6g}", f"{p.rotor_speed:.6g}"] for p in diagram.special]
+        head = ["mode", unit, "exactly", "multiplier", *(f"{name}, mm" for name in names), "foundation force, N"]
+        points = [[p.kind.replace("_", " "), f"{scale * p.omega:.6g}", f"{scale * p.rotor_speed:.6g}"] for p in diagram.special]
         lines = [
-            f"rotor {float(scene.drive.speed):.5g} rad/s ({_RPM * float(scene.drive.speed):.5g} rpm)",
+            f"rotor {speed_text(scene.drive.speed)}",
             table("exact jams; amplitudes and force are zero to peak", head, rows),
             *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in known),
         ]
         if points:
-            lines.append(table("points where stability changes", ["", "loads, rad/s", "rotor, rad/s"], points))
+            lines.append(table("points where stability changes", ["", f"loads, {unit}", f"rotor, {unit}"], points))
         return "\n".join(lines)
 
     output.done(document, text, "modes", diagram)

@@ -87,12 +87,12 @@ class Output:
             self.figures.append((Path(name).stem.replace("_", " "), figure))
 
     def csv(self, path: Path | None, result: Result, axis: str) -> None:
-        """Write the values of a result along an axis to the CSV file of --csv, if there is one."""
+        """Write the values of a result along an axis, in display units, to the CSV file of --csv, if there is one."""
         if path is None:
             return
         from jaxvib.results.csv import write_csv  # slow import, which --help does not need
 
-        write_csv(result, axis, path)
+        write_csv(result, axis, path, display=True)
         self.files.append(str(path))
 
     def done(self, document: Mapping[str, object], text: Callable[[], str], name: str, result: Result | None = None) -> None:

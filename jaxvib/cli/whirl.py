@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import UNIT, Output, app, shared, table
+from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.cli.output import CSV
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import SpeedUnit
-
-_RPM = 30.0 / math.pi
+    pass
 
 
 @app.command("whirl")
@@ -24,12 +21,9 @@ _RPM = 30.0 / math.pi
 @click.option(
     "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Include the masses of the loads."
 )
-@UNIT
 @CSV
 @shared
-def whirl(
-    scene: Path, speed: str | None, loads: Literal["fixed", "none"], unit: SpeedUnit, csv: Path | None, output: Output
-) -> None:
+def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
     """List the whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out adds the Campbell
     diagram."""
     import numpy as np  # slow imports, which --help does not need
@@ -50,19 +44,22 @@ def whirl(
     ]
     top = 1.3 * max([rotor_speed, *(each["speed"] for each in critical)])
     speeds = np.linspace(0.0, top, 161)
-    output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed, unit=unit))
+    output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed))
     if csv is not None:
         output.csv(csv, jv.whirl(loaded, speeds, loads=loads), "rotor_speed")
     document = {"rotor_speed": rotor_speed, "loads": loads, "whirl": whirls, "critical": critical}
 
     def text() -> str:
+        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
         sense = {True: "forward", False: "backward"}
-        rows = [[sense[w["forward"]], f"{w['speed']:.6g}", f"{_RPM * w['speed']:.5g}"] for w in critical]
-        moving = [[sense[w["forward"]], f"{w['speed']:.6g}", f"{_RPM * w['speed']:.5g}", f"{w['decay']:.4g}"] for w in whirls]
+        rows = [[sense[w["forward"]], f"{scale * w['speed']:.6g}"] for w in critical]
+        moving = [[sense[w["forward"]], f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w in whirls]
         return "\n".join(
             [
-                table("critical speeds: whirl speed = rotor speed", ["", "rad/s", "rpm"], rows),
-                table(f"whirl at {rotor_speed:.5g} rad/s", ["", "rad/s", "rpm", "decay, 1/s"], moving),
+                table("critical speeds: whirl speed = rotor speed", ["", unit], rows),
+                table(f"whirl at {speed_text(rotor_speed)}", ["", unit, "decay, 1/s"], moving),
             ]
         )
 

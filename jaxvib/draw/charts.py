@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
+from jaxvib.display import SpeedUnit, speed_unit
 from jaxvib.draw.style import (
     COLORS,
     GUIDE,
@@ -17,13 +18,11 @@ from jaxvib.draw.style import (
     Drawn,
     Look,
     Onto,
-    SpeedUnit,
     legend_above,
     legend_outside,
     log_ticks,
     numbered,
     panels,
-    speed_scale,
 )
 from jaxvib.errors import InputError, quoted
 
@@ -44,7 +43,7 @@ def branch_diagram(
     names: Sequence[str],
     units: Sequence[str] | None = None,
     at: float | None = None,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     judged: str = "",
     show: Sequence[str] = PARTS,
     ax: Onto = None,
@@ -67,7 +66,7 @@ def branch_diagram(
     - `at`: operating speed, rad/s, drawn as a vertical line
     - `show`: panels to draw, some of `PARTS`
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     if not show or any(part not in PARTS for part in show):
         raise InputError("show", f"is {quoted(tuple(show))}; it names some of: {', '.join(PARTS)}")
     apart = len(names) > 2

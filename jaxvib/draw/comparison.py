@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
+from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, legend_above, log_ticks, panels
 
 
 def tiers_chart(
@@ -132,24 +133,25 @@ def stability_chart(
     marks: Mapping[str, np.ndarray],
     *,
     label: str,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw a band for each value (n,), shaded at the load speeds `omega` (n, P) that are `stable` (n, P).
 
     `marks` are points (k, 2) of load speed and value by kind. Speeds are in rad/s and drawn in `unit`.
     """
+    unit, scale = speed_unit(unit)
     figure, (axes,) = panels(1, size=(7.5, 5.0), ax=ax)
     logarithmic = value[0] > 0.0 and value[-1] > 3.0 * value[0]
     edges = np.exp(_edges(np.log(value))) if logarithmic else _edges(value)
     for speeds, is_stable, low, high in zip(omega, stable, edges[:-1], edges[1:], strict=True):
-        axes.fill_between(speed_scale(unit) * speeds, low, high, where=is_stable, color="#cfe3d6", lw=0.0)
+        axes.fill_between(scale * speeds, low, high, where=is_stable, color="#cfe3d6", lw=0.0)
     axes.set_ylim(edges[0], edges[-1])
     if logarithmic:
         axes.set_yscale("log")
         log_ticks(axes)
     for (kind, points), color, shape in zip(marks.items(), COLORS, itertools.cycle("os^D"), strict=False):
-        axes.plot(speed_scale(unit) * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
+        axes.plot(scale * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
     axes.set_xlabel(f"speed of loads, {unit}")
     axes.set_ylabel(label)

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from jaxvib.draw.style import GUIDE, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
+from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.draw.style import GUIDE, Drawn, Onto, legend_above, log_ticks, panels
 
 _KINDS = (
     ("loads gather (both agree)", "#ececec"),
@@ -25,7 +26,7 @@ def agreement_maps(
     predicted: np.ndarray,
     maps: Sequence[tuple[str, np.ndarray]],
     *,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
     """Draw maps over rotor speed and load mass, coloured by the agreement of predicted and exact balancing.
@@ -40,14 +41,15 @@ def agreement_maps(
     >>> import numpy as np
     >>> figure = agreement_maps(np.array([1.0, 2.0]), np.array([0.1, 1.0]), np.eye(2) > 0, [("", np.eye(2) > 0)])
     >>> figure.axes[0].get_xlabel()
-    'rotor speed, rad/s'
+    'rotor speed, rpm'
     """
     colours = ListedColormap([colour for _, colour in _KINDS])
     norm = BoundaryNorm(np.arange(len(_KINDS) + 1) - 0.5, len(_KINDS))
+    unit, scale = speed_unit(unit)
     figure, axes = panels(1, len(maps), size=(3.8, 3.6), ax=ax)
     for axis, (title, exact) in zip(axes, maps, strict=True):
         both = np.where(predicted == exact, np.where(exact, 1, 0), np.where(predicted, 2, 3))
-        axis.pcolormesh(speed_scale(unit) * speed, height, both, cmap=colours, norm=norm, shading="nearest", rasterized=True)
+        axis.pcolormesh(scale * speed, height, both, cmap=colours, norm=norm, shading="nearest", rasterized=True)
         if np.size(height) > 1:
             axis.set_yscale("log")
             log_ticks(axis)
@@ -68,7 +70,7 @@ def pull_chart(
     pull: np.ndarray,
     balancing: list[list[float | None]],
     exact: list[list[float]] | None = None,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
 ) -> None:
     """Draw the functional of the criterion (S,), kg m^2, over rotor speed (S,), rad/s, drawn in `unit`.
 
@@ -82,7 +84,7 @@ def pull_chart(
     'f, kg m², gathering > 0, balancing < 0'
     """
     size = np.abs(pull[np.isfinite(pull)])
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     speed = scale * speed
     ax.plot(speed, pull, color="black", linewidth=1.0)
     ax.set_yscale("symlog", linthresh=np.median(size[size > 0.0]) if np.any(size > 0.0) else 1.0)

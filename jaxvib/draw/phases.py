@@ -8,20 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
+from jaxvib.display import SpeedUnit, speed_unit
 from jaxvib.draw.charts import solid_and_dashed
-from jaxvib.draw.style import (
-    COLORS,
-    GUIDE,
-    MARKERS,
-    OPERATING,
-    UNSTABLE,
-    Drawn,
-    SpeedUnit,
-    legend_above,
-    log_ticks,
-    panels,
-    speed_scale,
-)
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, Drawn, legend_above, log_ticks, panels
 
 _WIDTHS = (2.2, 1.0)
 """Widths of stable and unstable lines, which differ because overlapping dashes could otherwise look like a stable line."""
@@ -35,7 +24,7 @@ def drag_diagram(
     at: float,
     jams: tuple[np.ndarray, np.ndarray] | None = None,
     within: float | None = None,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw load speeds over the drag, on a log scale; stable parts are solid, unstable ones dashed.
@@ -56,7 +45,7 @@ def drag_diagram(
     >>> figure.axes[0].get_ylabel()
     'speed of loads, rad/s'
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)
     colors = dict(zip(dict.fromkeys(name for name, *_ in branches), itertools.cycle(COLORS), strict=False))
     marks = dict(zip(colors, MARKERS, strict=False))

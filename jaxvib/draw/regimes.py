@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxvib.draw.style import COLORS, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
+from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, Drawn, Onto, legend_above, log_ticks, panels
 
 HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
 """Hatches that distinguish neighbouring areas in greyscale."""
@@ -18,7 +19,7 @@ def regime_chart(
     omega: np.ndarray,
     rotor_speed: float,
     *,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
     """Draw the fractions of regimes as stacked bars, and the speeds of the loads, over their drag.
@@ -32,7 +33,7 @@ def regime_chart(
     2
     """
     figure, (top, bottom) = panels(2, size=(7.5, 2.8), share_x=True, ax=ax)
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     width = 0.9 * np.min(np.diff(np.log(drag))) if len(drag) > 1 else 0.1
     low = np.zeros(len(drag))
     for k, (kind, share) in enumerate(shares.items()):

@@ -7,20 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.draw.style import (
-    COLORS,
-    GUIDE,
-    MARKERS,
-    STROKES,
-    Drawn,
-    Look,
-    Onto,
-    SpeedUnit,
-    legend_above,
-    log_ticks,
-    panels,
-    speed_scale,
-)
+from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Drawn, Look, Onto, legend_above, log_ticks, panels
 
 
 def modes_chart(
@@ -31,7 +19,7 @@ def modes_chart(
     resonances: np.ndarray | None = None,
     *,
     names: Sequence[str],
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
     """Draw load speeds and amplitudes of jam modes over their numbers; markers are filled for stable modes.
@@ -50,7 +38,7 @@ def modes_chart(
     >>> figure.axes[1].get_ylabel()
     'amplitude, mm, zero to peak'
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     figure, (top, bottom) = panels(2, size=(6.0, 2.6), share_x=True, ax=ax)
     for axis, values in ((top, scale * omega[:, None]), (bottom, 1e3 * amplitude)):
         for k in range(values.shape[1]):
@@ -76,7 +64,7 @@ def modes_chart(
 
 
 def shapes_chart(
-    frequency: np.ndarray, shape: np.ndarray, *, names: Sequence[str], unit: SpeedUnit = "rad/s", ax: Axes | None = None
+    frequency: np.ndarray, shape: np.ndarray, *, names: Sequence[str], unit: SpeedUnit | None = None, ax: Axes | None = None
 ) -> Drawn:
     """Draw mode shapes (k, nd) as bars, a group for each mode, labelled with its frequency (k,) rad/s, drawn in `unit`.
 
@@ -84,8 +72,9 @@ def shapes_chart(
 
     >>> import numpy as np
     >>> shapes_chart(np.array([10.0]), np.ones((1, 2)), names=("y1", "y2")).axes[0].get_xticklabels()[0].get_text()
-    '10 rad/s'
+    '95.49 rpm'
     """
+    unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(max(5.0, 1.4 * len(frequency)), 3.4), ax=ax)
     many, width = len(names), 0.8 / len(names)
     for k, name in enumerate(names):
@@ -98,7 +87,7 @@ def shapes_chart(
         }
         axis.bar(places, shape[:, k], width=0.94 * width, label=name, **look)
     axis.axhline(0.0, color="black", lw=0.9)
-    axis.set_xticks(range(len(frequency)), [f"{speed_scale(unit) * w:.4g} {unit}" for w in frequency])
+    axis.set_xticks(range(len(frequency)), [f"{scale * w:.4g} {unit}" for w in frequency])
     axis.set_ylim(-1.1, 1.1)
     axis.set_ylabel("mode shape, relative")
     axis.grid(False, axis="x")
@@ -177,7 +166,7 @@ def speeds_chart(
     rows: Sequence[tuple[str, np.ndarray]],
     spans: Sequence[tuple[str, np.ndarray]] = (),
     *,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw speeds (n,) rad/s as labelled points, then intervals (n, 2) rad/s as bars, a row for each, in `unit`.
@@ -190,7 +179,7 @@ def speeds_chart(
     >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
     ['balancing', 'resonances']
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.0, 0.55 * (len(rows) + len(spans)) + 1.0), ax=ax)
     values = scale * np.concatenate([np.ravel(x) for _, x in (*rows, *spans)])
     top = 1.15 * np.max(values[np.isfinite(values)], initial=1e-300)

@@ -15,9 +15,6 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from jaxvib.errors import InputError, quoted
 
-SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
-"""Unit in which speeds are drawn."""
-
 Onto: TypeAlias = "Axes | Sequence[Axes] | None"
 """Axes onto which a chart is drawn: one, or as many as it has panels; None for a new figure."""
 
@@ -56,19 +53,6 @@ _STYLE: Any = {
     "figure.constrained_layout.use": True,
     "figure.dpi": 130,
 }
-
-_SCALES = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
-
-
-def speed_scale(unit: str) -> float:
-    """Return the factor from rad/s to `unit`. **Raises** `InputError` for a unit other than "rad/s", "rpm" and "Hz".
-
-    >>> round(speed_scale("rpm"), 3)
-    9.549
-    """
-    if not isinstance(unit, str) or unit not in _SCALES:
-        raise InputError("unit", f"is {quoted(unit)}; it must be one of 'rad/s', 'rpm', 'Hz'")
-    return _SCALES[unit]
 
 
 def panels(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.draw.style import COLORS, GUIDE, OPERATING, Drawn, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, OPERATING, Drawn, legend_above, panels
 
 
 def campbell_diagram(
@@ -15,7 +16,7 @@ def campbell_diagram(
     *,
     critical: tuple[np.ndarray, np.ndarray] | None = None,
     at: float | None = None,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw whirl speeds over the rotor speed: forward whirls as solid lines, backward whirls dashed.
@@ -32,7 +33,7 @@ def campbell_diagram(
     >>> len(campbell_diagram(n, np.ones((5, 1)), np.ones((5, 1), dtype=bool)).axes)
     1
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     for with_rotor, line, color, label in ((True, "-", COLORS[0], "forward whirl"), (False, "--", COLORS[1], "backward whirl")):
         for k, values in enumerate(whirl_lines(speed, forward == with_rotor)):

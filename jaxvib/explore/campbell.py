@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxvib.display import speed_unit
 from jaxvib.draw.machine.parts import Text
 from jaxvib.draw.machine.svg import svg
-from jaxvib.draw.style import COLORS, GUIDE, speed_scale
+from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.draw.whirl import critical_groups, whirl_lines
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
 from jaxvib.steady.whirl import Whirl
@@ -43,7 +44,7 @@ def campbell(found: Whirl, at: float) -> str:
     >>> "whirl speed, rpm" in campbell(jv.whirl(scene, np.linspace(0.0, 600.0, 31)), at=460.0)
     True
     """
-    scale, rotor_speed = speed_scale("rpm"), np.asarray(found.rotor_speed)
+    scale, rotor_speed = speed_unit("rpm")[1], np.asarray(found.rotor_speed)
     speed, forward = np.asarray(found.speed), np.asarray(found.forward)
     critical, ahead = scale * np.asarray(found.critical.speed), np.asarray(found.critical.forward)
     right = scale * max(float(np.max(rotor_speed)), 1.05 * at)

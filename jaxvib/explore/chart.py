@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxvib.display import speed_unit
 from jaxvib.draw.charts import crossings, log_limits, stretches
 from jaxvib.draw.machine.parts import Text
 from jaxvib.draw.machine.svg import svg
-from jaxvib.draw.style import COLORS, GUIDE, speed_scale, together
+from jaxvib.draw.style import COLORS, GUIDE, together
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
 from jaxvib.steady.branches import Branches
 from jaxvib.steady.jams.branch_plot import MARKS
@@ -41,7 +42,7 @@ def chart(found: Branches, most: float) -> str:
     >>> "foundation force, N, zero to peak" in chart(jv.branches(scene), most=200.0)
     True
     """
-    scale, at = speed_scale("rpm"), float(found.scene.drive.speed)
+    scale, at = speed_unit("rpm")[1], float(found.scene.drive.speed)
     omega, stable, force = np.asarray(found.omega), np.asarray(found.stable), np.asarray(found.foundation_force)
     rotor_speed, resonances = np.asarray(found.rotor_speed), np.asarray(found.resonances)
     rotor_speed = np.where(rotor_speed <= most, rotor_speed, np.nan)

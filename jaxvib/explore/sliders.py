@@ -10,11 +10,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxvib.display import shown_unit
 from jaxvib.errors import InputError
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
 from jaxvib.machine.scene import Scene
-from jaxvib.units import shown_unit
 
 COUNT = "loads.count"
 """Name of the slider that changes the number of loads."""

@@ -15,6 +15,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.boundary import call_user, validated
+from jaxvib.display import speed_text
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
@@ -40,7 +41,8 @@ from jaxvib.units import Number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """Results of `_run`, for one run or for many."""
@@ -116,18 +118,19 @@ class Ensemble(Result):
             return head
         speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
-        return f"{head}\n  loads turn at {np.min(speeds):.6g} .. {np.max(speeds):.6g} rad/s; {worst}"
+        return f"{head}\n  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the mean speed of each load in `unit` over the runs.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
+        from jaxvib.display import speed_unit
         from jaxvib.draw.results import points_chart  # slow import
-        from jaxvib.draw.style import speed_scale
 
-        speeds = speed_scale(unit) * np.asarray(self.load_speed)
+        unit, scale = speed_unit(unit)
+        speeds = scale * np.asarray(self.load_speed)
         return points_chart(speeds, across="run", up=f"speed of loads, {unit}", ax=ax)
 
 

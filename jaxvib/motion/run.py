@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.forces import normal_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.mount import on_body, read_place
@@ -37,7 +38,8 @@ from jaxvib.units.known import when_known
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
 
 
 @cached
@@ -133,9 +135,8 @@ class Run(AbstractMeasured, PointAnswers, Result):
     def summary(self) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
-        speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
-        rotors = ", ".join(f"{float(w[-1]):.6g}" for w in self.window.rotor_speeds)
-        rotor = "rotor" if len(self.window.rotor_speeds) == 1 else "rotors"
+        rotors = [w[-1] for w in self.window.rotor_speeds]
+        rotor = "rotor" if len(rotors) == 1 else "rotors"
         state = "settled" if bool(self.settled) else "not settled: run longer"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
@@ -150,7 +151,8 @@ class Run(AbstractMeasured, PointAnswers, Result):
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
-                f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), {rotor} at {rotors} rad/s",
+                f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
+                f"{rotor} at {speed_text(rotors, 6)}",
                 f"  {self.extent(self.scene)}",
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
@@ -185,7 +187,7 @@ class Run(AbstractMeasured, PointAnswers, Result):
         return found if np.all(is_pushed) else jnp.where(is_pushed, found, np.nan)
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot time histories: platforms, speeds of loads and rotor, foundation force.
 
         To the left the whole run as bands between its peaks (the window if nothing else was kept), to the right its last three

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.state import State
 from jaxvib.errors import ComputationError, InputError, quoted
@@ -293,5 +294,5 @@ def _require_mode(scene: Scene, run: Run, mode: int) -> None:
         now = f"jam mode {nearest}" if nearest else "turning with the rotor"
         raise ComputationError(
             "left_mode",
-            f"the motion left jam mode {mode} and settled at {float(run.omega):.6g} rad/s, {now}; mode {mode} is unstable",
+            f"the motion left jam mode {mode} and settled at {speed_text(run.omega, 6)}, {now}; mode {mode} is unstable",
         )

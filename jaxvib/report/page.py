@@ -18,7 +18,7 @@ import equinox as eqx
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, written
 from jaxvib.machine.scene import Scene
-from jaxvib.report.tables import Units, escaped, parameters, results, worth
+from jaxvib.report.tables import Units, escaped, in_display_units, parameters, results, worth
 from jaxvib.results.fields import Plain
 from jaxvib.results.result import Result
 
@@ -51,9 +51,10 @@ class Report:
         if self.command:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
         units = self.units if self.scene is None else _of_coordinates(self.units, self.scene)
-        parts += [_section("Accuracy", worth(self.document, units))]
+        document, units = in_display_units(self.document, units)
+        parts += [_section("Accuracy", worth(document, units))]
         parts += [_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures))]
-        parts += [_section("Results", results(self.document, units))]
+        parts += [_section("Results", results(document, units))]
         if self.scene is not None:
             sketch = "" if self.sketch is None else _figure("sketch", self.sketch)
             parts += [_section("Machine", sketch + parameters(self.scene))]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import html
 import tomllib
-from collections.abc import Mapping, Sequence
-from typing import TypeAlias, TypeGuard
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias, TypeGuard, cast
 
+from jaxvib.display import shown_unit
 from jaxvib.machine.files import EFFECTS, scene_to_toml
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Exciter, Scene
@@ -37,6 +38,35 @@ _MAX_ROWS = 200
 def escaped(text: object) -> str:
     """Return a text in which the special characters of HTML are escaped."""
     return html.escape(str(text), quote=True)
+
+
+def in_display_units(document: Mapping[str, Plain], units: Units) -> tuple[Mapping[str, Plain], Units]:
+    """Return a document whose numbers are in display units, and these units.
+
+    One name has one unit: its largest number in the whole document decides, whether in a list or in the rows of a table.
+
+    >>> in_display_units({"omega": 10.0, "jams": [{"amplitude": [0.002]}]}, {"omega": "rad/s", "amplitude": "m"})
+    ({'omega': 95.49296585513721, 'jams': [{'amplitude': [2.0]}]}, {'omega': 'rpm', 'amplitude': 'mm'})
+    """
+    sizes = dict.fromkeys(units, 0.0)
+
+    def note_size(name: str, x: float) -> float:
+        sizes[name] = max(sizes.get(name, 0.0), abs(x))
+        return x
+
+    _scaled(document, "", note_size)
+    shown = {name: shown_unit(unit, sizes[name]) for name, unit in units.items()}
+    scaled = _scaled(document, "", lambda name, x: shown[name][1] * x if name in shown else x)
+    return cast("Mapping[str, Plain]", scaled), {name: unit for name, (unit, _) in shown.items()}
+
+
+def _scaled(value: Plain | Mapping[str, Plain], name: str, scale: Callable[[str, float], float]) -> Plain:
+    """Apply a function of (name, number) to all numbers of a plain value that are not Booleans."""
+    if isinstance(value, Mapping):
+        return {key: _scaled(each, key, scale) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_scaled(each, name, scale) for each in value]
+    return scale(name, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
 def worth(document: Mapping[str, Plain], units: Units) -> str:
@@ -81,7 +111,8 @@ def parameters(scene: Scene) -> str:
         for name, value in table.get("effects", {}).items():
             for each in value if isinstance(value, list) else [value]:
                 parts.append((f"{which}effect: {_words(name)}", each, _units(EFFECTS[name])))
-    return "".join(f"<h3>{escaped(title)}</h3>{_pairs(list(table.items()), units)}" for title, table, units in parts)
+    shown = [(title, *in_display_units(table, units)) for title, table, units in parts]
+    return "".join(f"<h3>{escaped(title)}</h3>{_pairs(list(table.items()), units)}" for title, table, units in shown)
 
 
 def _units(part: type) -> Units:

@@ -11,12 +11,13 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import shown_unit
 from jaxvib.errors import InputError, quoted, written
 from jaxvib.results.fields import Labels, columns, labels_of
 
 
 @validated
-def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
+def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool = False) -> Path:
     """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
     The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
@@ -27,6 +28,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
     - `result`: result of any class
     - `axis`: name of the axis in the metadata of the fields, such as "time" or "point"
     - `path`: path of the file, which is overwritten
+    - `display`: True for the units of `display_units`; default: SI units
 
     **Returns** the path. **Raises** `InputError` for an axis that the result does not have, and for a path that cannot be
     written to.
@@ -38,7 +40,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
     >>> path.read_text().splitlines()[0]
     'rotor_speed (rad/s),speed 1 (rad/s),speed 2 (rad/s),decay 1 (1/s),decay 2 (1/s),forward 1,forward 2'
     """
-    table = table_along(result, axis)
+    table = table_along(result, axis, display=display)
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -53,7 +55,7 @@ def main_axis(result: eqx.Module) -> str:
     return max(found, key=lambda axis: found[axis], default="")
 
 
-def table_along(result: eqx.Module, axis: str) -> dict[str, np.ndarray]:
+def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict[str, np.ndarray]:
     """Return the columns of the table of `write_csv` by their heads. **Raises** `InputError` for an unknown axis."""
     labels = labels_of(result)
     units = labels.get("unit", ())
@@ -67,6 +69,10 @@ def table_along(result: eqx.Module, axis: str) -> dict[str, np.ndarray]:
             head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
             parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
             for part, numbers in parts:
+                if display and own and np.issubdtype(numbers.dtype, np.floating):
+                    own_size = float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
+                    own, factor = shown_unit(own, own_size)
+                    numbers = factor * numbers
                 table[f"{part}{head}" + (f" ({own})" if own else "")] = numbers
     if not table:
         there = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})

@@ -25,7 +25,8 @@ from jaxvib.steady.jams.jam import STABILITY_CRITERION, AbstractJam, Jam, branch
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
     from jaxvib.steady.orbits.diagram import ExactBranches
 
 
@@ -54,7 +55,7 @@ class Branches(AbstractJam):
     def plot(
         self,
         *,
-        unit: SpeedUnit = "rad/s",
+        unit: SpeedUnit | None = None,
         most: float | None = None,
         show: Sequence[str] = ("speed", "amplitude", "force"),
         ax: Onto = None,

@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.linear import linear_model
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
@@ -21,7 +22,8 @@ from jaxvib.runtime.programs import cached
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 
 class ModeShapes(Result):
@@ -49,13 +51,13 @@ class ModeShapes(Result):
         """Return a line of text for each mode."""
         rows = zip(np.asarray(self.frequency), np.asarray(self.shape), strict=True)
         parts = [
-            f"{w:.6g} rad/s: " + ", ".join(f"{name} {x:+.3f}" for name, x in zip(self.coordinates, row, strict=True))
+            f"{speed_text(w, 6)}: " + ", ".join(f"{name} {x:+.3f}" for name, x in zip(self.coordinates, row, strict=True))
             for w, row in rows
         ]
         return "\n".join(parts)
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the shapes as bars, a group for each mode with its frequency in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.

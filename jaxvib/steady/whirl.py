@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text, speed_unit
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.mount import Mount
@@ -27,7 +28,8 @@ from jaxvib.units.known import when_known
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 Weights = Literal["fixed", "none"]
 
@@ -64,11 +66,11 @@ class CriticalSpeeds(Result):
     def summary(self) -> str:
         """Return a line of text for each speed."""
         pairs = zip(np.asarray(self.speed), np.asarray(self.forward), strict=True)
-        lines = [f"critical speed {w:.6g} rad/s, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
+        lines = [f"critical speed {speed_text(w, 6)}, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
         lost = [self.message] if self.status_name != "done" else []
         return "\n".join([*lines, *lost]) or "no critical speed"
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot forward and backward critical speeds, on a line each, in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
@@ -104,15 +106,15 @@ class Whirl(Result):
 
     def summary(self) -> str:
         """Return the whirls at each rotor speed, and the critical speeds, as text."""
-        lines = []
+        lines, (unit, scale) = [], speed_unit()
         for n, *whirls in zip(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)), strict=True):
-            shown = ", ".join(f"{w:.6g}{_sense_word(w, f)}" for w, f in zip(*whirls, strict=True))
-            lines.append(f"rotor {n:.6g} rad/s: whirl {shown} rad/s")
+            shown = ", ".join(f"{scale * w:.6g}{_sense_word(w, f)}" for w, f in zip(*whirls, strict=True))
+            lines.append(f"rotor {scale * n:.6g} {unit}: whirl {shown} {unit}")
         lost = [self.message] if self.status_name != "done" else []
         return "\n".join([*lines, *lost, self.critical.summary()])
 
     @validated
-    def plot(self, *, at: float | None = None, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, at: float | None = None, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the Campbell diagram: whirl speeds over the rotor's speed, forward and backward, with the synchronous line.
 
         Critical speeds are marked on the synchronous line, and the rotor's working speed if `at` is given.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.display import shown_unit
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.files import scene_from_toml, suggest_name
@@ -80,7 +81,10 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
     values = _values(opened, name, tuple(slice(None, None, step if d == dims[0] else 1) for d in dims))
     log = _is_log(opened, dims[0])
     label = _axis_label(opened, dims[0])
-    return points_over(x, values.reshape(x.size, -1), across=label, up=_measure_label(opened, name), log=log, ax=ax)
+    (_, scale), (_, factor) = _display_unit(opened, dims[0]), _display_unit(opened, name)
+    return points_over(
+        scale * x, factor * values.reshape(x.size, -1), across=label, up=_measure_label(opened, name), log=log, ax=ax
+    )
 
 
 def figures(
@@ -146,14 +150,17 @@ def plot_map(
     shape = (ys.size, xs.size)
     labels: Look = {"across": _axis_label(opened, across), "up": _axis_label(opened, up)}
     labels["log"] = (_is_log(opened, across), _is_log(opened, up))
+    (_, scale_x), (_, scale_y) = _display_unit(opened, across), _display_unit(opened, up)
     if measure in (None, "regime", "mode") and _has_labels(opened):
         table = _labels(opened, region)
         lines = _theory(opened, across, up, xs, ys) if theory else {}
         codes = np.transpose(table.codes, order).reshape(shape)
-        return label_map(xs, ys, codes, table.names, lines=lines, **labels, ax=ax)
+        lines = {kind: [(scale_x * a, scale_y * b) for a, b in parts] for kind, parts in lines.items()}
+        return label_map(scale_x * xs, scale_y * ys, codes, table.names, lines=lines, **labels, ax=ax)
     name = _measure(opened, measure)
     values = np.transpose(_values(opened, name, region), order).reshape(shape)
-    return value_map(xs, ys, values, label=_measure_label(opened, name), **labels, ax=ax)
+    _, factor = _display_unit(opened, name)
+    return value_map(scale_x * xs, scale_y * ys, factor * values, label=_measure_label(opened, name), **labels, ax=ax)
 
 
 def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -182,7 +189,8 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     total = np.sum(list(hits.values()), axis=0)
     shares = {name: (n / total, *wilson(n, total)) for name, n in hits.items() if np.any(n > 0)}
     log = _is_log(opened, over)
-    return shares_chart(opened.read(over), shares, across=_axis_label(opened, over), log=log, ax=ax)
+    _, scale = _display_unit(opened, over)
+    return shares_chart(scale * opened.read(over), shares, across=_axis_label(opened, over), log=log, ax=ax)
 
 
 def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -203,7 +211,8 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
         )
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
-    return distribution_chart(edges, np.asarray(counts), across=_measure_label(opened, name), ax=ax)
+    _, factor = _display_unit(opened, name)
+    return distribution_chart(factor * edges, np.asarray(counts), across=_measure_label(opened, name), ax=ax)
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -237,7 +246,8 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
     label = f"mean {_measure_label(opened, name)}"
-    return tornado_chart(axes, means[:, 0], means[:, 1], found[0] / found[1], across=label, ax=ax)
+    _, factor = _display_unit(opened, name)
+    return tornado_chart(axes, *(factor * m for m in (*means.T, found[0] / found[1])), across=label, ax=ax)
 
 
 def _fifths(store: Store, axis: str) -> tuple[float, float]:
@@ -262,8 +272,18 @@ def _is_log(store: Store, axis: str) -> bool:
     return isinstance(spec, Mapping) and spec.get("scale") == "log"
 
 
+_USUAL_SIZES = {"m": 0.01, "N/m": 1e5, "N": 100.0}
+"""Sizes in SI units of numbers by which the display unit of a whole figure is chosen."""
+
+
+def _display_unit(store: Store, name: str) -> tuple[str, float]:
+    """Return the unit in which an axis or a measure is drawn, and the factor to it."""
+    unit = str(store.group[name].attrs.get("units", ""))
+    return shown_unit(unit, _USUAL_SIZES.get(unit, 1.0))
+
+
 def _axis_label(store: Store, axis: str) -> str:
-    unit = store.group[axis].attrs.get("units", "")
+    unit, _ = _display_unit(store, axis)
     words = {_SPEED: "rotor speed", "start.rate": "initial speed of the loads", "start.angle": "initial angle of the loads"}
     return f"{words.get(axis, axis)}, {unit}" if unit else words.get(axis, axis)
 
@@ -279,7 +299,7 @@ def _measure(store: Store, name: str | None) -> str:
 
 def _measure_label(store: Store, name: str) -> str:
     attributes = store.group[name].attrs
-    words, unit = str(attributes.get("long_name", name)), attributes.get("units", "")
+    words, (unit, _) = str(attributes.get("long_name", name)), _display_unit(store, name)
     return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # else matplotlib would typeset it as a formula
 
 

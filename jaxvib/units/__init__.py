@@ -33,7 +33,6 @@ __all__ = [
     "numbers",
     "random_numbers",
     "require_real",
-    "shown_unit",
     "to_float",
     "traced",
     "unit_ratio",
@@ -259,20 +258,3 @@ def random_numbers(seed: object) -> np.random.Generator:
     jaxvib.errors.InputError: seed is -1; it must be a whole number, at least 0
     """
     return np.random.default_rng(count(seed, "seed", low=0))
-
-
-def shown_unit(unit: str, size: float) -> tuple[str, float]:
-    """Return the unit in which engineers usually state values of about `size`, and the factor from the SI value to it."""
-    if unit == "N/m" and size >= 1e3:
-        return "N/mm", 1e-3
-    if unit in ("m", "meter") and 0.0 < size < 1.0:
-        return ("mm", 1e3) if size >= 1e-5 else ("um", 1e6)
-    if unit == "rad/s":
-        return "rpm", 30.0 / np.pi
-    if unit == "rad":
-        return "deg", 180.0 / np.pi
-    if unit == "kg" and 0.0 < size < 1.0:
-        return "g", 1e3
-    if unit == "N" and size >= 1e4:
-        return "kN", 1e-3
-    return unit, 1.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxvib.units import shown_unit
+from jaxvib.display import shown_unit
 from optimize.quantities.quantity import Demand
 from optimize.result import Influence, Limit, Machine
 from optimize.search.find import Found

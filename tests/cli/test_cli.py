@@ -52,7 +52,7 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
     assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
     assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000
-    assert "loads can stay jammed at 164.63 rad/s (all together)" in typed("modes", "rotor.toml")[1]
+    assert "loads can stay jammed at 1572.1 rpm (all together)" in typed("modes", "rotor.toml")[1]
     (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
     for words in (("modes", "--exact"), ("criterion",)):
         code, out, err = typed(words[0], "stations.toml", *words[1:])
@@ -266,7 +266,7 @@ def test_refusal_of_an_effect_names_the_option_that_removes_it(typed, tmp_path):
         (["modes", "--exact"], "--without static_imbalance"),
         (
             ["settle", "--drift", "-1"],
-            "constant speed of 460 rad/s: the final speed of the drive (run_up)\njaxvib: drift is -1",
+            "constant speed of 4392.68 rpm: the final speed of the drive (run_up)\njaxvib: drift is -1",
         ),
         (["growth", "--until", "2s", "--speed", "0"], "drive.speed is 0 rad/s; it must be greater than 0"),
     ):

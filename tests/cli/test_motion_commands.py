@@ -28,10 +28,12 @@ def test_a_run_as_csv_is_its_trajectory(typed, tmp_path, monkeypatch):
     code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "run.csv", "--json")
     assert code == 0 and err == ""
     head, *rows = read(tmp_path / "run.csv")
-    assert head[:3] == ["time (s)", "displacement y1 (m)", "displacement y2 (m)"] and "rotor_speed (rad/s)" in head
+    assert head[:3] == ["time (s)", "displacement y1 (mm)", "displacement y2 (mm)"] and "rotor_speed (rpm)" in head
     numbers = np.array(rows, dtype=float)
     np.testing.assert_allclose(numbers[:, 0], kept.trajectory.time, rtol=1e-8)
-    np.testing.assert_allclose(numbers[:, head.index("angle 2 (rad)")], kept.trajectory.state.angle[0][:, 1], rtol=1e-8)
+    np.testing.assert_allclose(
+        numbers[:, head.index("angle 2 (deg)")], np.degrees(kept.trajectory.state.angle[0][:, 1]), rtol=1e-8
+    )
     code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "run.csv", "--window")
     assert code == 2 and "--csv needs a trajectory, which --window does not save" in err
     code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "none/run.csv")
@@ -45,18 +47,20 @@ def test_an_envelope_as_csv_is_its_trajectory(typed, tmp_path):
     assert code == 0, err
     head, *rows = read(tmp_path / "run_up.csv")
     kept = jv.envelope(jv.load_scene("machine.toml"), "1s").trajectory
-    at = [head.index(f"trajectory_{name}") for name in ("time (s)", "amplitude y2 (m)", "rotor_speed (rad/s)")]
+    at = [head.index(f"trajectory_{name}") for name in ("time (s)", "amplitude y2 (mm)", "rotor_speed (rpm)")]
     numbers = np.array(rows, dtype=float)[:, at]
-    np.testing.assert_allclose(numbers, np.stack([kept.time, kept.amplitude[:, 1], kept.rotor_speed], axis=1), rtol=1e-8)
+    np.testing.assert_allclose(
+        numbers, np.stack([kept.time, 1e3 * kept.amplitude[:, 1], 30.0 / np.pi * kept.rotor_speed], axis=1), rtol=1e-8
+    )
 
 
 def test_branches_as_csv(typed, tmp_path):
     assert typed("modes", "machine.toml", "--csv", "branches.csv")[0] == 0
     head, *rows = read(tmp_path / "branches.csv")
     at = {name: k for k, name in enumerate(head)}
-    numbers = [[float(row[at[name]]) for row in rows] for name in ("omega (rad/s)", "rotor_speed (rad/s)")]
+    numbers = [[float(row[at[name]]) for row in rows] for name in ("omega (rpm)", "rotor_speed (rpm)")]
     branch = jv.branches(jv.load_scene("machine.toml"))
-    np.testing.assert_allclose(numbers, [branch.omega, branch.rotor_speed], rtol=1e-8)
+    np.testing.assert_allclose(numbers, 30.0 / np.pi * np.stack([branch.omega, branch.rotor_speed]), rtol=1e-8)
 
 
 def test_settle_and_growth_ask_what_is_typed(typed, tmp_path, monkeypatch):

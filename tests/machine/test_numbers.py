@@ -13,12 +13,12 @@ from scenes import BALLS, machines, scene
 from scenes import ROTOR as ROTOR_NUMBERS
 
 import jaxvib as jv
+from jaxvib.display import shown_unit
 from jaxvib.machine.files import EFFECTS, SECTIONS
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.numbers.named import find_number, numbers_of, put_numbers, read_value
 from jaxvib.report.arguments import GROUPS, arguments_of, part_of
 from jaxvib.sweeps.axes import axis_of
-from jaxvib.units import shown_unit
 from optimize import DesignSpace
 
 

@@ -151,7 +151,7 @@ def test_a_run_that_left_its_mode_is_no_verification(monkeypatch):
         return dataclasses.replace(run, omega=run.omega * 0.0 + 50.0)
 
     monkeypatch.setattr(sys.modules[synthesize.__module__], "settle", settled)
-    assert _run(scene("two_mass", speed=120.0), 3, True) == (None, "the motion left mode 3 and settled at 50 rad/s")
+    assert _run(scene("two_mass", speed=120.0), 3, True) == (None, "the motion left mode 3 and settled at 477.465 rpm")
 
 
 def test_verification_without_exact_motion_starts_in_the_jam(monkeypatch):

@@ -78,14 +78,14 @@ def test_a_scene_file_with_a_hostile_name(tmp_path, monkeypatch, capsys):
     said = " ".join(page.text)
     assert name in said and "evil.example" not in text
     assert "Machine" in said and "N s/m" in said and "by slope, for light loads" in said and len(page.links) == 2
-    assert "amplitude, m" in said and "m or rad" not in said and "omega, rad/s" in said and "jaxvib" in said
+    assert "amplitude, mm" in said and "m or rad" not in said and "omega, rpm" in said and "jaxvib" in said
 
 
 def test_numbers_that_are_not_finite_and_long_lists():
     document = {"error": math.nan, "omega": list(range(40)), "table": [[1.0, 2.0]] * 300, "empty": [], "flag": True}
     page = checked(Report("x", {**document, "error": None}, {"omega": "rad/s"}).html())
     said = " ".join(page.text)
-    assert "40 numbers from 0 to 39" in said and "100 more rows" in said and "yes" in said and "omega, rad/s" in said
+    assert "40 numbers from 0 to 372.4" in said and "100 more rows" in said and "yes" in said and "omega, rpm" in said
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)
@@ -93,7 +93,7 @@ def test_parameters_of_every_template_have_units(kind, tmp_path):
     path = jv.html_report(RESULT, tmp_path / "r.html", scene=jv.scene_from_toml(TEMPLATES[kind]), figures=[])
     text = path.read_text()
     checked(text)
-    assert "<td class='unit'>kg</td>" in text and "<td class='unit'>rad/s</td>" in text
+    assert "<td class='unit'>kg</td>" in text and "<td class='unit'>rpm</td>" in text
     assert RESULT.message in text
 
 

@@ -58,7 +58,7 @@ def test_a_map_has_the_values_at_their_place(grid):
     figure = plot_map(grid.store, "weighted", x="drive.speed", y="loads.drag")
     mesh = figure.axes[0].collections[0]
     np.testing.assert_array_equal(np.asarray(mesh.get_array()), grid.data["weighted"].values.T)
-    assert figure.axes[0].get_yscale() == "log" and figure.axes[0].get_xlabel() == "rotor speed, rad/s"
+    assert figure.axes[0].get_yscale() == "log" and figure.axes[0].get_xlabel() == "rotor speed, rpm"
     turned = plot_map(grid.store, "weighted", x="loads.drag")
     np.testing.assert_array_equal(np.asarray(turned.axes[0].collections[0].get_array()), grid.data["weighted"].values)
 

@@ -60,14 +60,19 @@ def stability_map(
     ]
 
     def text() -> str:
-        shown = [[f"{row['value']:.6g}", f"{100.0 * row['stable_share']:.3g} %", _special(row["special"])] for row in rows]
-        return table(f"exact jams over {vary}", [vary, "of load speeds stable", "where stability changes, rad/s"], shown)
+        from jaxvib.display import speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
+        shown = [
+            [f"{row['value']:.6g}", f"{100.0 * row['stable_share']:.3g} %", _special(row["special"], scale)] for row in rows
+        ]
+        return table(f"exact jams over {vary}", [vary, "of load speeds stable", f"where stability changes, {unit}"], shown)
 
     output.done({"vary": vary, "map": rows}, text, "stability_map", found)
 
 
-def _special(points: list[dict]) -> str:
-    return ", ".join(f"{p['kind'].replace('_', ' ')} {p['omega']:.5g}" for p in points) or "nowhere"
+def _special(points: list[dict], scale: float) -> str:
+    return ", ".join(f"{p['kind'].replace('_', ' ')} {scale * p['omega']:.5g}" for p in points) or "nowhere"
 
 
 @app.command("onset")

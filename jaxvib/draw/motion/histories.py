@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, SpeedUnit, legend_above, load_names, panels, speed_scale
+from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, legend_above, load_names, panels
 
 _BINS = 300
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
@@ -64,7 +65,7 @@ def time_histories(
     names: Sequence[str],
     units: Sequence[str] | None = None,
     directions: Sequence[str] = ("force",),
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
     """Draw the histories of a run in two columns: the `whole` run as bands between its peaks, and its last periods as curves.
@@ -86,7 +87,7 @@ def time_histories(
     ['displacement, mm', 'tilt, mrad', 'speed, rad/s', 'foundation force, N']
     """
     units = ["m"] * len(names) if units is None else units
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     kinds = [(kind, label) for kind, label in (("m", "displacement, mm"), ("rad", "tilt, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, 2, size=(5.4, 2.3), widths=(1.7, 1.0), share_x="col", ax=ax)
     period = period_of(end[0], end[1])
@@ -151,7 +152,7 @@ def amplitude_histories(
     names: Sequence[str],
     units: Sequence[str],
     directions: Sequence[str] = ("force",),
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
     """Draw the histories of an averaged run, a panel for each quantity; amplitudes are zero to peak.
@@ -159,7 +160,7 @@ def amplitude_histories(
     `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
     (nt, count) and `rotor_speed` (nt,) are in rad/s, drawn in `unit`, and the foundation force `force` (nt, nb) is in N.
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)
 

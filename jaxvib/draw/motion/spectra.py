@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, legend_above, panels
 
 _DECADES = 1e-4
 """Lower end of the amplitude scale, relative to the largest amplitude."""
@@ -21,7 +22,7 @@ def spectrum_chart(
     load_speed: np.ndarray,
     resonances: np.ndarray,
     *,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw amplitudes (nf,) by name with unit, on a log scale, over frequency (nf,), with reference lines.
@@ -29,7 +30,7 @@ def spectrum_chart(
     Vertical lines are the rotor speed (1,), the mean load speed and the resonances. Frequencies and speeds are in rad/s, drawn
     in `unit`.
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
     top = max(float(np.max(values)) for values in series.values())
     for k, (name, values) in enumerate(series.items()):
@@ -57,7 +58,7 @@ def waterfall_chart(
     load_speed: np.ndarray,
     resonances: np.ndarray,
     *,
-    unit: SpeedUnit = "rad/s",
+    unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
     """Draw amplitudes (P, nf) as shades of grey over time (P,), s, and frequency (nf,); `name` includes their unit.
@@ -65,7 +66,7 @@ def waterfall_chart(
     The rotor speed and the load speed (P,) are drawn as lines, resonances as horizontal lines. Frequencies and speeds are in
     rad/s, drawn in `unit`.
     """
-    scale = speed_scale(unit)
+    unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.4), ax=ax)
     top = max(float(np.max(values)), 1e-300)
     shade = axis.pcolormesh(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.display import quantity_text
 from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
@@ -96,8 +97,8 @@ class AbstractMeasured(eqx.Module):
         """Return the amplitudes and the foundation force of a `scene` as a line of text."""
         structure = scene.machine.structure()
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
-        amplitude = ", ".join(f"{name} {float(a):.4g} {unit}" for name, a, unit in named)
-        return f"amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N"
+        amplitude = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
+        return f"amplitude, zero to peak: {amplitude}; foundation force {quantity_text(self.foundation_force, 'N', 4)}"
 
 
 class Measured(AbstractMeasured):

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
@@ -114,12 +115,13 @@ class Regime(Result):
     def summary(self) -> str:
         """Return the name and its evidence as text."""
         pattern = sentence(self.pattern)
-        speeds = ", ".join(f"{float(w):.5g}" for w in self.load_speed)
-        evidence = [f"loads {speeds} rad/s, rotor {float(self.rotor_speed):.5g} rad/s, ripple {float(self.ripple):.2g} rad/s"]
+        loads, rotor = (speed_text(speed) for speed in (self.load_speed, self.rotor_speed))
+        evidence = [f"loads {loads}, rotor {rotor}, ripple {speed_text(self.ripple, 2)}"]
         if bool(self.name == RegimeName.jammed):
             # A mode that rises to the rotor speed lies beyond its resonance.
             where = "beyond" if int(self.mode) == 2 * int(self.resonance) + 1 else "by"
-            near = f"{where} resonance {int(self.resonance)} at {float(self.resonance_speed):.5g} rad/s (mode {int(self.mode)})"
+            speed = speed_text(self.resonance_speed)
+            near = f"{where} resonance {int(self.resonance)} at {speed} (mode {int(self.mode)})"
             evidence += [near, pattern]
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
             evidence += [self._remainder(), pattern]

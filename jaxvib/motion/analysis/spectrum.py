@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -20,7 +21,8 @@ from jaxvib.units import count
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 _FINER = 4
 """Ratio of the resolution of a piece and the spacing of frequencies; the heights of peaks are then accurate to 2 %."""
@@ -64,7 +66,7 @@ class Spectrum(Result):
         last = self.amplitude[-1]
         peaks = np.argmax(last, axis=0)
         lines = [
-            f"{name}: {last[k, j]:.4g} {unit} at {self.frequency[k]:.5g} rad/s"
+            f"{name}: {quantity_text(last[k, j], unit, 4)} at {speed_text(self.frequency[k])}"
             for j, (name, unit, k) in enumerate(zip(self.coordinates, self.units, peaks, strict=True))
         ]
         return "\n".join(
@@ -77,7 +79,7 @@ class Spectrum(Result):
         *,
         show: Literal["displacement", "force"] = "displacement",
         coordinate: str | None = None,
-        unit: SpeedUnit = "rad/s",
+        unit: SpeedUnit | None = None,
         ax: Axes | None = None,
     ) -> Drawn:
         """Plot amplitudes over frequency for one piece, or a waterfall over time for several, darker for larger amplitudes.

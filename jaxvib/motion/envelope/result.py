@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured
@@ -19,7 +20,8 @@ from jaxvib.results.result import Result
 from jaxvib.steady.outcome import REFUSED
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
 
 
 class EnvelopeStatus(eqx.Enumeration):
@@ -94,7 +96,6 @@ class Envelope(AbstractMeasured, Result):
     def summary(self) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak."""
         unstable, first = bool(self.status == EnvelopeStatus.would_separate), []
-        speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
         end = EnvelopeStatus[EnvelopeStatus.done] if unstable else self.message
         if unstable:
@@ -104,15 +105,15 @@ class Envelope(AbstractMeasured, Result):
                 *first,
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
-                f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
+                f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
+                f"rotor at {speed_text(self.window.rotor_speed[-1], 6)}",
                 f"  {self.extent(self.scene)}",
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
         )
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot amplitudes, load and rotor speeds, and the amplitude of the foundation force over time.
 
         **Arguments**: `unit` and `ax` as `Run.plot`.

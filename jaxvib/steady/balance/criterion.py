@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_unit
 from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, turning
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.terms import (
@@ -31,7 +32,8 @@ from jaxvib.steady.balance.speeds import CharacteristicSpeeds, CriterionStatus, 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 
 class Criterion(Result):
@@ -77,15 +79,15 @@ class Criterion(Result):
         """Return the characteristic speeds and intervals as a table in text."""
 
         def written(intervals: list[list[float | None]]) -> str:
-            return ", ".join(f"{a:.6g} .. {'infinity' if b is None else f'{b:.6g}'}" for a, b in intervals)
+            return ", ".join(f"{scale * a:.6g} .. {'infinity' if b is None else f'{scale * b:.6g}'}" for a, b in intervals)
 
-        table = criterion_table(self)
+        table, (unit, scale) = criterion_table(self), speed_unit()
         lines = [f"{table['status']}", self.speeds.summary()]
-        lines += [f"{name + ' at':14s}{written(table[name])} rad/s" for name in ("balancing", "gathering")]
+        lines += [f"{name + ' at':14s}{written(table[name])} {unit}" for name in ("balancing", "gathering")]
         return "\n".join(lines)
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the characteristic speeds with damping, and the intervals between them, in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.

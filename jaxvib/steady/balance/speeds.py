@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.display import speed_unit
 from jaxvib.equations.linear import LinearModel, linear_model, require_one_point
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -25,7 +26,8 @@ from jaxvib.units.known import when_known
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 _GRID_POINTS = 24
 """Number of grid points on each side of each resonance in the search for sign changes of the damped machine."""
@@ -82,10 +84,10 @@ class CharacteristicSpeeds(Result):
 
     def summary(self) -> str:
         """Return a table in text: each speed without and with damping, and the mode shape of each resonance."""
-        damped = dict(self.labelled(damped=True))
-        lines = [f"{'':14s}{'undamped':>12s}{'damped':>12s}  rad/s; mode shape ({', '.join(self.coordinates)})"]
+        damped, (unit, scale) = dict(self.labelled(damped=True)), speed_unit()
+        lines = [f"{'':14s}{'undamped':>12s}{'damped':>12s}  {unit}; mode shape ({', '.join(self.coordinates)})"]
         for label, speed in self.labelled():
-            line = f"{label:14s}{speed:12.6g}{f'{damped[label]:.6g}' if label in damped else 'none':>12s}"
+            line = f"{label:14s}{scale * speed:12.6g}{f'{scale * damped[label]:.6g}' if label in damped else 'none':>12s}"
             if label.startswith("resonance"):
                 shape = self.shapes[:, int(label.split()[1]) - 1]
                 largest = shape[jnp.argmax(jnp.abs(shape))]
@@ -93,7 +95,7 @@ class CharacteristicSpeeds(Result):
             lines.append(line)
         return "\n".join(lines)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot resonances and additional speeds, without and with damping, on a line each, in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from jax import Array
 
+from jaxvib.display import speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
 
 
 class _Branch(Protocol):
@@ -34,13 +36,18 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], j
     **Arguments**: `marks`: special points (kind, load speed, rotor speed); `judged`: text on how stability is determined.
     """
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
-    natural = ", ".join(f"{float(w):.6g}" for w in estimated_frequencies(branch.scene))
+    ends = speed_text([np.min(omega), np.max(omega)], 6, " to ")
     lines = [
-        f"{omega.size} points from {np.min(omega):.6g} to {np.max(omega):.6g} rad/s, {np.mean(stable):.1%} of them stable "
-        f"{judged}; resonances {natural} rad/s"
+        f"{omega.size} points from {ends}, {np.mean(stable):.1%} of them stable {judged}; "
+        f"resonances {speed_text(estimated_frequencies(branch.scene), 6)}"
     ]
     names = [(kind.replace("_", " "), w, n) for kind, w, n in marks]
-    return "\n".join([*lines, *(f"  {kind}: Omega {w:.6g} rad/s, rotor {n:.6g} rad/s" for kind, w, n in names)])
+    return "\n".join(
+        [
+            *lines,
+            *(f"  {kind}: Omega {speed_text(w, 6)}, rotor {speed_text(n, 6)}" for kind, w, n in names),
+        ]
+    )
 
 
 MARKS = {
@@ -55,7 +62,7 @@ MARKS = {
 def plot_branch(
     branch: _Branch,
     marks: Sequence[tuple[str, float, float]],
-    unit: SpeedUnit,
+    unit: SpeedUnit | None,
     most: float | None,
     judged: str,
     show: Sequence[str],

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force, require_drag
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -37,7 +38,8 @@ from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units.known import when_known
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
 
 STABILITY_CRITERION = "by slope, for light loads that stay together"
 """Criterion of the stability of a jam mode, and its condition."""
@@ -95,10 +97,10 @@ class Jam(AbstractJam):
         """Return one line of text; amplitude zero to peak."""
         if not np.isfinite(self.omega):
             return f"mode {int(self.mode)}: {self.message}"
-        amplitude = ", ".join(f"{float(a):.4g}" for a in self.amplitude)
         return (
-            f"mode {int(self.mode)}: Omega {float(self.omega):.6g} rad/s, {self.judgement}, "
-            f"amplitude {amplitude} m, foundation force {float(self.foundation_force):.4g} N"
+            f"mode {int(self.mode)}: Omega {speed_text(self.omega, 6)}, {self.judgement}, "
+            f"amplitude {quantity_text(self.amplitude, 'm', 4)}, "
+            f"foundation force {quantity_text(self.foundation_force, 'N', 4)}"
         )
 
     @property
@@ -109,7 +111,7 @@ class Jam(AbstractJam):
         return f"{'stable' if self.stable else 'unstable'} by slope"
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot the speed of the loads in `unit`, and the amplitudes, onto two axes `ax` if given.
 
         **Returns** a matplotlib figure, or the given `ax`.
@@ -158,10 +160,10 @@ class JamModes(AbstractJam):
 
     def _require(self, mode: int) -> None:
         if status_names(self.status)[mode - 1] == "absent":
-            there = ", ".join(map(str, self.mode_numbers()))
+            there, rotor = ", ".join(map(str, self.mode_numbers())), speed_text(np.asarray(self.rotor_speed)[0], 6)
             raise ComputationError(
                 "absent",
-                f"jam mode {mode} does not exist at rotor speed {float(self.rotor_speed[0]):.6g} rad/s; there: {there}",
+                f"jam mode {mode} does not exist at rotor speed {rotor}; there: {there}",
             )
 
     @validated
@@ -176,14 +178,17 @@ class JamModes(AbstractJam):
 
     def summary(self) -> str:
         """Return a table in text; amplitudes zero to peak."""
-        lines = [f"rotor speed {np.asarray(self.rotor_speed)[0]:.6g} rad/s, resonances "]
-        lines[0] += ", ".join(f"{w:.6g}" for w in np.asarray(self.resonances)) + " rad/s"
+        rotor, resonances = (speed_text(speed, 6) for speed in (np.asarray(self.rotor_speed)[0], self.resonances))
         return "\n".join(
-            [*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {STABILITY_CRITERION}"]
+            [
+                f"rotor speed {rotor}, resonances {resonances}",
+                *(f"  {self.select(k).summary()}" for k in self.mode_numbers()),
+                f"stable: {STABILITY_CRITERION}",
+            ]
         )
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot the speeds of the loads in `unit` among the resonances, and amplitudes, by mode; onto two axes `ax` if given.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
@@ -196,7 +201,7 @@ def _row(jams: Jam, row: Array | np.ndarray) -> Jam:
     return jax.tree.map(lambda leaf: leaf[row], jams)
 
 
-def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, ax: Onto) -> Drawn:
+def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit | None, ax: Onto) -> Drawn:
     from jaxvib.draw.results import modes_chart  # slow import
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))

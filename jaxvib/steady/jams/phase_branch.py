@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.display import speed_text
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.steady.jams.phases import PhaseStatus
@@ -17,7 +18,8 @@ from jaxvib.steady.jams.phases import PhaseStatus
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 _PHASE_JUMP = 0.3
 """Change of a phase, rad, from one load speed to the next above which a figure shows another pattern."""
@@ -51,14 +53,14 @@ class PhaseBranch(Result):
         factor, omega = np.asarray(self.drag_factor), np.asarray(self.omega)
         there = np.isfinite(factor)
         if not np.any(there):
-            return f"no jam from {omega[0]:.6g} to {omega[-1]:.6g} rad/s"
+            return f"no jam from {speed_text(omega[[0, -1]], 6, ' to ')}"
         return (
             f"{np.sum(there)} of {omega.size} load speeds have a jam, {np.sum(np.asarray(self.stable))} a stable one, from "
-            f"{np.min(omega[there]):.6g} to {np.max(omega[there]):.6g} rad/s, at {np.min(factor[there]):.4g} to "
+            f"{speed_text([np.min(omega[there]), np.max(omega[there])], 6, ' to ')}, at {np.min(factor[there]):.4g} to "
             f"{np.max(factor[there]):.4g} times the scene's drag"
         )
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the speeds of loads and rotor over the drag (N s/m, or relative to the scene's if loads differ in it); stable
         solid, unstable dashed.
 

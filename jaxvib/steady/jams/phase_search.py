@@ -46,7 +46,8 @@ from jaxvib.units import count, random_numbers
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 _SHOWN_DRAG_FACTOR = 30.0
 """Drag range of a figure of all jams: from the scene's drag divided by this factor to the drag times it."""
@@ -95,7 +96,7 @@ class PhaseJams(AbstractPhaseJam):
         return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
 
     @validated
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot the speeds of the loads over the drag, from a 30th of the scene's to 30 times it, for each pattern of these
         jams.
 

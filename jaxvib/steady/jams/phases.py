@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.averaged import Averaged, averaged_growth, averaged_model, mean_torque
 from jaxvib.equations.linear import JAM_TERMS, LinearModel, linear_model, peak_force, require_drag, turning, turning_loads
 from jaxvib.errors import InputError
@@ -107,7 +108,7 @@ class PhaseJam(AbstractPhaseJam):
             return self.message
         phases = ", ".join(f"{degrees(float(a)):.4g}" for a in self.phase)
         stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
-        return f"Omega {float(self.omega):.6g} rad/s, {stable}, {sentence(self.pattern)}: {phases} deg"
+        return f"Omega {speed_text(self.omega, 6)}, {stable}, {sentence(self.pattern)}: {phases} deg"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -117,7 +118,7 @@ class PhaseJam(AbstractPhaseJam):
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
-        return phase_circles([(f"{float(self.omega):.4g} rad/s", np.asarray(self.phase))], ax=ax)
+        return phase_circles([(speed_text(self.omega, 4), np.asarray(self.phase))], ax=ax)
 
 
 class TorqueBalance(eqx.Module):

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
@@ -156,13 +157,11 @@ class Orbit(Result):
     def summary(self) -> str:
         """Return the result as a few lines of text; amplitudes zero to peak."""
         kinds = {unit: [k for k, each in enumerate(self.units) if each == unit] for unit in dict.fromkeys(self.units)}
-        amplitude = "; ".join(
-            f"{', '.join(f'{float(self.amplitude[k]):.6g}' for k in places)} {unit}" for unit, places in kinds.items()
-        )
+        amplitude = "; ".join(quantity_text(np.asarray(self.amplitude)[places], unit, 6) for unit, places in kinds.items())
         return (
-            f"loads {float(self.omega):.9g} rad/s, rotor {float(self.rotor_speed):.9g} rad/s, "
+            f"loads {speed_text(self.omega, 9)}, rotor {speed_text(self.rotor_speed, 9)}, "
             f"{self.judgement} (largest multiplier {float(self.multiplier):.6g})\n"
-            f"amplitude {amplitude}, foundation force {float(self.foundation_force):.6g} N, "
+            f"amplitude {amplitude}, foundation force {quantity_text(self.foundation_force, 'N', 6)}, "
             f"power {float(self.power):.6g} W\n"
             f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
         )

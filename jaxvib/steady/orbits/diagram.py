@@ -31,7 +31,8 @@ from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
 
 _ORBITS_PER_BATCH = 32
 """Number of orbits in a batch: enough to fill vector registers, few enough for the cache."""
@@ -98,7 +99,7 @@ class ExactBranches(Result):
     def plot(
         self,
         *,
-        unit: SpeedUnit = "rad/s",
+        unit: SpeedUnit | None = None,
         most: float | None = None,
         show: Sequence[str] = ("speed", "amplitude", "force"),
         ax: Onto = None,

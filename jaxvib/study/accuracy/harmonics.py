@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError, quoted
@@ -61,7 +62,7 @@ class HarmonicConvergence(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        names = [f"{w:.4g} rad/s" for w in self.omega]
+        names = [speed_text(w, 4) for w in self.omega]
         from jaxvib.draw.comparison import convergence_chart  # slow import
 
         return convergence_chart(self.harmonics, self.error, self.known, names=names, ax=ax)

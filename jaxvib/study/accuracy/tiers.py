@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit, part
@@ -51,7 +52,7 @@ class Tiers(Result):
         lines = []
         for k, mass in enumerate(self.mass):
             light, exact = (
-                f"{tier.omega[k]:.9g} rad/s" if np.isfinite(tier.omega[k]) else tier.message[k]
+                speed_text(tier.omega[k], 9) if np.isfinite(tier.omega[k]) else tier.message[k]
                 for tier in (self.leading, self.exact)
             )
             lines.append(f"load of {mass:.4g} kg: leading order {light}, exact {exact}")

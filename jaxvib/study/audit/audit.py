@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import Effect
@@ -215,7 +216,7 @@ def _comparison(
             jammed = JamComparison(chosen)
             if mode is not None:
                 jam_modes(without_excluded_effects(scene)).select(mode)  # raises an error if the mode does not exist
-            return jammed, f"jam mode {chosen} at {float(scene.drive.speed):.5g} rad/s"
+            return jammed, f"jam mode {chosen} at {speed_text(scene.drive.speed)}"
         except InputError:
             if mode is not None:
                 raise

@@ -22,7 +22,8 @@ from jaxvib.steady.balance.criterion import criterion
 from jaxvib.steady.balance.states import balanced_growth, stability_changes
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
 
 
 class CriterionMap(Result):
@@ -62,7 +63,7 @@ class CriterionMap(Result):
             lines.append(f"{factor:>16.3g}" + "".join(f"{cell:>16}" for cell in cells))
         return "\n".join(lines)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot agreement and disagreement of the criterion over rotor speed in `unit` and load mass, one panel for each drag,
         onto as many axes `ax` if given.
 

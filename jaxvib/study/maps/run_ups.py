@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.effects.base import has_term
@@ -33,7 +34,8 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, numbers, random_numbers
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
 
 _FAILED = "failed"
 """Name of the outcome of a run that did not reach its end and has no regime."""
@@ -82,12 +84,12 @@ class RunUps(Result):
             portions = []
             for kind in (kind for kind in (*REGIMES, _FAILED) if np.any(self.kind[k] == kind)):
                 speeds = self.omega[k][self.kind[k] == kind]
-                at = f" at {_span(speeds)} rad/s" if kind == "jammed" else ""
+                at = f" at {_span(speeds)}" if kind == "jammed" else ""
                 portions.append(f"{100.0 * np.mean(self.kind[k] == kind):.3g} % {kind}{at}")
             lines.append(f"drag {drag:.4g} N s/m: {', '.join(portions)}")
         return "\n".join(lines)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot the shares of the kinds of motion, and the load speeds in `unit`, over drag, onto two axes `ax` if given.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
@@ -102,7 +104,7 @@ class RunUps(Result):
 def _span(values: np.ndarray) -> str:
     """Return text with one number if all are equal to a thousandth, otherwise with the smallest and the largest."""
     low, high = float(np.min(values)), float(np.max(values))
-    return f"{low:.4g}" if high - low < 1e-3 * high else f"{low:.4g} .. {high:.4g}"
+    return speed_text(low if high - low < 1e-3 * high else [low, high], 4, " .. ")
 
 
 @validated

@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import make_scene
@@ -23,7 +24,8 @@ from jaxvib.units import number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxvib.draw.style import Drawn, SpeedUnit
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn
 
 
 class StabilityMap(Result):
@@ -48,11 +50,11 @@ class StabilityMap(Result):
         """Return a line of text for each value: the stable share of the range, and the special points."""
         lines = []
         for x, stable, points in zip(self.value, self.stable, self.special, strict=True):
-            kinds = ", ".join(f"{point.kind.replace('_', ' ')} at {point.omega:.6g} rad/s" for point in points)
+            kinds = ", ".join(f"{point.kind.replace('_', ' ')} at {speed_text(point.omega, 6)}" for point in points)
             lines.append(f"{x:.6g}: {np.mean(stable):.1%} of the load speeds stable; {kinds or 'no special point'}")
         return "\n".join(lines)
 
-    def plot(self, *, label: str = "x", unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
+    def plot(self, *, label: str = "x", unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
         """Plot stable jams as shaded areas over the load speed in `unit` and x, special points as marks; `label` is x's name.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.

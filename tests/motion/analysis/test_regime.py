@@ -80,9 +80,9 @@ def test_loads_at_one_station_cannot_balance_a_moment(effects, label):
 @pytest.mark.parametrize(
     ("speed", "damping", "mode", "near"),
     [
-        (3.0, 0.01, 5, "beyond resonance 2 at 1 rad/s"),
-        (3.0, 0.01, 3, "by resonance 2 at 1 rad/s"),
-        (0.5, 0.05, 3, "beyond resonance 1 at 0.3"),
+        (3.0, 0.01, 5, "beyond resonance 2 at 9.5493 rpm"),
+        (3.0, 0.01, 3, "by resonance 2 at 9.5493 rpm"),
+        (0.5, 0.05, 3, "beyond resonance 1 at 3.1831 rpm"),
     ],
 )
 def test_a_run_that_starts_in_a_mode_and_stays_has_that_mode(speed, damping, mode, near):

@@ -191,7 +191,7 @@ def test_select_says_what_is_wrong():
     for wrong in (2.0, "3", True, None):
         with pytest.raises(jv.InputError, match="it must be a whole number"):
             modes.select(wrong)
-    with pytest.raises(jv.ComputationError, match=r"jam mode 5 does not exist at rotor speed 1 rad/s; there: 3") as error:
+    with pytest.raises(jv.ComputationError, match=r"jam mode 5 does not exist at rotor speed 9.5493 rpm; there: 3") as error:
         modes.select(5)
     assert error.value.status == "absent"
     jam = modes.select(5, throw=False)
@@ -200,7 +200,7 @@ def test_select_says_what_is_wrong():
 
 def test_summary_lists_the_modes():
     text = jv.jam_modes(published().scene()).summary()
-    assert len(text.splitlines()) == 5 and "mode 3: Omega 0.972053 rad/s, stable by slope" in text and "mode 4" in text
+    assert len(text.splitlines()) == 5 and "mode 3: Omega 9.28242 rpm, stable by slope" in text and "mode 4" in text
     assert text.endswith("stable: by slope, for light loads that stay together")
 
 

@@ -192,7 +192,7 @@ def test_jams_are_found_from_distant_load_speeds():
 def test_figure_of_convergence():
     found = jv.harmonic_convergence(published(eps=0.05).scene(), [0.34, 0.97], points=(4, 8))
     assert found.harmonics.tolist() == [3, 7] and np.all(found.error[1] < 1e-4 * found.error[0])
-    assert [line.get_label() for line in found.plot().axes[0].lines[::2]] == ["0.34 rad/s", "0.97 rad/s", "estimate"]
+    assert [line.get_label() for line in found.plot().axes[0].lines[::2]] == ["3.247 rpm", "9.263 rpm", "estimate"]
     with pytest.raises(jv.InputError, match="ascending"):
         jv.harmonic_convergence(published().scene(), [0.9], points=(8, 4))
 

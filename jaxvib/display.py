@@ -1,0 +1,114 @@
+"""Units in which texts, tables and figures show numbers to readers; data and files of results stay in SI units."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
+
+SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
+"""Unit in which speeds are shown."""
+
+_SPEED_FACTORS = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
+
+
+class _Chosen:
+    """Display units of this process."""
+
+    speed: SpeedUnit = "rpm"
+    si = False
+
+
+@validated
+def display_units(*, speed: SpeedUnit = "rpm", si: bool = False) -> None:
+    """Set the units of all texts, tables and figures of this process; without arguments, the usual ones of engineers.
+
+    The command-line option `--unit` sets `speed`.
+
+    **Arguments**
+
+    - `speed`: unit of speeds and frequencies, "rpm", "Hz" or "rad/s"
+    - `si`: True for m, N/m and kg; False for mm, N/mm and g where they suit the size of the number. Machines of dimensionless
+      numbers read best with `speed="rad/s", si=True`
+
+    **Returns** None. **Raises** `InputError` for another unit.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> print(jv.mode_shapes(scene).summary())
+    267.434 rpm: y1 +1.000
+    >>> jv.display_units(speed="Hz")
+    >>> print(jv.mode_shapes(scene).summary())
+    4.45723 Hz: y1 +1.000
+    >>> jv.display_units()
+    """
+    if not isinstance(si, bool):
+        raise InputError("si", f"is {quoted(si)}; it must be True or False")
+    _Chosen.speed, _Chosen.si = speed_unit(speed)[0], si
+
+
+def speed_unit(unit: SpeedUnit | None = None) -> tuple[SpeedUnit, float]:
+    """Return a unit of speeds, by default that of `display_units`, and the factor from rad/s to it.
+
+    **Raises** `InputError` for a unit other than "rad/s", "rpm" and "Hz".
+
+    >>> unit, factor = speed_unit("rpm")
+    >>> round(factor, 3)
+    9.549
+    """
+    unit = _Chosen.speed if unit is None else unit
+    if not isinstance(unit, str) or unit not in _SPEED_FACTORS:
+        raise InputError("unit", f"is {quoted(unit)}; it must be one of 'rad/s', 'rpm', 'Hz'")
+    return unit, _SPEED_FACTORS[unit]
+
+
+def shown_unit(unit: str, size: float) -> tuple[str, float]:
+    """Return the display unit of values of about `size`, and the factor from the SI value to it.
+
+    >>> shown_unit("m", 0.02), shown_unit("N", 120.0)
+    (('mm', 1000.0), ('N', 1.0))
+    """
+    if unit == "rad/s":
+        return speed_unit()
+    if _Chosen.si:
+        return unit, 1.0
+    if unit == "N/m" and size >= 1e3:
+        return "N/mm", 1e-3
+    if unit in ("m", "meter") and 0.0 < size < 1.0:
+        return ("mm", 1e3) if size >= 1e-5 else ("um", 1e6)
+    if unit == "rad":
+        return "deg", 180.0 / np.pi
+    if unit == "kg" and 0.0 < size < 1.0:
+        return "g", 1e3
+    if unit == "N" and size >= 1e4:
+        return "kN", 1e-3
+    return unit, 1.0
+
+
+def quantity_text(values: ArrayLike, unit: str, digits: int = 5, between: str = ", ") -> str:
+    """Return numbers in their display unit as text, with the unit once.
+
+    **Arguments**: `values` in the SI `unit`, a number or an array of one axis; `digits`: significant digits; `between`:
+    separator.
+
+    >>> quantity_text([0.0234, 0.0012], "m", 3)
+    '23.4, 1.2 mm'
+    """
+    numbers = np.atleast_1d(np.asarray(values, float))
+    shown, factor = shown_unit(unit, float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers))))
+    return between.join(f"{factor * x:.{digits}g}" for x in numbers) + f" {shown}"
+
+
+def speed_text(values: ArrayLike, digits: int = 5, between: str = ", ") -> str:
+    """Return speeds, rad/s, as `quantity_text` does.
+
+    >>> speed_text(157.0796), speed_text([100.0, 200.0], 3, " .. ")
+    ('1500 rpm', '955 .. 1.91e+03 rpm')
+    """
+    return quantity_text(values, "rad/s", digits, between)
