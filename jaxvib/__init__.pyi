@@ -23,7 +23,7 @@ from jaxvib.machine.loads import Loads, balls, pendulums, rollers
 from jaxvib.machine.torus import torus_balls
 
 # Drives
-from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp
+from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp, SwitchedOff
 
 # Effects
 from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, StaticImbalance
@@ -35,7 +35,7 @@ from jaxvib.machine.effects.supports import CubicSupport, Stop
 
 # Scenes, and their files
 from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
-from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.scene import Exciter, Scene, unbalance
 
 # The equations
 from jaxvib.equations.dynamics import vector_field
@@ -157,6 +157,7 @@ __all__ = [
     "RunUp",
     "DCMotor",
     "InductionMotor",
+    "SwitchedOff",
     # Effects
     "Effect",
     "Gravity",
@@ -172,6 +173,7 @@ __all__ = [
     # Scenes, and their files
     "Scene",
     "Exciter",
+    "unbalance",
     "load_scene",
     "save_scene",
     "scene_from_toml",

@@ -61,6 +61,7 @@ class Motion(NamedTuple):
     - `weight`: torque of gravity on the unbalance, see `RotorDynamics.weight`
     - `rolling`: forces on the loads if all of them roll
     - `housing`: speed at which the housing turns with the machine; None if it does not turn
+    - `time`, s
     """
 
     state: ExciterState
@@ -71,6 +72,7 @@ class Motion(NamedTuple):
     weight: Array | None
     rolling: ContactSolution
     housing: Array | None
+    time: Array
 
 
 class Eliminated(NamedTuple):
@@ -127,7 +129,7 @@ class RotorDynamics(eqx.Module):
         """Return the quantities that do not need the accelerations, for a rotor that turns at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
         drag, weight = jnp.zeros_like(speed), self.weight(t, state)
-        return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact, housing)
+        return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the exciter's own accelerations in terms of those of the mount.
@@ -187,7 +189,8 @@ class RotorDynamics(eqx.Module):
 
     def _motor(self, motion: Motion) -> tuple[Array, Array] | None:
         """Return the torque of a motor, at its speed relative to the housing, and its inertia; None under an ideal drive."""
-        return self.drive.torque_and_inertia(motion.speed if motion.housing is None else motion.speed - motion.housing)
+        speed = motion.speed if motion.housing is None else motion.speed - motion.housing
+        return self.drive.torque_and_inertia(motion.time, speed)
 
     def _taken_torque(self, motion: Motion, drag: Array, coupling: Axes) -> tuple[Array, list[Array]]:
         """Return (T, c) of the torque T + c . a, N m, that loads, gravity and imbalance take from the rotor.
@@ -283,7 +286,7 @@ class ExciterDynamics(RotorDynamics):
         rubbing = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
         friction = [each.signed({}) if each.normal is None else each for each in rubbing]
         contact = ContactSolution(self.loads.inertia_factor(), force, friction)
-        return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact, housing)
+        return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the accelerations of loads and rotor in terms of those of the mount.

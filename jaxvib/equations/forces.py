@@ -109,7 +109,7 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         weight = total_gravity(effects).get(1)
         if exciter.unbalance is not None and weight is not None:
             parts.append(exciter.unbalance * weight * jnp.sin(turn))
-        motor = drive.torque_and_inertia(rate)
+        motor = drive.torque_and_inertia(t, rate)
         if motor is not None:
             parts.append(0.5 * motor[1] * rate**2)
     supports = zip(terms_of(scene.effects, SupportForce), model.supports, strict=True)
@@ -187,7 +187,7 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
             given.append(spun)
             lost += losses
         driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
-        motor = dynamics.drive.torque_and_inertia(driven)
+        motor = dynamics.drive.torque_and_inertia(t, driven)
         if motor is not None:
             given.append(driven * motor[0])
             continue

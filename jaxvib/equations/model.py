@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -52,6 +53,11 @@ class Model(eqx.Module):
 
 
 def assemble(scene: Scene) -> Model:
-    """Return the model of a scene."""
-    carrier, mounts = scene.machine.carrier(), tuple(scene.machine.mount(exciter.at) for exciter in scene.exciters)
+    """Return the model of a scene. The mass of its carrier includes the masses of unbalances, at the exciters' axes."""
+    carrier, mounts = scene.machine.carrier(), tuple(scene.machine.mount(exciter.place) for exciter in scene.exciters)
+    for exciter, mount in zip(scene.exciters, mounts, strict=True):
+        if exciter.unbalance_mass is not None:
+            rows = mount.rotor_rows()
+            added = carrier.mass + exciter.unbalance_mass * rows.T @ rows
+            carrier = dataclasses.replace(carrier, mass=added)
     return Model(scene, carrier, mounts, tuple(term.rows(scene.machine) for term in terms_of(scene.all_effects, SupportForce)))

@@ -78,6 +78,10 @@ class _TorqueInput(Motor):
         """Return the sum of the motor's torque and the additional torque."""
         return self.extra if self.motor is None else self.motor.torque(speed) + self.extra
 
+    def torque_at(self, t: Array, speed: Array) -> Array:
+        """Return the sum of the motor's torque at time `t` and the additional torque."""
+        return self.extra if self.motor is None else self.motor.torque_at(t, speed) + self.extra
+
 
 class Inputs(NamedTuple):
     """Inputs of the equations.

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
@@ -63,8 +64,8 @@ class Drive(Part):
         """Return the rotor's angular acceleration at time `t` (s), rad/s^2; None if it follows from torques."""
 
     @abc.abstractmethod
-    def torque_and_inertia(self, speed: Array) -> tuple[Array, Array] | None:
-        """Return the torque T (N m) at the rotor's `speed` (rad/s), and the rotor's inertia J (kg m^2).
+    def torque_and_inertia(self, t: Array, speed: Array) -> tuple[Array, Array] | None:
+        """Return the torque T (N m) at time `t` (s) and the rotor's `speed` (rad/s), and the rotor's inertia J (kg m^2).
 
         None if no torque changes the speed.
         """
@@ -97,9 +98,9 @@ class Clockwise(Drive):
         acceleration = self.drive.rotor_acceleration(t)
         return None if acceleration is None else -acceleration
 
-    def torque_and_inertia(self, speed: Array) -> tuple[Array, Array] | None:
+    def torque_and_inertia(self, t: Array, speed: Array) -> tuple[Array, Array] | None:
         """Return the torque of the drive at the opposite speed with the opposite sign, and its inertia."""
-        motor = self.drive.torque_and_inertia(-speed)
+        motor = self.drive.torque_and_inertia(t, -speed)
         return None if motor is None else (-motor[0], motor[1])
 
     def jump_ts(self) -> tuple[Array, ...]:
@@ -161,7 +162,7 @@ class IdealDrive(Drive):
         """Return `acceleration_at`."""
         return self.acceleration_at(t)
 
-    def torque_and_inertia(self, speed: Array) -> None:
+    def torque_and_inertia(self, t: Array, speed: Array) -> None:
         """Return None: no torque changes the speed."""
 
 
@@ -206,9 +207,13 @@ class Motor(Drive):
     def rotor_acceleration(self, t: Array) -> None:
         """Return None: the acceleration follows from the torques."""
 
-    def torque_and_inertia(self, speed: Array) -> tuple[Array, Array]:
-        """Return `torque` and `inertia`."""
-        return self.torque(speed), self.inertia
+    def torque_and_inertia(self, t: Array, speed: Array) -> tuple[Array, Array]:
+        """Return `torque_at` and `inertia`."""
+        return self.torque_at(t, speed), self.inertia
+
+    def torque_at(self, t: Array, speed: Array) -> Array:
+        """Return the torque at time `t` (s) and the rotor's `speed`, N m: `torque`, unless the motor changes with time."""
+        return self.torque(speed)
 
     @abc.abstractmethod
     def torque(self, speed: Array) -> Array:
@@ -427,3 +432,59 @@ class InductionMotor(Motor):
         """Return the torque of Kloss's formula."""
         slip = 1.0 - speed / self.speed
         return 2.0 * self.breakdown_torque * slip * self.breakdown_slip / (slip**2 + self.breakdown_slip**2)
+
+
+class SwitchedOff(Motor):
+    """Motor that is switched off at a time and then turns with the friction of its bearings only.
+
+        T = torque of the motor  (t < at),    T = -bearing theta'  (t >= at)
+
+    `simulate` ends a step at that time. Steady motions are those after it: `torque` is the friction.
+
+    **Arguments** (SI or texts with a unit)
+
+    - `motor` until then, such as an `InductionMotor`
+    - `at`: time at which it is switched off, s, at least 0 (the default: it is off throughout); typical: 0 to 60
+    - `bearing` b, N m s: viscous friction of bearings and belts, at least 0; typical: 0.001 to 0.1
+
+    **Raises** `InputError` for a wrong unit, a negative value, and a motor of the wrong type.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.DCMotor("3000 rpm", stall_torque=2.0, inertia=0.01)
+    >>> off = jv.SwitchedOff(motor, at="10 s", bearing=0.01)
+    >>> [round(float(off.torque_at(t, 50.0)), 3) for t in (9.0, 11.0)]
+    [1.682, -0.5]
+    """
+
+    motor: Motor
+    at: Array = eqx.field(metadata=unit("s", low=0.0, words="time at which the motor is switched off"))
+    bearing: Array = eqx.field(metadata=unit("N m s", low=0.0, words="friction of the bearings"))
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, motor: Motor, at: Number = 0.0, bearing: Number = 0.0):
+        if not isinstance(motor, Motor) or isinstance(motor, SwitchedOff):
+            raise InputError("drive.motor", f"is {quoted(motor)}; it must be a motor, for example InductionMotor(...)")
+        self.motor, self.kind = motor, "switched_off"
+        self.at, self.bearing = read_numbers(SwitchedOff, "drive", at=at, bearing=bearing).values()
+
+    @property
+    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Speed of the motor without a load."""
+        return self.motor.speed
+
+    @property
+    def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Inertia of the motor's rotor."""
+        return self.motor.inertia
+
+    def torque(self, speed: Array) -> Array:
+        """Return the friction of the bearings."""
+        return -self.bearing * speed
+
+    def torque_at(self, t: Array, speed: Array) -> Array:
+        """Return the torque of the motor at `speed` before the time `at`, afterwards the friction of the bearings."""
+        return jnp.where(t < self.at, self.motor.torque(speed), self.torque(speed))
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        """Return the time at which the motor is switched off."""
+        return (self.at,)

@@ -15,11 +15,11 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, written
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
+from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp, SwitchedOff
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
-from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.scene import Exciter, Scene, unbalance
 from jaxvib.machine.structures.plane_body import plane_body, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import TEMPLATES as ROTORS
@@ -61,6 +61,7 @@ DRIVES = {
     "run_up": RunUp,
     "dc_motor": DCMotor,
     "induction_motor": InductionMotor,
+    "switched_off": SwitchedOff,
 }
 SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
 
@@ -249,6 +250,8 @@ def _built_exciter(table: object, k: int) -> Exciter:
     with within(f"exciters[{k}]."):
         values = {name: value for name, value in table.items() if name not in ("loads", "drive", "effects")}
         parts = {name: _built(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
+        if isinstance(values.get("unbalance"), Mapping):
+            values["unbalance"] = build_part(unbalance, values["unbalance"], "unbalance")
         effects = _built_effects(table.get("effects", {}))
         return build_part(Exciter, {**values, **parts, "effects": effects}, "")
 
@@ -293,6 +296,8 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
     entries = {name: _built_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
+    if isinstance(values.get("motor"), Mapping):  # a part within a part
+        entries["motor"] = _built(values["motor"], prefix + "motor", DRIVES)
     return build(**{**values, **entries})
 
 
@@ -350,7 +355,7 @@ def _part_table(section: str, part: Any) -> Tables:
 
 def _exciter_table(exciter: Exciter) -> Tables:
     at = exciter.position if exciter.platform is None else exciter.platform
-    own = {"at": at, "unbalance": exciter.unbalance}
+    own = {"at": at, "body": exciter.body or None, "unbalance": exciter.unbalance, "unbalance_mass": exciter.unbalance_mass}
     table = {name: np.asarray(value).tolist() for name, value in own.items() if value is not None}
     parts = {name: part for name in ("loads", "drive") if (part := getattr(exciter, name)) is not None}
     table |= {"direction": exciter.direction, **{name: _part_table(name, part) for name, part in parts.items()}}
@@ -378,6 +383,8 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
             fields[name] = [_fields(each, _ENTRIES[name]) if name in _ENTRIES else list(each) for each in value]
         elif isinstance(value, (int, str)):
             fields[name] = value
+        elif isinstance(value, Drive):
+            fields[name] = _part_table("drive", value)
         else:
             # An array with one value is written as a number for a machine. For loads it stays a list, because a list of one
             # load's value differs from a value that all loads share.

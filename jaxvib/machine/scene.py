@@ -17,9 +17,9 @@ from jaxvib.machine.drive import Clockwise, Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
 from jaxvib.machine.loads import Loads
-from jaxvib.machine.mount import Mount, read_place
+from jaxvib.machine.mount import Mount, Place, on_body, read_place
 from jaxvib.machine.numbers import Part, read_numbers, unit
-from jaxvib.units import Number
+from jaxvib.units import Number, number
 from jaxvib.units.known import when_known
 
 _MIN_RATIO = 1e-15
@@ -33,17 +33,25 @@ class Exciter(Part):
 
     - `loads` from `balls`, `rollers`, `pendulums`; None without loads
     - `drive`, a `Motor` or an `IdealDrive`; the inertia of a motor includes the unbalance
-    - `unbalance` S, kg m: static moment m r about the exciter's axis of a mass that turns with the rotor, greater than 0. The
-      mass m is part of the machine's mass; typical: 0.1 to 10 kg m
+    - `unbalance` S, kg m: static moment m r about the exciter's axis of a mass that turns with the rotor, greater than 0;
+      typical: 0.1 to 10 kg m. The function `unbalance` returns it from the force that catalogues state
+    - `unbalance_mass` m, kg: mass of the unbalance, added to the machine at the exciter's axis; typical: 5 to 200; default: the
+      machine's mass includes it
     - `at`: place on the machine, a platform number, the distance along a rotor's axis from its mass centre, m (a float or
       text), or the point (x, y) of a body in a plane, m; None for the default of the machine
+    - `body`: number of the body from 0, on machines with several; typical: 0 (the default)
     - `direction` of rotation: +1 anticlockwise, -1 clockwise. Angles and speeds of a state are anticlockwise in both cases
     - `effects` of the rotor and its loads such as `StaticImbalance` or `DryFriction`
 
     **Attributes**: the arguments, `at` as `platform` or `position`; `carries`: names of what turns, "loads" and "unbalance".
 
-    **Raises** `InputError` for a part of the wrong type, an effect that acts on the whole machine, a direction other than +1 or
-    -1, and an exciter with neither loads nor an unbalance.
+    **Raises** `InputError` for
+
+    - a part of the wrong type
+    - an effect that acts on the whole machine
+    - a direction other than +1 or -1
+    - an exciter with neither loads nor an unbalance
+    - the rotor of a motor with less inertia than its unbalance alone, m r^2 = S^2/m
 
     >>> import jaxvib as jv
     >>> motor = jv.DCMotor("1500 rpm", stall_torque=20.0, inertia=0.05)
@@ -55,8 +63,10 @@ class Exciter(Part):
     drive: Drive
     effects: tuple[Effect, ...]
     unbalance: Array | None = eqx.field(metadata=unit("kg m", low=0.0, open_low=True, words="unbalance of the rotor"))
+    unbalance_mass: Array | None = eqx.field(metadata=unit("kg", low=0.0, open_low=True, words="mass of the unbalance"))
     position: Array | None = eqx.field(metadata=unit("m", words="position of the exciter", typical=0.1))
     platform: int | None = eqx.field(static=True)
+    body: int = eqx.field(static=True)
     direction: int = eqx.field(static=True)
     carries: tuple[str, ...] = eqx.field(static=True)
 
@@ -66,7 +76,9 @@ class Exciter(Part):
         drive: Drive | None = None,
         *,
         unbalance: Number | None = None,
+        unbalance_mass: Number | None = None,
         at: int | Number | Sequence[Number] | None = None,
+        body: int = 0,
         direction: int = 1,
         effects: Effect | Sequence[Effect] = (),
     ):
@@ -82,15 +94,30 @@ class Exciter(Part):
                 problem = "acts on the whole machine; give it to the scene, Scene(effects=...)"
                 raise InputError(f"effects.{effect.kind}", problem)
         self.loads, self.drive, self.effects, self.direction = loads, drive, effects, int(direction)
-        self.unbalance = None if unbalance is None else read_numbers(Exciter, "", unbalance=unbalance)["unbalance"]
+        numbers = {"unbalance": unbalance, "unbalance_mass": unbalance_mass}
+        self.unbalance, self.unbalance_mass = read_unbalance(drive, **numbers)
         self.carries = ("loads",) * (loads is not None) + ("unbalance",) * (unbalance is not None)
         place = read_place(at, "at")
         self.platform, self.position = (place, None) if isinstance(place, int) else (None, place)
+        self.body = body
 
     @property
     def is_plain(self) -> bool:
         """True for loads on a balanced rotor that turns anticlockwise."""
         return self.carries == ("loads",) and self.direction == 1
+
+    @property
+    def place(self) -> Place:
+        """Place on the machine, with its body."""
+        return on_body(self.at, self.body)
+
+    def with_parts(self, loads: Loads | None, drive: Drive, effects: Sequence[Effect] = ()) -> Exciter:
+        """Return an exciter with other parts at the same place, with the same unbalance and direction.
+
+        **Arguments**: `loads`, `drive` and `effects` of the new exciter.
+        """
+        own = {name: getattr(self, name) for name in ("unbalance", "unbalance_mass", "at", "body", "direction")}
+        return Exciter(loads, drive, effects=effects, **own)
 
     @property
     def turning_drive(self) -> Drive:
@@ -101,6 +128,44 @@ class Exciter(Part):
     def at(self) -> int | Array | None:
         """Place on the machine: a platform number, a distance along a rotor's axis or a point, m; None for the default."""
         return self.position if self.platform is None else self.platform
+
+
+def unbalance(*, force: Number, at: Number) -> Array:
+    """Return the unbalance of an exciter from the centrifugal force that its catalogue states.
+
+        S = F / w^2
+
+    **Arguments** (SI or texts with a unit, greater than 0)
+
+    - `force` F, N, at that speed; typical: "1 kN" to "200 kN"
+    - `at` w, rad/s: the speed at which the force is stated; typical: "750 rpm" to "3000 rpm"
+
+    **Returns** S, kg m. **Raises** `InputError` for a wrong unit or a value that is not positive.
+
+    >>> import jaxvib as jv
+    >>> round(float(jv.unbalance(force="20 kN", at="1000 rpm")), 4)
+    1.8238
+    """
+    speed = number(at, "rad/s", "at", low=0.0, open_low=True)
+    return number(force, "N", "force", low=0.0, open_low=True) / speed**2
+
+
+def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Number | None) -> tuple[Array | None, Array | None]:
+    """Return the unbalance S and its mass m. **Raises** `InputError` if the rotor has less inertia than S^2/m."""
+    given = {name: value for name, value in (("unbalance", unbalance), ("unbalance_mass", unbalance_mass)) if value is not None}
+    if "unbalance_mass" in given and "unbalance" not in given:
+        raise InputError("unbalance_mass", f"is {quoted(unbalance_mass)} without an unbalance; give unbalance=..., in kg m")
+    found = read_numbers(Exciter, "", **given)
+    if len(found) == 2 and not drive.ideal:
+        when_known(_require_inertia, *found.values(), drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
+    return found.get("unbalance"), found.get("unbalance_mass")
+
+
+def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:
+    own = unbalance**2 / mass
+    if inertia < own * (1.0 - 1e-12):
+        problem = f"is {inertia:g} kg m^2, less than that of the unbalance alone, S^2/m = {own:g} kg m^2"
+        raise InputError("drive.inertia", f"{problem}; it must include the unbalance")
 
 
 class Scene(Part):
@@ -163,6 +228,8 @@ class Scene(Part):
             if exciter.loads is not None:
                 for effect in shared:
                     effect.validate(machine, exciter.loads)
+            with within(self.place_of(k)):
+                machine.require_body(exciter.body)
             _require_stations(machine, exciter)
             with within(self.place_of(k)):
                 _require_fit(machine, exciter)
@@ -211,11 +278,11 @@ class Scene(Part):
 
     def mount(self) -> Mount:
         """Return the mount of the only exciter."""
-        return self.machine.mount(self.exciter.at)
+        return self.machine.mount(self.exciter.place)
 
     def mounting(self) -> Mount:
         """Return the directions and shapes of the only exciter's mount, without its numbers."""
-        return shapes_of(self.machine, self.exciter.at)[1]
+        return shapes_of(self.machine, self.exciter.place)[1]
 
     def replace(self, **parts: Any) -> Scene:
         """Return the scene with other `parts`: its `machine`, or the `loads`, `drive` or `effects` of its only exciter.
@@ -228,8 +295,7 @@ class Scene(Part):
         """
         one = self.exciter
         known = {"machine": self.machine, "loads": one.loads, "drive": one.drive, "effects": self.all_effects} | parts
-        placed = {"unbalance": one.unbalance, "at": one.at, "direction": one.direction}
-        exciter = Exciter(known.pop("loads"), known.pop("drive"), **placed)
+        exciter = one.with_parts(known.pop("loads"), known.pop("drive"))
         return Scene(**known, exciters=[exciter])
 
     def place_of(self, k: int) -> str:
@@ -249,7 +315,7 @@ def _require_anticlockwise(exciter: Exciter) -> Exciter:
 def _require_stations(machine: Machine, exciter: Exciter) -> None:
     """**Raises** `InputError` for a place that the machine does not have, and if there are not as many stations as loads."""
     loads = exciter.loads
-    for levers in machine.mounting(exciter.at).levers:
+    for levers in machine.mounting(exciter.place).levers:
         if levers is not None and (loads is None or levers.shape != (loads.count,)):
             needed = "an unbalance needs a place" if loads is None else f"one for all loads or {loads.count} are needed"
             raise InputError("machine.stations", f"has {levers.shape[0]} values; {needed}")
@@ -294,8 +360,8 @@ def _read_exciters(
         return tuple(exciters)
     if len(exciters) > 1:
         raise InputError(f"effects.{effects[0].kind}", "acts on one rotor; give it to an exciter, Exciter(effects=...)")
-    one, own = exciters[0], read_effects((*exciters[0].effects, *effects))
-    return (Exciter(one.loads, one.drive, unbalance=one.unbalance, at=one.at, direction=one.direction, effects=own),)
+    one = exciters[0]
+    return (one.with_parts(one.loads, one.drive, read_effects((*one.effects, *effects))),)
 
 
 def read_effects(effects: object) -> tuple[Effect, ...]:

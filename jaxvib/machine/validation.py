@@ -15,8 +15,7 @@ from jax import Array
 from jaxvib.boundary import call_user
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.files import rebuild_part
-from jaxvib.machine.numbers import read_numbers
-from jaxvib.machine.scene import Exciter, Scene, require_comparable
+from jaxvib.machine.scene import Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
@@ -106,8 +105,7 @@ def _rebuild(scene: Scene) -> None:
             rebuild_part(exciter.drive, "drive")
             if (exciter.loads is not None, exciter.unbalance is not None) != tuple(x in exciter.carries for x in _CARRIED):
                 raise InputError("carries", f"is {exciter.carries}, which is not that of the exciter; create a new Exciter")
-            if exciter.unbalance is not None:
-                read_numbers(Exciter, "", unbalance=exciter.unbalance)
+            read_unbalance(exciter.drive, exciter.unbalance, exciter.unbalance_mass)
             for effect in exciter.effects:
                 rebuild_part(effect, f"effects.{effect.kind}")
     for effect in scene.effects:

@@ -296,7 +296,7 @@ class _FieldWithDetachment(eqx.Module):
                 continue
             normal_force = exciter.loads.normal_force(own.angle, own.rate, total_gravity(scene.effects))
             assert normal_force is not None
-            force = normal_force.at(scene.machine.mount(exciter.at).load_rates(change.velocity))
+            force = normal_force.at(scene.machine.mount(exciter.place).load_rates(change.velocity))
             pulls.append(jnp.maximum(-force, 0.0))
         return _StateWithDetachment(change, _joined(pulls))
 

@@ -138,7 +138,8 @@ def rebuild(description: Description, arrays: Iterator[object]) -> Any:
 
 def _fields(kind: type) -> list[str]:
     if dataclasses.is_dataclass(kind):
-        return [field.name for field in dataclasses.fields(kind)]
+        names = (field.name for field in dataclasses.fields(kind))
+        return [name for name in names if not isinstance(getattr(kind, name, None), property)]
     if issubclass(kind, tuple) and hasattr(kind, "_fields"):
         return list(kind._fields)  # pyright: ignore[reportAttributeAccessIssue]
     raise Undescribable(f"{kind} is no dataclass")

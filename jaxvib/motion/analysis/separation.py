@@ -110,7 +110,7 @@ def _basis(scene: Scene, state: State, which: int) -> tuple[Callable[[Array], St
     exciter = scene.exciters[which]
     touching = has_term(exciter.effects, LoadInteraction)
     shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(exciter.loads))
-    if touching or not shared or not scene.machine.mounting(exciter.at).at_one_point:
+    if touching or not shared or not scene.machine.mounting(exciter.place).at_one_point:
         flat, restored = ravel_pytree(state)
         return restored, lambda tangent: ravel_pytree(tangent)[0], flat.size
     zero = jax.tree.map(jnp.zeros_like, state)

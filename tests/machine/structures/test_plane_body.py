@@ -188,7 +188,7 @@ def test_numbers_of_supports_and_places_have_names():
         (lambda: scene_of(1, effects=(jv.Stop(1e5, gap=0.01),)), "effects.stop acts under a platform"),
         (
             lambda: jv.jam_modes(jv.Scene(SCREEN, jv.balls(count=1, mass=0.1, radius=0.1, drag=1.0), DRIVES[2])),
-            "turns with the",
+            "rotates with the housing",
         ),
     ],
 )
