@@ -23,7 +23,7 @@ from optimize.quantities.jams import (
 from optimize.quantities.machine import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
 from optimize.quantities.motion import peak_force, settling_time
 from optimize.quantities.quantity import Demand, Quantity, largest, least
-from optimize.space import DesignSpace, Held, hold
+from optimize.space import DesignSpace, HeldQuantity, hold
 from optimize.synthesize import Outcome, Synthesis, synthesize
 
 __all__ = [
@@ -31,7 +31,7 @@ __all__ = [
     "Design",
     "DesignSpace",
     "Front",
-    "Held",
+    "HeldQuantity",
     "Outcome",
     "Quantity",
     "Synthesis",

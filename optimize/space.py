@@ -20,7 +20,7 @@ from jaxvib.units.known import require_known
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import Quantity, require_quantity
 
-__all__ = ["Bounds", "DesignSpace", "Held", "Source", "hold"]
+__all__ = ["Bounds", "DesignSpace", "HeldQuantity", "Source", "hold"]
 
 Numbers = TypeVar("Numbers", np.ndarray, Array)
 
@@ -31,7 +31,7 @@ Source = str | tuple[str, float | Literal["keep"]]
 """Source of a tied number: the name of another one, with a factor, or "keep" for their present ratio."""
 
 
-class Held(eqx.Module):
+class HeldQuantity(eqx.Module):
     """Quantity that keeps its value during the search; made by `hold`.
 
     Returned by `hold`.
@@ -44,7 +44,7 @@ class Held(eqx.Module):
 
 
 @validated
-def hold(quantity: Quantity, value: Number | None = None) -> Held:
+def hold(quantity: Quantity, value: Number | None = None) -> HeldQuantity:
     """Return the condition that a quantity keeps a value during the search.
 
     **Arguments**
@@ -52,7 +52,8 @@ def hold(quantity: Quantity, value: Number | None = None) -> Held:
     - `quantity` such as `jam_frequency(mode=3)`
     - `value` in its unit, or text; default: its value in the scene from which the search begins; typical: not 0
 
-    **Returns** `Held`. **Raises** `InputError` for a wrong unit, or a value of 0 (held quantities are compared relative to it).
+    **Returns** `HeldQuantity`. **Raises** `InputError` for a wrong unit, or a value of 0 (held quantities are compared
+    relative to it).
 
     >>> from optimize import hold, jam_frequency
     >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name
@@ -60,11 +61,11 @@ def hold(quantity: Quantity, value: Number | None = None) -> Held:
     """
     require_quantity(quantity, "hold")
     if value is None:
-        return Held(quantity, None)
+        return HeldQuantity(quantity, None)
     held = float(number(value, quantity.unit, f"hold.{quantity.name}"))
     if held == 0.0:
         raise InputError(f"hold.{quantity.name}", "is 0; a held value must differ from 0")
-    return Held(quantity, held)
+    return HeldQuantity(quantity, held)
 
 
 class Tie(NamedTuple):
@@ -135,7 +136,7 @@ class DesignSpace(eqx.Module):
     free: tuple[NamedNumber, ...] = eqx.field(static=True)
     logs: tuple[bool, ...] = eqx.field(static=True)
     ties: tuple[Tie, ...] = eqx.field(static=True)
-    held: tuple[Held, ...]
+    held: tuple[HeldQuantity, ...]
     choices: tuple[Choice, ...] = eqx.field(static=True)
     counts: tuple[int, ...] = eqx.field(static=True)
 
@@ -143,7 +144,7 @@ class DesignSpace(eqx.Module):
         self,
         scene: Scene,
         free: Mapping[str, Bounds],
-        hold: Sequence[Held] = (),
+        hold: Sequence[HeldQuantity] = (),
         *,
         ties: Mapping[str, Source] | None = None,
         choices: Mapping[str, Sequence[Number]] | None = None,
@@ -175,7 +176,7 @@ class DesignSpace(eqx.Module):
         self.ties = _tied(scene, ties or {}, taken)
         self.counts = counts
         for held in hold:
-            if not isinstance(held, Held):
+            if not isinstance(held, HeldQuantity):
                 raise InputError("hold", f"has {quoted(held)}; wrap quantities in optimize.hold(...)")
         self.held = tuple(_with_value(held, scene) for held in hold)
         if len(self.held) >= self.size:
@@ -342,10 +343,10 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
     return tuple(found)
 
 
-def _with_value(held: Held, scene: Scene) -> Held:
+def _with_value(held: HeldQuantity, scene: Scene) -> HeldQuantity:
     if held.value is not None:
-        return Held(held.quantity, np.asarray(held.value))
+        return HeldQuantity(held.quantity, np.asarray(held.value))
     value = float(held.quantity(scene))
     if not (np.isfinite(value) and value != 0.0):
         raise InputError(f"hold.{held.quantity.name}", f"is {value} in the initial scene; give the value at which it is held")
-    return Held(held.quantity, np.asarray(value))
+    return HeldQuantity(held.quantity, np.asarray(value))

@@ -111,7 +111,11 @@ def test_a_speed_must_say_what_it_counts(text):
 
 
 def test_a_decimal_comma_has_its_own_message():
-    with pytest.raises(jv.InputError, match=r"'1,5 N/m', with a comma; write '1\.5 N/m' for a decimal comma, else '15 N/m'"):
+    with pytest.raises(
+        jv.InputError,
+        match=r"'1,5 N/m', with a comma; write '1\.5 N/m' if it is a decimal "
+        r"comma, otherwise '15 N/m'",
+    ):
         to_float("1,5 N/m", "N/m", "machine.stiffness")
 
 

@@ -22,7 +22,7 @@ def modes_chart(
     unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
-    """Draw load speeds and amplitudes of jam modes over their numbers; markers are filled for stable modes.
+    """Draw load speeds and amplitudes against the number of the jam mode; markers are filled for stable modes.
 
     **Arguments**
 
@@ -169,7 +169,8 @@ def speeds_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw speeds (n,) rad/s as labelled points, then intervals (n, 2) rad/s as bars, a row for each, in `unit`.
+    """Draw speeds (n,) rad/s as labelled points and below them intervals (n, 2) rad/s as bars, one row for each label; the
+    axis is in `unit`.
 
     `rows` contains (label, speeds), `spans` (label, intervals). Speeds that are not finite are left out. An interval with an
     infinite end extends to the edge.
@@ -207,7 +208,8 @@ def speeds_chart(
 def signals_chart(
     x: np.ndarray, signals: Sequence[tuple[str, np.ndarray, Sequence[str]]], *, across: str, ax: Onto = None
 ) -> Drawn:
-    """Draw a panel for each (label with unit, values (n, k), k names) over `x` (n,), whose label is `across`.
+    """Draw one panel for each signal against `x` (n,), whose label is `across`. A signal is (label with unit, values (n, k),
+    names of its k curves).
 
     >>> import numpy as np
     >>> len(signals_chart(np.arange(3.0), [("angle, rad", np.ones((3, 1)), ["load"])], across="time, s").axes)
@@ -225,7 +227,7 @@ def signals_chart(
 
 
 def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Drawn:
-    """Draw values (n, k) as points over 1 to n.
+    """Draw values (n, k) as points against their index 1 to n.
 
     >>> import numpy as np
     >>> points_chart(np.ones((3, 2)), across="run", up="speed, rad/s").axes[0].get_xlabel()
@@ -252,7 +254,7 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Draw
     axis.plot(np.cos(turn), np.sin(turn), color=GUIDE, lw=0.9, label="limit of stability")
     inside = np.abs(multipliers) <= 1.0
     for kind, look in ((inside, {"color": COLORS[0]}), (~inside, {"color": COLORS[1], "marker": "X"})):
-        name = f"{int(np.sum(kind))} {'decay' if kind is inside else 'grow'}"
+        name = f"{'stable' if kind is inside else 'unstable'}: {int(np.sum(kind))}"
         axis.plot(
             np.real(multipliers[kind]),
             np.imag(multipliers[kind]),
@@ -266,9 +268,10 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Draw
 
 
 def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertainty: float, *, ax: Axes | None = None) -> Drawn:
-    """Draw growth rates (n,) 1/s of intervals that end at `time` (n,) s, and the exponent 1/s with its standard error."""
+    """Draw growth rates (n,) 1/s of intervals that end at `time` (n,) s, and the largest Lyapunov exponent 1/s with its
+    standard error."""
     figure, (axes,) = panels(1, ax=ax)
-    axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each stretch")
+    axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each interval")
     half = time[time.size // 2 :]
     axes.fill_between(half[[0, -1]], exponent - uncertainty, exponent + uncertainty, color=COLORS[1], alpha=0.3, lw=0.0)
     axes.plot(half[[0, -1]], [exponent, exponent], color=COLORS[1], ls="--", label="exponent, with its standard error")

@@ -32,7 +32,8 @@ def label_map(
 ) -> Drawn:
     """Draw a map over x (n,) and y (m,), coloured by labels, with lines over it.
 
-    The labels are codes (m, n), which are indices into `names`, or -1 for no label. `lines` are pairs of x and y by kind.
+    The labels are codes (m, n), which are indices into `names`, or -1 for no label. `lines` contains pairs of x and y for each
+    kind of bifurcation.
 
     >>> import numpy as np
     >>> figure = label_map(np.arange(2.0), np.arange(3.0), np.eye(3, 2, dtype=int), ["a", "b"], across="x", up="y")
@@ -48,14 +49,14 @@ def label_map(
     axis.pcolormesh(x, y, place[codes], cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
     entries: list[Patch | Line2D] = [Patch(color=colours[k + 1], label=names[which]) for k, which in enumerate(there)]
     if np.any(codes < 0):
-        entries.append(Patch(color=_NO_ANSWER_COLOR, label="no answer"))
+        entries.append(Patch(color=_NO_ANSWER_COLOR, label="no result"))
     edges = axis.get_xlim(), axis.get_ylim()
     for kind, parts in (lines or {}).items():
         dashes = _DASHES.get(kind, ":")
         for xs, ys in parts:
             axis.plot(xs, ys, color="black", lw=1.1, ls=dashes, marker="." if len(xs) == 1 else None)
         if parts:
-            entries.append(Line2D([], [], color="black", lw=1.1, ls=dashes, label=f"{kind} of exact jams"))
+            entries.append(Line2D([], [], color="black", lw=1.1, ls=dashes, label=f"{kind} bifurcations of exact jams"))
     axis.set_xlim(edges[0])
     axis.set_ylim(edges[1])
     _scales(axis, across, up, log)
@@ -145,7 +146,7 @@ def shares_chart(
         axis.fill_between(x, low, high, color=colour, alpha=0.25, lw=0.0)
         axis.plot(x, share, color=colour, marker=".", ms=4.0, lw=1.0, label=name)
     axis.set_ylim(-0.03, 1.03)
-    _scales(axis, across, f"share of the cases, band {level}", (log, False))
+    _scales(axis, across, f"fraction of the cases (band: {level} confidence)", (log, False))
     axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small")
     return figure if ax is None else ax
 
@@ -164,7 +165,7 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax
     share = axis.twinx()
     share.plot(edges, np.concatenate([[0.0], np.cumsum(counts)]) / max(np.sum(counts), 1), color=COLORS[1])
     share.set_ylim(0.0, 1.02)
-    share.set_ylabel("share below", color=COLORS[1])
+    share.set_ylabel("cumulative fraction", color=COLORS[1])
     share.grid(False)
     return figure if ax is None else ax
 

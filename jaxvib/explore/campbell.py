@@ -30,9 +30,9 @@ _LEGEND = {
 
 
 def campbell(found: Whirl, at: float) -> str:
-    """Draw the whirl speeds over the rotor speed with the critical speeds, in rpm, like `Whirl.plot`.
+    """Draw the whirl speeds against the rotor speed, with the critical speeds, in rpm, like `Whirl.plot`.
 
-    **Arguments**: `found`, the whirls of one scene over rotor speeds; `at`, the operating speed, rad/s.
+    **Arguments**: `found`, whirl speeds of one scene at several rotor speeds; `at`, the operating speed, rad/s.
 
     **Returns** the text of an SVG file.
 
@@ -46,21 +46,21 @@ def campbell(found: Whirl, at: float) -> str:
     """
     scale, rotor_speed = speed_unit("rpm")[1], np.asarray(found.rotor_speed)
     speed, forward = np.asarray(found.speed), np.asarray(found.forward)
-    critical, ahead = scale * np.asarray(found.critical.speed), np.asarray(found.critical.forward)
+    critical, forward_critical = scale * np.asarray(found.critical.speed), np.asarray(found.critical.forward)
     right = scale * max(float(np.max(rotor_speed)), 1.05 * at)
-    groups = critical_groups(critical, ahead, right)
+    groups = critical_groups(critical, forward_critical, right)
     shown = [k for group, _ in groups for k in group]
     top = 1.12 * max(scale * float(np.nanmax(speed)), *critical[shown].tolist(), 1e-300)
     panel = Panel(FIRST, "whirl speed, rpm", (0.0, right), (0.0, top), wide=2.0 * WIDE + APART)
     parts, texts = panel.frame(), panel.texts()
-    for own, look in ((forward, _FORWARD), (~forward, _BACKWARD)):
-        parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, own)]
+    for selected, look in ((forward, _FORWARD), (~forward, _BACKWARD)):
+        parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, selected)]
     end = min(top, right)
     parts += [panel.line([0.0, end], [0.0, end], ROTOR), panel.line([scale * at] * 2, panel.y, OPERATING)]
     for k in shown:
         w = float(critical[k])
-        look = {**_CRITICAL, "ec": COLORS[0] if ahead[k] else COLORS[1]}
-        parts += [panel.line([w, w], [0.0, w], _DROP), dot(*panel.at(w, w), look, square=not ahead[k])]
+        look = {**_CRITICAL, "ec": COLORS[0] if forward_critical[k] else COLORS[1]}
+        parts += [panel.line([w, w], [0.0, w], _DROP), dot(*panel.at(w, w), look, square=not forward_critical[k])]
     ends: list[float] = []  # right end of the texts in each row, from the lowest row upward
     for group, word in groups:
         x, _ = panel.at(float(critical[group[-1]]), 0.0)

@@ -1,4 +1,4 @@
-"""Parameters of a scene that sliders change, their ranges, and the scene at their values."""
+"""Sliders for the parameters of a scene: their ranges, and the scene for given values of the sliders."""
 
 from __future__ import annotations
 
@@ -23,19 +23,23 @@ _MACHINE_NUMBERS = ("machine.stiffness", "machine.link_stiffness", "machine.damp
 """Numbers of a machine that have sliders."""
 
 _MAX_SINGLE_SLIDERS = 12
-"""Maximum number of sliders for scalars of a machine; in a larger machine, one slider changes all of a kind."""
+"""Maximum number of sliders for single parameters of a machine. A machine with changed parameters has one slider for all of a
+field, such as all stiffnesses."""
 
-_DECADES = tuple(np.geomspace(0.1, 10.0, 81).tolist())
-_SHARES = tuple((np.arange(1, 301) / 100.0).tolist())
+_VALUE_FACTORS = tuple(np.geomspace(0.1, 10.0, 81).tolist())
+_SPEED_FACTORS = tuple((np.arange(1, 301) / 100.0).tolist())
 
 
 class Slider(NamedTuple):
     """Slider for a parameter of a scene.
 
-    The parameter of the scene is multiplied by value / `start`; at `start` it therefore keeps its value bit for bit.
+    The parameter is multiplied by value / `start`; at `start` it therefore keeps exactly its value.
 
-    **Attributes**: `name` in the scene; `label`, the designer's name; `unit` on the slider; `steps`, the ascending values of
-    the slider; `start`, the scene's value, which is one of them; `number` of the scene, None for the number of loads.
+    **Attributes**
+
+    - `name` in the scene; `label`, the name shown to the user; `unit` on the slider
+    - `steps`: ascending values of the slider; `start`: the value in the scene, which is one of them
+    - `number`: the parameter; None for the number of loads
     """
 
     name: str
@@ -55,10 +59,10 @@ def sliders_of(scene: Scene) -> list[Slider]:
     """Return the sliders of a scene, those of the drive and the loads first.
 
     - springs and dampers, masses and drags of the loads: a tenth to ten times the scene's values
-    - rotor speed: up to three times the scene's value
+    - rotor speed: a hundredth to three times the scene's value
     - number of loads, if all loads have equal parameters
 
-    A number that is 0 has no slider, because no factor changes it.
+    A parameter that is 0 has no slider, because a factor does not change it.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
@@ -68,19 +72,19 @@ def sliders_of(scene: Scene) -> list[Slider]:
     >>> sliders_of(scene)[-2].title, sliders_of(scene)[-2].start
     ('stiffness of the support, N/mm', 40.0)
     """
-    found = [_slider(scene, find_number(scene, "drive.speed", "slider"), _SHARES)]
-    if _shared(scene):
+    found = [_slider(scene, find_number(scene, "drive.speed", "slider"), _SPEED_FACTORS)]
+    if _has_equal_loads(scene):
         counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
         found.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
-    numbers = [find_number(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _has(scene, name)]
-    arrays = [find_number(scene, name, "slider") for name in _MACHINE_NUMBERS if _has(scene, name)]
+    numbers = [find_number(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _is_adjustable(scene, name)]
+    arrays = [find_number(scene, name, "slider") for name in _MACHINE_NUMBERS if _is_adjustable(scene, name)]
     single = [one for array in arrays for one in array.single(scene) if np.any(one.read(scene))]
     numbers += single if len(single) <= _MAX_SINGLE_SLIDERS else arrays
-    return found + [_slider(scene, number, _DECADES) for number in numbers]
+    return found + [_slider(scene, number, _VALUE_FACTORS) for number in numbers]
 
 
 def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
-    """Return the scene with its sliders at these values, by name and in the sliders' units; others keep the scene's values.
+    """Return the scene for `values` of the sliders by name, in the units of the sliders; other parameters keep their values.
 
     **Raises** `InputError` for a name that is not a slider of the scene, and for loads that do not fit into the rotor.
 
@@ -105,12 +109,12 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
             scene = put_numbers(scene, (slider.number,), slider.number.read(scene) * (value / slider.start))
     if loads.count == scene.loads.count:
         return scene
-    more = dataclasses.replace(scene.loads, count=loads.count)
-    return scene.replace(loads=rebuild_part(more, "loads"))
+    changed = dataclasses.replace(scene.loads, count=loads.count)
+    return scene.replace(loads=rebuild_part(changed, "loads"))
 
 
-def _has(scene: Scene, name: str) -> bool:
-    """True if the scene has that number, it is not 0, and no other number replaces it, such as a rotor's
+def _is_adjustable(scene: Scene, name: str) -> bool:
+    """True if the scene has that parameter, it is not 0, and no other parameter overrides it, such as a rotor's
     `stiffness_terms`."""
     part, _, field = name.partition(".")
     owner = getattr(scene, part)
@@ -118,8 +122,8 @@ def _has(scene: Scene, name: str) -> bool:
     return value is not None and bool(np.any(np.asarray(value))) and getattr(owner, f"{field}_terms", None) is None
 
 
-def _shared(scene: Scene) -> bool:
-    """True if all loads have equal parameters and no load has its own station; an additional load is then like the others."""
+def _has_equal_loads(scene: Scene) -> bool:
+    """True if all loads have equal parameters and no load has its own station, so that the number of loads can change."""
     return scene.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 
@@ -128,7 +132,7 @@ def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Sl
     if number.size > 1:
         part, _, field = number.name.partition(".")
         steps = tuple(float(f"{f:.3g}") for f in factors)
-        return Slider(number.name, f"every {field.replace('_', ' ')} of the {part}, times", "", steps, 1.0, number)
+        return Slider(number.name, f"{field.replace('_', ' ')} of the {part}, common factor", "", steps, 1.0, number)
     unit, scale = shown_unit(number.unit, float(values[0]))
     start = float(f"{scale * values[0]:.6g}")
     return Slider(number.name, number.words(scene)[0], unit, _steps(start, factors), start, number)
@@ -136,5 +140,6 @@ def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Sl
 
 @functools.lru_cache(maxsize=256)
 def _steps(start: float, factors: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the values around `start`, with four digits. They are cached because every move needs those of all sliders."""
+    """Return the values around `start`, with four digits. They are cached because each move of a slider needs the values of
+    all sliders."""
     return tuple(sorted({start, *(float(f"{f * start:.4g}") for f in factors if f != 1.0)}))

@@ -1,4 +1,5 @@
-"""Dimensionless forms of the two platform papers, which build a scene and convert its results."""
+"""Dimensionless forms of the equations in the two papers on platform machines. A form builds a scene and converts its
+results."""
 
 from __future__ import annotations
 
@@ -29,26 +30,30 @@ class Dimensionless(eqx.Module):
         v_i = y_i/(rho_i y~), rho_i = M2S/M_i, n = speed/w, n_i^2 = k_i/(M_i w^2), n_ij^2 = k_ij/(M2S w^2),
         h_i = b_i/(2 M_i w), h_ij = b_ij/(2 M2S w), eps = y~/(kappa R), beta = b_W/(eps kappa m w)
 
+    Platform i has displacement y_i, mass M_i, stiffness k_i and damping b_i; the N loads have mass m, radius R, drag b_W and
+    kappa = 1 + (moment of inertia about the mass centre)/(m R^2); phi_j are their angles, and s_y is the vertical component
+    of their dimensionless unbalance s.
+
     The two papers scale the unbalance differently, and eps and v_i with it:
 
-    - `form="antiphase"`: s~ = m R, so s_y = sum sin phi_j, coincident loads have s = N, and eps is that of one load
-    - `form="criterion"`: s~ = N m R, so s_y = (1/N) sum sin phi_j, s = 1, and eps is that of all loads
+    - `form="antiphase"`: s~ = m R, so s_y = sum sin phi_j, coincident loads have s = N, and eps is m/(kappa M2S)
+    - `form="criterion"`: s~ = N m R, so s_y = (1/N) sum sin phi_j, coincident loads have s = 1, and eps is N m/(kappa M2S)
 
-    **Arguments** (n platforms; all numbers without a unit unless it is stated)
+    **Arguments** (p platforms; numbers are dimensionless unless a unit is stated)
 
     - `form`: "antiphase" or "criterion"
-    - `natural` n_i (n,), one number for each platform; typical: 0.2 to 1
-    - `damping` h_i (n,); typical: 0.01 to 0.05
+    - `natural` n_i (p,), one number for each platform; typical: 0.2 to 1
+    - `damping` h_i (p,); typical: 0.01 to 0.05
     - `link_natural` n_ij, one number for each link (12 for two masses; 12, 13, 23 for three); typical: 0.3 to 1
     - `link_damping` h_ij, one number for each link; typical: 0.01 to 0.05
-    - `rho` rho_i (n - 1,) of the platforms without the exciter, in order; typical: 0.5 to 2
-    - `eps`: the loads' share of the mass M2S, times 1/kappa; typical: 1e-3 to 0.1
+    - `rho` rho_i (p - 1,) of the platforms without the exciter, in order; typical: 0.5 to 2
+    - `eps`: mass of one load ("antiphase") or of all loads ("criterion"), divided by kappa M2S; typical: 1e-3 to 0.1
     - `beta`: drag of the loads; typical: 0.1 to 10
     - `speed` n of the rotor; typical: 1 to 5 times the lowest resonance
     - `count` N of loads; typical: 1 to 4
-    - `mass_scale` M2S, kg, `frequency_scale` w, rad/s, and `radius` R, m: the size of the machine, which is free; typical: 1
-      each, or 50 to 5000 kg, 10 to 100 rad/s and 0.05 to 0.3 m
-    - `kappa`, at least 1: the loads are pendulums with this kappa; typical: 1 to 1.5
+    - `mass_scale` M2S, kg, `frequency_scale` w, rad/s, and `radius` R, m: the size of the machine, which can be chosen freely;
+      typical: 1 each, or 50 to 5000 kg, 10 to 100 rad/s and 0.05 to 0.3 m
+    - `kappa`, at least 1: inertia factor of the loads, which are pendulums; typical: 1 to 1.5
 
     **Raises** `InputError` for lengths that do not fit, values that are not positive, or loads heavier than M2S.
 
@@ -118,7 +123,7 @@ class Dimensionless(eqx.Module):
         self.radius = number(radius, "m", "radius", **positive)
         self.kappa = number(kappa, "", "kappa", low=1.0)
         share = self.eps * self.kappa * (self.count if form == "antiphase" else 1)
-        number(1.0 - share, "", "1 - (mass of all loads)/M2S", **positive)
+        number(1.0 - share, "", "1 - (mass of all loads)/M2S (from eps, kappa and count)", **positive)
 
     @property
     def _load_mass(self) -> Array:
@@ -178,14 +183,14 @@ class Dimensionless(eqx.Module):
         **Arguments**
 
         - `omega`, rad/s, any shape
-        - `amplitude`, m, real or complex; its last axis is that of the platforms
+        - `amplitude`, m, real or complex; its last axis has one entry for each platform
         - `force`, N, any shape
 
         NaN in an array, for modes that do not exist, stays NaN.
 
         **Returns** a dict with the same keys: omega/w, amplitude_i/(rho_i y~), force/(M2S w^2 y~).
 
-        **Raises** `InputError` for amplitudes of another number of platforms.
+        **Raises** `InputError` if the last axis of `amplitude` does not have one entry for each platform.
 
         >>> import jaxvib as jv
         >>> form = jv.Dimensionless("antiphase", natural=1/3, damping=0.01, eps=1e-3, beta=1.0, speed=3.0, frequency_scale=50.0)
@@ -196,5 +201,8 @@ class Dimensionless(eqx.Module):
         given = {"omega": omega, "amplitude": amplitude, "force": force}
         if amplitude is not None and jnp.shape(amplitude)[-1:] not in ((), (1,), jnp.shape(self.lengths)):
             shape = jnp.shape(amplitude)
-            raise InputError("amplitude", f"has shape {shape}; its last axis is the {self.lengths.shape[0]} platforms")
+            raise InputError(
+                "amplitude",
+                f"has shape {shape}; its last axis must have {self.lengths.shape[0]} entries, one for each platform",
+            )
         return {name: value / units[name] for name, value in given.items() if value is not None}

@@ -20,32 +20,32 @@ from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import is_finite, wrap_angles
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.rodas4 import Rodas4
-from jaxvib.ode.types import Y as Held
+from jaxvib.ode.types import Y as IntegratorState
 from jaxvib.runtime.compat import fast_diffrax_loop_end
 
 BATCH_SIZE = 64
-"""Number of runs in a batch on a core: enough to fill its vectors, few enough for its cache."""
+"""Number of runs in a batch on a core: enough to fill its vector registers, few enough to fit into its cache."""
 
 PARTS = 64
-"""Number of equal parts of a run before its window, with mean speeds of the loads over each."""
+"""Number of equal parts of a run before its window; the mean speeds of the loads are measured over each part."""
 
 
 _DOUBLINGS = 40
-"""Number of implicit steps in the first part, each twice as long as the previous one; the shortest is 1e-12 of the part."""
+"""Number of doublings of the implicit step at the start, from 1e-12 of the regular step to the regular step."""
 
 
 @fast_diffrax_loop_end()
 def advance(
-    motion: PackedSystem, held: Held, begin: Array, length: Array, step: Array, *, implicit: bool = False
-) -> tuple[Held, Array]:
-    """Return the state of the integrator a `length` of time after `begin`, by steps of size `step`, and the number of steps."""
+    motion: PackedSystem, packed: IntegratorState, begin: Array, length: Array, step: Array, *, implicit: bool = False
+) -> tuple[IntegratorState, Array]:
+    """Return the state of the integrator at the time `begin` + `length`, by steps of size `step`, and the number of steps."""
     solution = diffrax.diffeqsolve(
         motion.term,
         Rodas4() if implicit else motion.method(),
         t0=begin,
         t1=begin + length,
         dt0=step,
-        y0=held,
+        y0=packed,
         args=motion.args,
         saveat=diffrax.SaveAt(t1=True),
         stepsize_controller=diffrax.ConstantStepSize(),
@@ -57,30 +57,30 @@ def advance(
 
 
 def stretches(
-    motion: PackedSystem, held: Held, length: Array, step: Array, number: int, *, implicit: bool
-) -> tuple[Held, Array, Array]:
-    """Return the beginnings of stretches of the same `length`, s, the length of each, and the integrator's first state.
+    motion: PackedSystem, packed: IntegratorState, length: Array, step: Array, number: int, *, implicit: bool
+) -> tuple[IntegratorState, Array, Array]:
+    """Return the first state of the integrator, and the start times and lengths, s, of `number` stretches of the same `length`.
 
-    Implicit steps do not resolve the acceleration of loads by drag at the start; therefore the first stretch has doubling
-    steps.
+    Implicit steps do not resolve the acceleration of loads by drag at the start; therefore the first stretch begins with very
+    short steps, each twice as long as the previous one.
     """
     begins, lengths = length * jnp.arange(number, dtype=length.dtype), jnp.full(number, length)
     if not implicit:
-        return held, begins, lengths
+        return packed, begins, lengths
 
-    def doubled(k: Array, held: Held) -> Held:
+    def doubled(k: Array, packed: IntegratorState) -> IntegratorState:
         end = step * 2.0 ** (k - _DOUBLINGS)
         begin = jnp.where(k == 0, 0.0, end / 2.0)
-        return advance(motion, held, begin, end - begin, end - begin, implicit=True)[0]
+        return advance(motion, packed, begin, end - begin, end - begin, implicit=True)[0]
 
-    held = jax.lax.fori_loop(0, _DOUBLINGS + 1, doubled, held)
-    return held, begins.at[0].set(step), lengths.at[0].add(-step)
+    packed = jax.lax.fori_loop(0, _DOUBLINGS + 1, doubled, packed)
+    return packed, begins.at[0].set(step), lengths.at[0].add(-step)
 
 
 def pack_batch(
     field: Callable[[Array, State], State], state: State, single: bool, has_common_turns: bool, *, implicit: bool
 ) -> PackedSystem:
-    """Return the equations of a batch of runs; an implicit method takes the numbers of each run as a vector."""
+    """Return the equations of a batch of runs; for an implicit method the state of each run is one vector."""
     if implicit:
         return PackedSystem(field, state, solver=Rodas4())
     return PackedSystem(field, state, wrapped=single, has_common_turns=has_common_turns, batch=True)
@@ -89,9 +89,14 @@ def pack_batch(
 class BatchPlan(NamedTuple):
     """Steps of a batch of runs, equal for all runs.
 
-    **Attributes**: `until`: end time, s; `window`: length of the measuring window at the end, s; `samples`: number of evenly
-    spaced states in it; `each`: number of steps in each of the `PARTS` before it; `between`: number of steps from one sample to
-    the next; `implicit`: true if decay is too fast for explicit steps.
+    **Attributes**
+
+    - `until`: end time, s
+    - `window`: length of the measuring window at the end, s
+    - `samples`: number of evenly spaced states in the window
+    - `each`: number of steps in each of the `PARTS` parts before the window
+    - `between`: number of steps from one sample to the next
+    - `implicit`: True if decay is too fast for explicit steps
     """
 
     until: float
@@ -105,9 +110,9 @@ class BatchPlan(NamedTuple):
 class BatchRun(NamedTuple):
     """A run with its measurements.
 
-    **Attributes**: its `scene`; `window`: its last stretch; `measured` and `regime` of the window; `part_speed` (PARTS, count):
-    mean speeds of the loads, rad/s, over the equal parts before the window, each `part_length` s long; `finite`: true if the
-    motion stayed finite.
+    **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured` and `regime` of the window; `part_speed`
+    (PARTS, count): mean speeds of the loads, rad/s, over the equal parts before the window, each `part_length` s long;
+    `finite`: true if the motion stayed finite.
     """
 
     scene: Scene
@@ -132,23 +137,23 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS
     spacing = plan.window / (plan.samples - 1)
 
-    def part(held: Held, at: tuple[Array, Array]) -> tuple[Held, Held]:
-        held, _ = advance(motion, held, *at, jnp.asarray(length / plan.each, dtype), implicit=plan.implicit)
-        return held, held
+    def part(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, IntegratorState]:
+        packed, _ = advance(motion, packed, *at, jnp.asarray(length / plan.each, dtype), implicit=plan.implicit)
+        return packed, packed
 
-    def sample(held: Held, k: Array) -> tuple[Held, Held]:
+    def sample(packed: IntegratorState, k: Array) -> tuple[IntegratorState, IntegratorState]:
         at, step = begin + k * spacing, jnp.asarray(spacing / plan.between, dtype)
-        moved, _ = advance(motion, held, at, jnp.asarray(spacing, dtype), step, implicit=plan.implicit)
+        moved, _ = advance(motion, packed, at, jnp.asarray(spacing, dtype), step, implicit=plan.implicit)
         return moved, moved
 
     first = motion.pack(state)
     sizes = jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype)
-    held, begins, lengths = stretches(motion, first, *sizes, PARTS, implicit=plan.implicit)
-    held, parts = jax.lax.scan(part, held, (begins, lengths))
-    _, later = jax.lax.scan(sample, held, jnp.arange(plan.samples - 1, dtype=dtype))
+    packed, begins, lengths = stretches(motion, first, *sizes, PARTS, implicit=plan.implicit)
+    packed, parts = jax.lax.scan(part, packed, (begins, lengths))
+    _, later = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
     before = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)
     azimuth, _ = turning_angles(scene, lambda: length * jnp.arange(PARTS + 1, dtype=dtype), motion.unpack(before))
-    states = motion.unpack(jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), held, later))
+    states = motion.unpack(jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), packed, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length

@@ -1,4 +1,5 @@
-"""Vector field and state in the form for the fastest integration: equations on scalars if the state is small."""
+"""Vector field and state in the representation that integrates fastest: equations on scalars for small states, otherwise on
+arrays."""
 
 from __future__ import annotations
 
@@ -22,35 +23,47 @@ from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program
 from jaxvib.ode.types import Args, RealScalarLike
 from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
 
-Held: TypeAlias = PyTree[Array]
-"""State of the integrator: the numbers of a state, or if angles are wrapped a pair of these and the counted turns."""
+IntegratorState: TypeAlias = PyTree[Array]
+"""State of the integrator: the entries of a `State`; if angles are wrapped, a pair of the entries and the numbers of whole
+turns."""
 
 _TURN = 2.0 * math.pi
 
 _LONG_ARRAY = 4
-"""Smallest number of entries in an array of the state for which arrays are used instead of scalars. With arrays
-derivatives take less time and programs compile sooner; runs take the same time, and two thirds of it from 8 entries on."""
+"""Smallest number of entries in an array of the state for which arrays are used instead of scalars. With arrays, derivatives
+take less time and programs compile faster. Runs take the same time as with scalars, and two thirds of it for 8 entries or
+more."""
 
-_MOST_WRITTEN = 8
-"""Largest number of numbers in a state for which the stages of the method are written out one after another."""
+_MAX_UNROLLED_SIZE = 8
+"""Largest size of a state for which the stages of the method are unrolled."""
 
 
 class PackedSystem(eqx.Module):
-    """Conversion between a `State` and the state of the integrator: a vector of its numbers, or a tuple of them.
+    """Conversion between a `State` and the state of the integrator: a vector of its entries, or a tuple of scalars.
 
-    The unrolled method takes a tuple, whose numbers stay in processor registers. Any other method takes a vector, since diffrax
-    then saves, compares and carries one array instead of many.
+    The unrolled method takes a tuple, whose scalars stay in processor registers. Any other method takes a vector, since
+    diffrax then saves, compares and carries one array instead of many.
 
-    If angles are wrapped, the integrator has each angle within a turn and the number of whole turns. A long run in single
-    precision keeps its phase this way: an angle of a million radians has no digits left for the place in a turn.
+    If angles are wrapped, the state of the integrator contains each angle within a turn and, separately, the number of whole
+    turns. This preserves the phase in long runs in single precision, which cannot resolve the position within a turn of an
+    angle of a million radians.
 
-    **Arguments**: the vector field; a state; `wrapped`: true if angles are wrapped; `has_common_turns`: true if the angles of
-    all loads are wrapped by the same turns, which keeps their differences; `batch`: true if many runs advance together; the
-    `solver`, if it is not `method`.
+    **Arguments**
 
-    **Attributes**: `program`: the equations, on scalars if `is_scalarized`, otherwise on arrays; None if JAX does not
-    give access to programs; `size`: the number of numbers in the state; `is_on_scalars`: True if they are separate scalars;
-    `args`: the arguments of `term`.
+    - the vector field and a state
+    - `wrapped`: True if angles are wrapped
+    - `has_common_turns`: True if the same number of turns is subtracted from the angles of all loads, which keeps their
+      differences
+    - `batch`: True if many runs advance as one batch
+    - `solver`; default: `method`
+
+    **Attributes**
+
+    - `program`: jaxpr of the equations, on scalars if `is_scalarized`, otherwise on arrays; None if this version of JAX gives
+      no access to jaxprs
+    - `size`: number of entries of the state; `is_on_scalars`: True if the state is a tuple of scalars
+    - `has_fences`: True if intermediate values are computed only once, see `fenced`
+    - `args`: arguments of `term`
     """
 
     args: Args
@@ -58,8 +71,8 @@ class PackedSystem(eqx.Module):
     is_scalarized: bool = eqx.field(static=True)
     size: int = eqx.field(static=True)
     is_on_scalars: bool = eqx.field(static=True)
-    fences: bool = eqx.field(static=True)
-    like: Any = eqx.field(static=True)
+    has_fences: bool = eqx.field(static=True)
+    treedef: Any = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
     has_common_turns: bool = eqx.field(static=True)
@@ -76,12 +89,12 @@ class PackedSystem(eqx.Module):
         solver: diffrax.AbstractSolver | None = None,
     ):
         self.wrapped, self.has_common_turns, self.batch = wrapped, has_common_turns, batch
-        leaves, self.like = jax.tree.flatten(state)
+        leaves, self.treedef = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
         self.args, given = field, (jnp.zeros((), leaves[0].dtype), state, field)
-        is_written = self.size <= _MOST_WRITTEN if solver is None else isinstance(solver, UnrolledDopri8)
-        # Vectors over the angles of many loads use vector registers as fully as vectors over runs.
+        is_unrolled = self.size <= _MAX_UNROLLED_SIZE if solver is None else isinstance(solver, UnrolledDopri8)
+        # Without a batch, arrays over the angles of many loads already fill the vector registers.
         is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG_ARRAY)
         program = scalarized_program(_rates_of, *given) if is_small else None
         self.is_scalarized = program is not None
@@ -89,8 +102,8 @@ class PackedSystem(eqx.Module):
         if program is not None:
             # Arrays are split into entries here, so that the time loop contains no arrays.
             self.args = scalars_of(field)
-        self.is_on_scalars = self.is_scalarized and (batch or is_written)
-        self.fences = self.is_on_scalars and solver is None
+        self.is_on_scalars = self.is_scalarized and (batch or is_unrolled)
+        self.has_fences = self.is_on_scalars and solver is None
 
     @property
     def term(self) -> diffrax.ODETerm:
@@ -98,28 +111,30 @@ class PackedSystem(eqx.Module):
         return diffrax.ODETerm(self._rates)
 
     def method(self, adjoint: diffrax.AbstractAdjoint | None = None) -> diffrax.AbstractSolver:
-        """Return the method of order 8 in its fastest form, with derivatives by `adjoint`, or by step replay."""
-        # The numbers of the equations are left out, since a method must not contain traced arrays.
+        """Return the method of order 8 in its fastest form, with derivatives by `adjoint`; default: step replay, see
+        `jaxvib.ode.replay`."""
+        # `args` is removed, since a method must not contain traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
-        if self.size <= _MOST_WRITTEN:
+        if self.size <= _MAX_UNROLLED_SIZE:
             return UnrolledDopri8(batch=self.batch, wrap=wrap)
         return LoopDopri8(reuse=adjoint is None or isinstance(adjoint, diffrax.ForwardMode), wrap=wrap)
 
-    def pack(self, state: State) -> Held:
+    def pack(self, state: State) -> IntegratorState:
         """Convert a state (or a tree like it) to the form of the integrator."""
         y = tuple(scalars_of(state)) if self.is_on_scalars else ravel(state)
         return (y, jax.tree.map(jnp.zeros_like, y)) if self.wrapped else y
 
-    def unpack(self, held: Held) -> State:
-        """Return states along a leading axis from those of the integrator; angles count from the turn of the first state."""
+    def unpack(self, packed: IntegratorState) -> State:
+        """Return states along a leading axis from those of the integrator; angles are relative to the number of turns of the
+        first state."""
         if not self.wrapped:
-            return self._state(held)
-        y, turns = held
+            return self._state(packed)
+        y, turns = packed
         return self._state(_turned(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
 
-    def _wrap(self, held: Held) -> Held:
+    def _wrap(self, packed: IntegratorState) -> IntegratorState:
         """Move whole turns from the angles to their counts."""
-        y, turns = held
+        y, turns = packed
         is_angle, leader = self._angles()
         lead = tuple(y[k] for k in leader) if self.is_on_scalars else y[leader]
 
@@ -133,7 +148,7 @@ class PackedSystem(eqx.Module):
         """Return a mask of the numbers that are angles, and for each number the index of the angle that defines its turns."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         places = jax.tree.unflatten(
-            self.like, [np.arange(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
+            self.treedef, [np.arange(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
         )
         is_angle, leader = np.zeros(self.size, bool), np.arange(self.size)
         for exciter in places.exciters:
@@ -145,7 +160,7 @@ class PackedSystem(eqx.Module):
                 is_angle[exciter.rotor[0]] = True
         return is_angle, leader
 
-    def _state(self, y: Held) -> State:
+    def _state(self, y: IntegratorState) -> State:
         """Return states along a leading axis from the numbers of the integrator."""
         rows = jnp.stack(y, axis=-1) if self.is_on_scalars else y
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
@@ -153,15 +168,15 @@ class PackedSystem(eqx.Module):
             rows[..., end - math.prod(shape) : end].reshape(*rows.shape[:-1], *shape)
             for end, shape in zip(ends, self.shapes, strict=True)
         ]
-        return jax.tree.unflatten(self.like, parts)
+        return jax.tree.unflatten(self.treedef, parts)
 
-    def _rates(self, t: RealScalarLike, y: Held, args: Args) -> Held:
+    def _rates(self, t: RealScalarLike, y: IntegratorState, args: Args) -> IntegratorState:
         if self.wrapped:
             y, turns = y
             return self._plain_rates(t, y, args), jax.tree.map(jnp.zeros_like, turns)
         return self._plain_rates(t, y, args)
 
-    def _plain_rates(self, t: RealScalarLike, y: Held, args: Args) -> Held:
+    def _plain_rates(self, t: RealScalarLike, y: IntegratorState, args: Args) -> IntegratorState:
         if self.program is None:
             return ravel(args(t, self._state(y)))
         run = jaxpr_as_fun(self.program)
@@ -169,11 +184,11 @@ class PackedSystem(eqx.Module):
             return ravel(run(jnp.asarray(t, y.dtype), *jax.tree.leaves(self._state(y)), *jax.tree.leaves(args)))
         numbers = y if self.is_on_scalars else jnp.unstack(y)
         given = [jnp.asarray(t, numbers[0].dtype), *numbers, *args]
-        rates = fenced(self.program, given) if self.fences else run(*given)
+        rates = fenced(self.program, given) if self.has_fences else run(*given)
         return tuple(rates) if self.is_on_scalars else jnp.stack(rates)
 
 
-def _turned(y: Held, turns: Held, sign: float) -> Held:
+def _turned(y: IntegratorState, turns: IntegratorState, sign: float) -> IntegratorState:
     """Add whole turns to numbers, with 2 pi in two parts, since the rounding of 2 pi would accumulate."""
 
     def turned(x: Array, n: Array) -> Array:

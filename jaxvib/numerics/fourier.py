@@ -14,15 +14,21 @@ from jax import Array
 class Grid(NamedTuple):
     """Points on a period of theta = Omega t and the matrices of trigonometric interpolation between them.
 
-    With the half-turn symmetry psi(theta + pi) = psi(theta), e(theta + pi) = -e(theta), half a period is sufficient: psi
-    has even harmonics only and the point e of the loads odd ones.
+    With the half-turn symmetry psi(theta + pi) = psi(theta), e(theta + pi) = -e(theta), half a period is sufficient: the
+    deviation psi of the load angle from Omega t has even harmonics only, and the position e = exp(i phi) of the loads on the
+    unit circle has odd ones.
 
-    **Attributes** (M points): `symmetric`: True if it is half a period; `theta` (M,); `first`, `second` (M, M) d/dtheta and
-    d^2/dtheta^2 of psi; `deviation_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `deviation_weights` (J,): psi
-    has the harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times
-    cos and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis`
-    (M, 2K) and `synthesis` (2K, M): the matrices from e_l to the real parts of its harmonics e_k with the imaginary ones beside
-    them, and back, see `analyzed` and `synthesized`.
+    **Attributes** (M points)
+
+    - `symmetric`: True if the grid covers half a period
+    - `theta` (M,): points, rad
+    - `first`, `second` (M, M): matrices of the derivatives d/dtheta and d^2/dtheta^2 of psi
+    - `deviation_orders` (J,) and `orders` (K,): harmonics of psi and of e
+    - `deviation_weights` (J,): harmonic k of psi is weight / M sum_l psi_l exp(-i k theta_l); for e all weights are 2
+    - `cosine`, `sine` (2M - 1, K): 2 / M times cos and sin of k times the angle between two points
+    - `pairs` (M, M): index of the angle between two points in `cosine` and `sine`
+    - `analysis` (M, 2K): matrix from the values e_l to the real parts of the harmonics e_k followed by their imaginary parts;
+      `synthesis` (2K, M): matrix of the inverse map; see `analyzed` and `synthesized`
     """
 
     symmetric: bool
@@ -40,10 +46,11 @@ class Grid(NamedTuple):
 
 
 def grid_of(points: int, symmetric: bool) -> Grid:
-    """Grid of `points` on half a period if the motion has the half-turn symmetry, otherwise on a period.
+    """Return the grid of `points` points on half a period if the motion has the half-turn symmetry, otherwise on a period.
 
-    `points` is rounded to an even number for half a period and to an odd number for a period, which keeps the highest harmonic
-    of e complete. Each precision has its own grid, since JAX caches an array with the precision of its first use.
+    `points` is rounded to an even number for half a period and to an odd number for a period, so that the grid represents both
+    the cosine and the sine of the highest harmonic of e. Each precision has its own grid, since JAX caches an array with the
+    precision of its first use.
     """
     return _grid_of(points, symmetric, jnp.result_type(float).itemsize == 8)
 
@@ -59,8 +66,8 @@ def _grid_of(points: int, symmetric: bool, double: bool) -> Grid:
     else:
         deviation_orders, orders = np.arange(0, (m + 1) // 2), np.arange(1, (m + 1) // 2)
         weights = np.where(deviation_orders == 0, 1.0, 2.0)
-    apart = theta[:, None] - theta[None, :]
-    phase = deviation_orders[:, None, None] * apart
+    difference = theta[:, None] - theta[None, :]
+    phase = deviation_orders[:, None, None] * difference
     first = np.tensordot(weights * -deviation_orders, np.sin(phase), 1) / m
     second = np.tensordot(weights * -(deviation_orders**2), np.cos(phase), 1) / m
     distance = orders * (turn / m * np.arange(1 - m, m))[:, None]
@@ -82,27 +89,33 @@ def _synthesis(orders: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def analyzed(values: Array, matrix: np.ndarray) -> Array:
-    """Harmonics (..., K) of values (..., M) at the points, by a product of real numbers, a quarter of the complex one."""
+    """Return the harmonics (..., K) of values (..., M) at the points.
+
+    A real matrix product computes them, with a quarter of the operations of a complex one.
+    """
     return jax.lax.complex(*jnp.split(values @ matrix, 2, -1))
 
 
 def synthesized(harmonics: Array, matrix: np.ndarray) -> Array:
-    """Values (..., M) at the points of harmonics (..., K): Re sum_k c_k exp(i k theta_l)."""
+    """Return the values (..., M) at the points of harmonics (..., K): Re sum_k c_k exp(i k theta_l)."""
     return jnp.concatenate([harmonics.real, harmonics.imag], -1) @ matrix
 
 
 def deviation_analysis(grid: Grid) -> np.ndarray:
-    """(M, 2J): real parts of psi's harmonics, and beside them imaginary ones, from its values at the points; see `analyzed`."""
+    """Return the matrix (M, 2J) from values of psi to the real parts of its harmonics followed by the imaginary parts.
+
+    See `analyzed`.
+    """
     return _analysis(grid.deviation_orders, grid.theta) * np.tile(grid.deviation_weights, 2) / grid.theta.size
 
 
 def resampling(grid: Grid, to: Grid) -> np.ndarray:
-    """(M, M') psi at the points of another grid from that at those of one, by the harmonics that both have."""
+    """Return the matrix (M, M') from values of psi on `grid` to those on the grid `to`, by the harmonics of both grids."""
     orders = min(grid.deviation_orders.size, to.deviation_orders.size)
     keep = np.tile(np.arange(grid.deviation_orders.size) < orders, 2)
     return deviation_analysis(grid)[:, keep] @ _synthesis(grid.deviation_orders[:orders], to.theta)
 
 
 def deviation_synthesis(grid: Grid) -> np.ndarray:
-    """(2J, M): psi at the points from its harmonics, see `synthesized`."""
+    """Return the matrix (2J, M) from the harmonics of psi to its values at the points, see `synthesized`."""
     return _synthesis(grid.deviation_orders, grid.theta)

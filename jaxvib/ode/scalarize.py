@@ -1,8 +1,8 @@
-"""Small programs on arrays, rewritten as programs on scalars.
+"""Array programs of small size, rewritten as programs on scalars.
 
 XLA runs a program on arrays of two or three entries as a chain of small loops, and under `vmap` their entries lie interleaved
-in memory. The same program on numbers is one straight piece of code, and under `vmap` every number becomes a contiguous array
-over the batch: what a compiler turns into vector instructions best. The equations are written once, on arrays.
+in memory. The same program on scalars is straight-line code, and under `vmap` every scalar becomes a contiguous array over the
+batch, which a compiler vectorizes best. The equations are written once, on arrays.
 """
 
 from __future__ import annotations
@@ -61,24 +61,24 @@ Shared = TypeVar("Shared")
 Out = TypeVar("Out")
 
 _Sines: TypeAlias = dict[int, tuple[Scalar, tuple[Array, Array]]]
-"""Sines by the `id` of an angle: the angle, which keeps the id unique, its sine and cosine."""
+"""Dictionary from the `id` of an angle to the angle, its sine and its cosine. The angle is stored so that its id is not
+reused."""
 
 MAX_SCALARS, _MAX_OPERATIONS = 32, 1200
 """Largest numbers of state entries and of operations for which equations are compiled on scalars."""
 
 _BLOCK = 4096
-"""Number of entries of a batch that go through a program on scalars together: it may hold a thousand values of each in
-memory."""
+"""Number of entries of a batch in one call of a program on scalars, which may store a thousand values for each entry."""
 
 
 def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> Callable[..., PyTree[Scalars]]:
-    """`function`, traced for arguments of these shapes, on scalars.
+    """Return `function`, traced for arguments of these shapes, as a function of scalars.
 
-    **Returns** a function of the same arguments in which every array is an object array of scalars, as are its results.
+    **Returns** a function of the same arguments. Its arguments and results are object arrays of scalars.
     Sines and cosines are those of `jaxvib.numerics.sincos`. Products with zeros that are constants of the program are omitted.
 
     **Raises** `NotScalarizable` if an operation of the program has no rule on scalars, here or at a call of the returned
-    function. A function with a custom derivative (`jax.custom_jvp`) has none, since its derivative would be lost.
+    function. There is no rule for functions with a custom derivative (`jax.custom_jvp`), since the derivative would be lost.
 
     >>> import jax.numpy as jnp, numpy as np
     >>> on_scalars = scalarize(lambda x: x[0] * jnp.ones(2) + x, jnp.zeros(2))
@@ -104,7 +104,7 @@ def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array])
 
 
 def scalar_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr:
-    """Trace the function of `scalarize`: a program from the numbers of all arguments to those of the result, in order.
+    """Trace the function of `scalarize`: a program from the entries of all arguments to the entries of the result, in order.
 
     **Raises** `NotScalarizable` if an operation has no rule on scalars.
     """
@@ -153,7 +153,7 @@ def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
     known: dict[Var, list[Var]] = {}
 
     def polynomial(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
-        place = _angles().get(equation.primitive)
+        place = _trigonometric_primitives().get(equation.primitive)
         if place is None or not isinstance(angle := inputs[0], Var) or not is_floating(angle):
             return None
         made: list[tuple[JaxprEqn, Atoms]] = []
@@ -167,15 +167,17 @@ def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
 
 
 def scalars_of(tree: PyTree[Array]) -> list[Array]:
-    """All numbers of a tree of arrays, in order."""
+    """Return all entries of a tree of arrays, in order."""
     return [number for leaf in jax.tree.leaves(tree) for number in (jnp.unstack(leaf.ravel()) if leaf.shape else (leaf,))]
 
 
 def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared], Out]:
-    """`jax.vmap(function, in_axes=(0, None))`, on scalars if `function` is small enough; for values only.
+    """Return `jax.vmap(function, in_axes=(0, None))`, on scalars if `function` is small enough; intended for evaluation
+    without derivatives.
 
-    The program on scalars is fenced, therefore its time is proportional to the number of operations. It processes a large batch
-    in blocks, therefore its memory does not grow with the batch. Its derivatives are right but may be slow.
+    The program on scalars computes intermediate values once (see `fenced`), therefore its time is proportional to the number
+    of operations. It processes a large batch in blocks, therefore its memory does not grow with the batch. Its derivatives are
+    right but may be slow.
 
     **Arguments**: `function(x, shared)` gives a tree of arrays; the first leaf of x is a time or another finite scalar.
 
@@ -190,7 +192,7 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
         shared = jax.tree.map(jnp.asarray, shared)
         program = scalarized_program(function, one, shared) if size <= MAX_SCALARS else None
         if program is None:
-            # The batch is the last axis of every array, if `vmap` can keep it there, which takes half the time.
+            # The batch is the last axis of every array. If `vmap` can keep it there, this halves the time.
             last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), batch)
             found = jax.vmap(function, in_axes=(-1, None), out_axes=-1)(last, shared)
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
@@ -213,8 +215,8 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
 
 
 @functools.cache
-def _angles() -> dict[Primitive, int]:
-    """The sine and the cosine, and the place of each in what `sine_and_cosine` returns."""
+def _trigonometric_primitives() -> dict[Primitive, int]:
+    """Return the primitives of sine and cosine, with the position of each in the result of `sine_and_cosine`."""
     return {primitive_of(lax.sin, np.float32(1.0)): 0, primitive_of(lax.cos, np.float32(1.0)): 1}
 
 
@@ -222,7 +224,7 @@ def _require_rules(jaxpr: Jaxpr) -> None:
     for equation in jaxpr.eqns:
         if equation.primitive in inlined():
             _require_rules(_inner(equation)[0])
-        elif equation.primitive not in rules() and equation.primitive not in _angles():
+        elif equation.primitive not in rules() and equation.primitive not in _trigonometric_primitives():
             raise NotScalarizable(equation.primitive.name)
 
 
@@ -245,8 +247,8 @@ def _run(jaxpr: Jaxpr, consts: Sequence[ArrayLike], arguments: list[Scalars], si
         given = [read(atom) for atom in equation.invars]
         if equation.primitive in inlined():
             results = _run(*_inner(equation), given, sines)
-        elif equation.primitive in _angles():
-            place = _angles()[equation.primitive]
+        elif equation.primitive in _trigonometric_primitives():
+            place = _trigonometric_primitives()[equation.primitive]
             results = elementwise(lambda x, place=place: _of_angle(x, place, sines))(*given)
         else:
             results = rules()[equation.primitive](*given, **equation.params)
@@ -257,19 +259,19 @@ def _run(jaxpr: Jaxpr, consts: Sequence[ArrayLike], arguments: list[Scalars], si
 
 
 def _checked(result: Scalars, aval: Any, name: str) -> Scalars:
-    """Result of an operation, after a check of shape and dtype against the program on arrays."""
+    """Return the result of an operation after a check of shape and dtype against the program on arrays."""
     scalars = (x for x in result.flat if hasattr(x, "dtype"))
     if result.shape != aval.shape or any(x.dtype != aval.dtype for x in scalars):
-        raise NotScalarizable(f"{name}: its rule gave another shape or dtype than {aval}")
+        raise NotScalarizable(f"{name}: its rule gave a shape or dtype different from {aval}")
     return result
 
 
 def _of_angle(x: Scalar, place: int, sines: _Sines) -> Scalar:
-    """Sine or cosine of an angle; both are computed once for all uses in a program."""
+    """Return the sine or cosine of an angle; both are computed once for all uses in a program."""
     if is_known(x):
         return np.cos(x) if place else np.sin(x)
     if not jnp.issubdtype(x.dtype, jnp.floating):
-        raise NotScalarizable(f"the sine of a number of {x.dtype}")
+        raise NotScalarizable(f"the sine or cosine of a number of type {x.dtype}")
     if id(x) not in sines:
         sines[id(x)] = x, sine_and_cosine(x)
     return sines[id(x)][1][place]

@@ -1,4 +1,4 @@
-"""Primitives with custom rules for derivatives, batches and transposes, for functions that JAX does not trace."""
+"""JAX primitives with custom rules of differentiation, batching and transposition, for functions that JAX does not lowering."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _module(name: str) -> Any:
 
 
 ad, batching, mlir = map(_module, ("jax.interpreters.ad", "jax.interpreters.batching", "jax.interpreters.mlir"))
-HAS_RULES = HAS_JAXPRS and all(
+CAN_DEFINE_PRIMITIVES = HAS_JAXPRS and all(
     hasattr(module, name)
     for module, name in (
         (ad, "Zero"),
@@ -31,46 +31,47 @@ HAS_RULES = HAS_JAXPRS and all(
         (mlir, "register_lowering"),
     )
 )
-"""True if JAX lets other packages define primitives. If not, each process traces the derivatives of cached functions again."""
+"""True if JAX lets other packages define primitives. If False, each process traces the derivatives of cached functions
+again."""
 
 
 def primitive(
     name: str,
     *,
-    evaluate: Callable[..., list[Array]],
-    batch: Callable[..., tuple],
-    differentiate: Callable[..., tuple] | None = None,
+    impl: Callable[..., list[Array]],
+    batching_rule: Callable[..., tuple],
+    jvp: Callable[..., tuple] | None = None,
     transpose: Callable[..., list] | None = None,
-    trace: Callable[..., list[Array]] | None = None,
-    abstract: Callable[..., Sequence] | None = None,
+    lowering: Callable[..., list[Array]] | None = None,
+    abstract_eval: Callable[..., Sequence] | None = None,
 ) -> Callable[..., list[Array]]:
-    """Define a primitive of arrays and keyword parameters by its rules.
+    """Define a primitive with array operands and static keyword parameters from its rules.
 
     **Arguments**: the rules, each a function
 
-    - `evaluate`: from arrays that are not traced to outputs
-    - `batch`: from arrays and their batch axes to outputs and their batch axes
-    - `differentiate`: from arrays and tangents to outputs and their tangents
+    - `impl`: from concrete arrays to outputs
+    - `batching_rule`: from arrays and their batch axes to outputs and their batch axes
+    - `jvp`: from arrays and tangents to outputs and their tangents
     - `transpose`: from cotangents of the outputs and arrays to cotangents of the arrays
-    - `trace`: from arrays to outputs, inside `jit`
-    - `abstract`: from types of arrays to types of outputs
+    - `lowering`: from arrays to outputs, inside `jit`
+    - `abstract_eval`: from the types of the arrays to the types of the outputs
 
-    **Returns** a function of arrays, which is `evaluate` itself if `HAS_RULES` is False.
+    **Returns** the function that applies the primitive; `impl` itself if `CAN_DEFINE_PRIMITIVES` is False.
     """
-    if not HAS_RULES:
-        return evaluate
+    if not CAN_DEFINE_PRIMITIVES:
+        return impl
     defined = Primitive(name)
     defined.multiple_results = True
-    defined.def_impl(evaluate)
-    batching.primitive_batchers[defined] = batch
-    if differentiate is not None:
-        ad.primitive_jvps[defined] = differentiate
+    defined.def_impl(impl)
+    batching.primitive_batchers[defined] = batching_rule
+    if jvp is not None:
+        ad.primitive_jvps[defined] = jvp
     if transpose is not None:
         ad.primitive_transposes[defined] = transpose
-    if abstract is not None:
-        defined.def_abstract_eval(abstract)
-    if trace is not None:
-        mlir.register_lowering(defined, mlir.lower_fun(trace, multiple_results=True))
+    if abstract_eval is not None:
+        defined.def_abstract_eval(abstract_eval)
+    if lowering is not None:
+        mlir.register_lowering(defined, mlir.lower_fun(lowering, multiple_results=True))
     return defined.bind
 
 
@@ -87,7 +88,7 @@ def zero_of(x: Array) -> object:
 def apply_pullback(pullback: Callable[[list], Sequence[Array]], cotangents: list) -> list[Array]:
     """Apply a pullback of `jax.vjp` to cotangents, some of which may be symbolic zeros from `zero_of`.
 
-    JAX 0.10.0 does not accept symbolic zeros; arrays of zeros replace them.
+    JAX 0.10.0 does not accept symbolic zeros as cotangents; arrays of zeros replace them.
     """
     try:
         return list(pullback(cotangents))

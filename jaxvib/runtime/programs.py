@@ -23,7 +23,7 @@ from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import primal_of, traced
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.operations import pruned
-from jaxvib.runtime.primitive import HAS_RULES, apply_pullback, is_zero, primitive, zero_of
+from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, apply_pullback, is_zero, primitive, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
 from jaxvib.runtime.structure import Skeleton, Undescribable, describe
@@ -94,7 +94,7 @@ class CachedFunction(Generic[P, T]):
 
     def _transformed(self, tracers: Sequence[Any], leaves: Sequence[Any], treedef: Any, args: Any, kwargs: Any) -> T:
         """Evaluate the function under a JAX transformation."""
-        if HAS_RULES and program_folder() is not None and not is_debugging() and all(map(_is_simple, tracers)):
+        if CAN_DEFINE_PRIMITIVES and program_folder() is not None and not is_debugging() and all(map(_is_simple, tracers)):
             call = _CallSignature(self, Skeleton.of(leaves, treedef))
             if call.is_describable():
                 return call.result(_stored(*(leaf for leaf in leaves if eqx.is_array(leaf)), call=call))
@@ -385,15 +385,15 @@ def _transpose(cotangents: Sequence[Any], *_: Any, at: _LinearizationPoint) -> l
     return _vjp_backward(at.call, at.active, wanted, _types(at.arrays), at.residuals, nonzero)
 
 
-_stored = primitive("stored", evaluate=_evaluate, differentiate=_differentiate, batch=_batch)
+_stored = primitive("stored", impl=_evaluate, jvp=_differentiate, batching_rule=_batch)
 """Primitive that calls a cached function under a single derivative or batch."""
 
 _linear_map = primitive(
     "stored_linear_map",
-    evaluate=_apply_linear_map,
-    batch=_batch_linear_map,
+    impl=_apply_linear_map,
+    batching_rule=_batch_linear_map,
     transpose=_transpose,
-    trace=_trace_linear_map,
-    abstract=lambda *_, at: at.types,
+    lowering=_trace_linear_map,
+    abstract_eval=lambda *_, at: at.types,
 )
 """Primitive that maps the tangents of the arguments of a cached function to the tangents of its outputs."""

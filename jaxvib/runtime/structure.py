@@ -18,15 +18,16 @@ import jax
 import numpy as np
 
 Description: TypeAlias = "bool | int | float | str | list[Description] | dict[str, Description] | None"
-"""Values of JSON."""
+"""JSON values."""
 
 KNOWN_PACKAGES = {"jaxvib", "optimize", "jax", "equinox", "diffrax", "optimistix", "optax", "lineax"}
-"""Packages whose classes and functions a description may name, because their sources or versions are part of keys."""
+"""Packages whose classes and functions a description may name, because the keys of stored programs include their sources or
+versions."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Slot:
-    """Placeholder in a tree for the array of this index."""
+    """Placeholder in a tree for the array with the index `place`."""
 
     place: int
 
@@ -133,7 +134,7 @@ def rebuild(description: Description, arrays: Iterator[object]) -> Any:
             return _named(name)
         case {"class": str() as name, "fields": [*items]}:
             return _instance(_named(name), [rebuild(x, arrays) for x in items])
-    raise Undescribable(f"{description!r} describes nothing")
+    raise Undescribable(f"{description!r} is not a valid description")
 
 
 def _fields(kind: type) -> list[str]:
@@ -142,13 +143,13 @@ def _fields(kind: type) -> list[str]:
         return [name for name in names if not isinstance(getattr(kind, name, None), property)]
     if issubclass(kind, tuple) and hasattr(kind, "_fields"):
         return list(kind._fields)  # pyright: ignore[reportAttributeAccessIssue]
-    raise Undescribable(f"{kind} is no dataclass")
+    raise Undescribable(f"{kind} is neither a dataclass nor a named tuple")
 
 
 def _instance(kind: object, values: list[object]) -> object:
-    """Return an object with these field values, without a call of its constructor, which might convert and check them."""
+    """Return an object with these field values. Its constructor, which might convert or check them, is not called."""
     if not isinstance(kind, type):
-        raise Undescribable(f"{kind} is no class")
+        raise Undescribable(f"{kind} is not a class")
     names = _fields(kind)
     if issubclass(kind, tuple):
         return tuple.__new__(kind, values)
@@ -159,7 +160,8 @@ def _instance(kind: object, values: list[object]) -> object:
 
 
 def _name(value: object) -> str:
-    """Return `module:name` of a class or function; raise `Undescribable` if this name does not lead back to it."""
+    """Return `module:name` of a class or function; raise `Undescribable` if an import by this name does not return the same
+    object."""
     name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
     if _named(name) is not value:
         raise Undescribable(f"{value!r} cannot be found by its name")
@@ -169,7 +171,7 @@ def _name(value: object) -> str:
 def _named(name: str) -> object:
     module, _, path = name.partition(":")
     if module.partition(".")[0] not in KNOWN_PACKAGES:
-        raise Undescribable(f"{name} is not of a known package")
+        raise Undescribable(f"{name} does not belong to a known package")
     try:
         found = functools.reduce(getattr, path.split("."), importlib.import_module(module))
     except (ImportError, AttributeError) as error:

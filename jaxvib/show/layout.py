@@ -8,8 +8,9 @@ from typing import NamedTuple
 class Tie(NamedTuple):
     """Link between two platforms, or support of a platform.
 
-    **Attributes**: `low` and `high`, the levels of its ends, 0 for the foundation; `stiffness` N/m and `damping` N s/m. The
-    exciter is represented by a tie from the level of its platform to the same level, without stiffness and damping.
+    **Attributes**: `low` and `high`: numbers of the platforms at its ends, counted from the bottom, 0 for the foundation;
+    `stiffness` N/m and `damping` N s/m. The exciter is represented by a tie from its platform to the same platform, without
+    stiffness and damping.
     """
 
     low: int
@@ -23,12 +24,12 @@ class Tie(NamedTuple):
         return self.low == self.high
 
 
-def lanes(ties: list[Tie], levels: int) -> list[int]:
-    """Return the order of ties from left to right in which few ties cross platforms of other ties, and platforms are short.
+def order_of_ties(ties: list[Tie], levels: int) -> list[int]:
+    """Return an order of the ties from left to right in which few ties cross other platforms, and platforms are drawn short.
 
     Pairs of ties are swapped until no swap is an improvement.
 
-    >>> lanes([Tie(0, 1), Tie(0, 2), Tie(1, 2)], 2)
+    >>> order_of_ties([Tie(0, 1), Tie(0, 2), Tie(1, 2)], 2)
     [0, 2, 1]
     """
     order = list(range(len(ties)))

@@ -10,7 +10,7 @@ from jaxvib.draw.machine.parts import Part, Text, box, circle, ground
 from jaxvib.draw.style import COLORS, GUIDE, Look
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.show.layout import Tie, lanes
+from jaxvib.show.layout import Tie, order_of_ties
 from jaxvib.show.plane import PlaneView
 from jaxvib.show.view import BED, BODY, RotorView, View, spring_text, tie_parts
 from jaxvib.show.wheel import Pose, places_of, shown
@@ -33,7 +33,7 @@ class PlatformView(RotorView):
             Tie(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j])) for j in range(n) for i in range(j)
         ]
         self.ties = [tie for tie in self.ties if tie.stiffness > 0.0 or tie.damping > 0.0] + [Tie(self.exciter, self.exciter)]
-        order = lanes(self.ties, n)
+        order = order_of_ties(self.ties, n)
         widths = [2.0 * self.wheel.rim + 0.2 if self.ties[k].exciter else self.lane for k in order]
         starts = np.concatenate([[0.0], np.cumsum(widths)])
         self.x = {k: float(starts[p] + (0.5 * widths[p] if self.ties[k].exciter else 0.45)) for p, k in enumerate(order)}

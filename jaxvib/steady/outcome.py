@@ -1,7 +1,7 @@
-"""Outcome of a computation: its result, the error of its status, or the status `refused`.
+"""Outcome of a computation: its result, an error raised because of its status, or a result with the status `refused`.
 
-Parameters of a scene may have no value until a compiled program runs. Their validation is skipped when the scene is built; if
-one of them is not allowed, the result has the status `refused` and no numbers.
+The values of traced parameters of a scene are known only when a compiled program runs. They are not validated when the scene
+is built; if one of them is not allowed, the result has the status `refused` and NaN in place of numbers.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import enumeration_of
 from jaxvib.units.known import is_known, when_known
 
-REFUSED = "a traced number has a value that is not allowed: call the function outside of jit, grad and vmap to see which one"
-"""Sentence of the status `refused`."""
+REFUSED = "a traced parameter has a value that is not allowed: call the function outside of jit, grad and vmap to see which one"
+"""Message of the status `refused`."""
 
 Found = TypeVar("Found", bound=Result)
 
@@ -37,13 +37,14 @@ def outcome(
     failures: Collection[str] = (),
     hint: Callable[[str], str] = lambda _: "",
 ) -> Found:
-    """Return the result of a computation for `scene` up to the time `end`, or raise the error of a known status.
+    """Return the result of a computation for `scene` up to the time `end`, or raise an error if its status is known and a
+    failure.
 
-    **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: text after the sentence of the
-    status with that name.
+    **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: function from the name of a
+    status to the text that is appended to its message.
 
-    **Returns** the result; under a JAX transformation with the status `refused` and NaN for numbers if a parameter of the
-    scene is one that its constructor would not take, such as a negative stiffness, or if `end` is not positive.
+    **Returns** the result; under a JAX transformation it has the status `refused` and NaN in place of numbers if a parameter
+    of the scene has a value that its constructor would reject, such as a negative stiffness, or if `end` is not positive.
 
     **Raises** `ComputationError`.
     """
@@ -64,7 +65,7 @@ def outcome(
 
 
 def unknown_is_positive(number: Array | None) -> Array | None:
-    """Return a traced Boolean, True if a number without a value yet is finite and positive; None for a known number."""
+    """Return a traced Boolean, True if a traced number is finite and positive; None for a number with a known value."""
     return None if number is None or is_known(number) else jnp.isfinite(number) & (number > 0.0)
 
 

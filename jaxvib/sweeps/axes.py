@@ -1,4 +1,4 @@
-"""Axes of a study: parameters of the scene and of the start, over lists, ranges and samples."""
+"""Axes of a study: parameters of the scene and of the initial state whose values come from lists, ranges or samples."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ _START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s
 
 _KEYS = ["from", "to", "count", "scale"]
 
-_MOST_CORNERS = 10
+_MAX_AXES_WITH_CORNERS = 10
 """Maximum number of axes for which all corners are checked; with more axes only two opposite corners are checked."""
 
 AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int | str]
 """A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the number is sampled."""
 
 
-class Spot(NamedTuple):
-    """Numbers that an axis changes: a `number` of the scene or, if it is None, the entry `entry` (None: all entries) of the
-    field `field` of the start."""
+class Target(NamedTuple):
+    """Target of an axis: the parameter `number` of the scene or, if it is None, the entry `entry` (None: all entries) of the
+    field `field` of the initial state."""
 
     number: NamedNumber | None
     field: str
@@ -44,10 +44,13 @@ class Spot(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """Number, or several numbers with one name, that changes from case to case.
+    """Axis of a study: one or several parameters with one name, whose value changes from case to case.
 
-    **Attributes**: `name`, `unit`; `values` (n,) SI, None for a number that is sampled between `low` and `high`, on a
-    logarithmic scale if `log`; the `spot` of the number.
+    **Attributes**
+
+    - `name`, `unit`
+    - `values` (n,), SI; None if values are sampled between `low` and `high`, on a logarithmic scale if `log` is True
+    - `target`: the parameters that the axis changes
     """
 
     name: str
@@ -56,13 +59,13 @@ class Axis(NamedTuple):
     low: float
     high: float
     log: bool
-    spot: Spot
+    target: Target
 
-    def at(self, share: np.ndarray) -> np.ndarray:
-        """Return the values at shares in [0, 1) of the range."""
+    def at(self, fraction: np.ndarray) -> np.ndarray:
+        """Return the values at fractions in [0, 1) of the range."""
         if self.log:
-            return self.low * (self.high / self.low) ** share
-        return self.low + (self.high - self.low) * share
+            return self.low * (self.high / self.low) ** fraction
+        return self.low + (self.high - self.low) * fraction
 
 
 class Grid(NamedTuple):
@@ -95,12 +98,12 @@ class Grid(NamedTuple):
 
     @property
     def tiles(self) -> tuple[int, ...]:
-        """Number of tiles along each dimension."""
+        """Number of chunks along each dimension."""
         return tuple(-(-n // t) for n, t in zip(self.shape, self.tile, strict=True))
 
     @property
     def chunks(self) -> int:
-        """Number of tiles."""
+        """Number of chunks."""
         return int(np.prod(self.tiles, dtype=np.int64))
 
     def region(self, chunk: int) -> tuple[slice, ...]:
@@ -109,10 +112,10 @@ class Grid(NamedTuple):
         return tuple(slice(int(a), min(int(a) + t, n)) for a, t, n in zip(first, self.tile, self.shape, strict=True))
 
     def values(self, chunk: int) -> np.ndarray:
-        """Return the numbers of the cases of a chunk, in C order, (cases, axes), SI."""
+        """Return the values of the axes in the cases of a chunk, in C order, (cases, axes), SI."""
         region = self.region(chunk)
         index = np.indices([s.stop - s.start for s in region]).reshape(len(region), -1)
-        drawn = self.drawn(region[-1]) if self.samples else np.zeros((0, 0))
+        drawn = self.sampled_values(region[-1]) if self.samples else np.zeros((0, 0))
         columns, grid, sampled = [], 0, 0
         for axis in self.axes:
             if axis.values is None:
@@ -123,22 +126,22 @@ class Grid(NamedTuple):
                 grid += 1
         return np.stack(columns, axis=1)
 
-    def drawn(self, which: slice) -> np.ndarray:
-        """Return the sampled numbers of a slice of the samples, (samples, sampled axes), SI."""
+    def sampled_values(self, which: slice) -> np.ndarray:
+        """Return the values of the sampled axes for a slice of the samples, (samples, sampled axes), SI."""
         axes = [axis for axis in self.axes if axis.values is None]
         shares = samples(which.start, which.stop, len(axes), self.seed, self.sampling)
         return np.stack([axis.at(shares[:, k]) for k, axis in enumerate(axes)], axis=1)
 
 
 def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
-    """Return the axis of the number with that name, from a list of values or a table.
+    """Return the axis of the parameter with this name, from a list of values or a table.
 
-    **Raises** `InputError` for a name or for values that the scene or a start cannot have.
+    **Raises** `InputError` for a name that does not exist and for values that are not allowed.
     """
-    spot, unit = _where(scene, name)
+    target, unit = _where(scene, name)
 
     def value(given: Number, field: str) -> float:
-        return float(number(given, unit, field)) if spot.number is None else spot.number.value(given, field)
+        return float(number(given, unit, field)) if target.number is None else target.number.value(given, field)
 
     if isinstance(spec, Mapping):
         for key in spec:
@@ -150,51 +153,52 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
                 raise InputError(f"axes.{name}.{key}", "is missing; an axis is a list, or a table with from and to")
         low, high = value(spec["from"], f"axes.{name}.from"), value(spec["to"], f"axes.{name}.to")
         if not low < high:
-            raise InputError(f"axes.{name}", f"goes from {low:g} to {high:g}; the first must be less than the second")
+            raise InputError(f"axes.{name}", f"has from = {low:g} and to = {high:g}; from must be less than to")
         scale = spec.get("scale", "even")
         if scale not in ("even", "log"):
             raise InputError(f"axes.{name}.scale", f"is {quoted(scale)}; it must be 'even' or 'log'")
         if scale == "log" and not low > 0.0:
-            raise InputError(f"axes.{name}.from", f"is {low:g}, and the scale 'log'; it must be greater than 0 there")
+            raise InputError(f"axes.{name}.from", f"is {low:g}; it must be greater than 0 for the scale 'log'")
         values = None
         if "count" in spec:
             size = count(spec["count"], f"axes.{name}.count", low=2, each=64.0)
             values = np.geomspace(low, high, size) if scale == "log" else np.linspace(low, high, size)
-        axis = Axis(name, unit, values, low, high, scale == "log", spot)
+        axis = Axis(name, unit, values, low, high, scale == "log", target)
     else:
         if isinstance(spec, str) or not isinstance(spec, (list, tuple, np.ndarray)) or len(spec) == 0:
             raise InputError(f"axes.{name}", f"is {quoted(spec)}; give a list of values, or a table with from, to and count")
         values = np.asarray([value(v, f"axes.{name}[{k}]") for k, v in enumerate(spec)])
         if np.unique(values).size < values.size:
             raise InputError(f"axes.{name}", "has a value twice; give each value once")
-        axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, spot)
+        axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, target)
     for end in (axis.low, axis.high):  # the constructors of the scene's parts check the range of each number
-        validate_scene(put(scene, (spot,), jnp.asarray([end])))
+        validate_scene(put(scene, (target,), jnp.asarray([end])))
     return axis
 
 
-def _where(scene: Scene, name: str) -> tuple[Spot, str]:
+def _where(scene: Scene, name: str) -> tuple[Target, str]:
     """Return the place of the numbers with that name, in the scene or in the start, and their unit."""
     if not str(name).startswith("start."):
         found = find_number(scene, name, "axes")
-        return Spot(found, "", None), found.unit
+        return Target(found, "", None), found.unit
     match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
     if match is None or match[1] not in _START:
         raise InputError(
-            f"axes.{name}", f"is not a number of a start; {suggest_name(str(name), [f'start.{f}' for f in _START])}"
+            f"axes.{name}",
+            f"is not a parameter of the initial state; {suggest_name(str(name), [f'start.{f}' for f in _START])}",
         )
     size = scene.loads.count if match[1] in ("angle", "rate") else scene.machine.structure().mass.shape[0]
     entry = None if match[2] is None else int(match[2])
     if entry is not None and entry >= size:
         raise InputError(f"axes.{name}", f"does not exist; start.{match[1]} has {size} entries, counted from 0")
-    return Spot(None, match[1], entry), _START[match[1]]
+    return Target(None, match[1], entry), _START[match[1]]
 
 
-def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
-    """Require that no two axes change the same number. **Raises** `InputError` otherwise."""
+def require_disjoint(scene: Scene, axes: Sequence[Axis]) -> None:
+    """Require that no two axes change the same parameter. **Raises** `InputError` otherwise."""
     taken: dict[object, str] = {}
     for axis in axes:
-        found, field, entry = axis.spot
+        found, field, entry = axis.target
         if found is not None:
             entries: set = found.entries
         else:
@@ -202,21 +206,24 @@ def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
             entries = {(field, k) for k in (range(size) if entry is None else (entry,))}
         for one in entries:
             if one in taken:
-                raise InputError(f"axes.{axis.name}", f"changes a number that axes.{taken[one]} also changes; name it once")
+                raise InputError(
+                    f"axes.{axis.name}", f"changes a parameter that axes.{taken[one]} also changes; use one of these axes"
+                )
             taken[one] = axis.name
 
 
-def put(scene: Scene, spots: Sequence[Spot], values: Array) -> Scene:
-    """Return the scene with the numbers (axes,) of a case."""
-    for k, spot in enumerate(spots):
-        if spot.number is not None:
-            scene = put_numbers(scene, (spot.number,), jnp.full(spot.number.size, values[k]))
+def put(scene: Scene, targets: Sequence[Target], values: Array) -> Scene:
+    """Return the scene with the values (axes,) of the axes in a case."""
+    for k, target in enumerate(targets):
+        if target.number is not None:
+            scene = put_numbers(scene, (target.number,), jnp.full(target.number.size, values[k]))
     return scene
 
 
-def put_start(state: State, spots: Sequence[Spot], values: Array) -> State:
-    """Return the state with the numbers (axes,) of a case. One number for all angles sets the mean angle of the loads."""
-    for k, (found, field, entry) in enumerate(spots):
+def put_start(state: State, targets: Sequence[Target], values: Array) -> State:
+    """Return the initial state with the values (axes,) of the axes in a case. One value for all angles sets the mean angle of
+    the loads; their differences stay."""
+    for k, (found, field, entry) in enumerate(targets):
         if found is None:
             old = getattr(state, field)
             leaf = old[0] if isinstance(old, tuple) else old
@@ -233,7 +240,7 @@ def put_start(state: State, spots: Sequence[Spot], values: Array) -> State:
 def corners(axes: Sequence[Axis]) -> np.ndarray:
     """Return the corners of the box that the axes span, (corners, axes), SI."""
     ends = np.asarray([[axis.low, axis.high] for axis in axes])
-    if len(axes) > _MOST_CORNERS:
+    if len(axes) > _MAX_AXES_WITH_CORNERS:
         return ends.T
     return np.stack([mesh.ravel() for mesh in np.meshgrid(*ends, indexing="ij")], axis=1)
 
@@ -241,7 +248,7 @@ def corners(axes: Sequence[Axis]) -> np.ndarray:
 def tile_of(shape: Sequence[int], most: int) -> tuple[int, ...]:
     """Return the number of cases of a chunk along each dimension; a chunk has at most `most` cases.
 
-    The last dimension is filled first, and tiles have nearly equal sizes.
+    Chunks extend along the last dimension first and have nearly equal sizes.
     """
     tile, room = [], most
     for n in reversed(shape):
@@ -256,11 +263,12 @@ SAMPLINGS = ("low_discrepancy", "random")
 
 
 def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.ndarray:
-    """Return the samples number `first` to `last` - 1 in the unit cube of `size` dimensions, (last - first, size), in [0, 1).
+    """Return the samples `first` to `last` - 1 of a sequence in the unit cube of `size` dimensions, (last - first, size), in
+    [0, 1).
 
     "low_discrepancy" is the additive sequence x_k = frac(x_0 + k a) with a_j = g^-j, where g > 1 solves g^(size+1) = g + 1 and
-    x_0 is random with the seed `seed`. It is computed with 64-bit integers; therefore the billionth sample has all its digits.
-    "random" samples are the numbers of a counter-based generator (Philox) with the key `seed`.
+    x_0 is random with the seed `seed`. It is computed with 64-bit integers; therefore even the billionth sample has full
+    precision. "random" samples are the numbers of a counter-based generator (Philox) with the key `seed`.
 
     >>> samples(0, 4, 1, 0, "low_discrepancy").round(3).ravel().tolist()
     [0.012, 0.63, 0.248, 0.866]

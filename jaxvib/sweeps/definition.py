@@ -15,7 +15,7 @@ from jaxvib.motion.batch import BATCH_SIZE, BatchPlan
 from jaxvib.motion.start import Start
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.compat import enumeration_names
-from jaxvib.sweeps.axes import Grid, Spot
+from jaxvib.sweeps.axes import Grid, Target
 from jaxvib.sweeps.identity import digest
 from jaxvib.sweeps.measures import Measure
 from optimize.quantities.quantity import Tier
@@ -33,10 +33,10 @@ class CaseStatus(eqx.Enumeration):
 
     missing = "the case has not been computed yet"
     done = "the case was computed"
-    absent = "a requested quantity does not exist in this case, such as a jam beyond its fold"
+    absent = "a requested quantity, such as a jam beyond its fold, does not exist in this case"
     not_finite = "the motion grew without bounds"
     failed = "an error was raised; its message is stored with the case"
-    lost = "the worker that computed the case died several times"
+    lost = "the process that computed the case terminated unexpectedly several times"
 
 
 CASE_STATUSES = enumeration_names(CaseStatus)
@@ -72,19 +72,19 @@ class Study:
     program: str = ""
 
     @property
-    def spots(self) -> tuple[Spot, ...]:
-        """Places of the numbers of the axes."""
-        return tuple(axis.spot for axis in self.grid.axes)
+    def targets(self) -> tuple[Target, ...]:
+        """Parameters that the axes change."""
+        return tuple(axis.target for axis in self.grid.axes)
 
     @property
-    def choices(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None]:
+    def choices(self) -> tuple[tuple[Target, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None]:
         """Static arguments of the program of a case."""
-        return self.spots, self.measures, self.plan, self.start, self.mode
+        return self.targets, self.measures, self.plan, self.start, self.mode
 
     @property
     def size(self) -> int:
         """Number of cases in one call of the program. It is a multiple of the batch size, because a partial batch would be
-        computed by other instructions."""
+        computed by different instructions, with other rounding errors."""
         return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // BATCH_SIZE) * BATCH_SIZE
 
     @property
@@ -108,7 +108,7 @@ class Study:
 
     @property
     def key(self) -> str:
-        """Text that is unique for the study."""
+        """String that is unique for the study."""
         return digest(self.record)
 
     def nothing(self, cases: int) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""Figures of a store, chosen by its axes and drawn with bounded memory."""
+"""Figures of the stored results of a sweep; the axes of the sweep determine their kind. The memory is bounded."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Look
 
 _MAX_DOTS = 1500
-"""Maximum number of cases along an axis of a figure; of more cases only every k-th one is drawn."""
+"""Maximum number of cases along an axis of a figure; if there are more, only every k-th case is drawn."""
 
 _ROWS = 9
-"""Number of values of the other axis at which folds and torus points are computed."""
+"""Number of values of the axis that is not the rotor speed, at which folds and torus bifurcations are computed."""
 
 _BINS = 60
 
 _SPEED = "drive.speed"
 
 
-class _Table(NamedTuple):
+class _Labels(NamedTuple):
     """Labels of cases: `codes` (cases ...) are indices into `names`, -1 for no label."""
 
     codes: np.ndarray
@@ -42,7 +42,7 @@ class _Table(NamedTuple):
 
 
 def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's 95 % interval of a share with `hits` of `cases`; 0 to 1 if there are no cases.
+    """Return Wilson's confidence interval (default: 95 %) of the share `hits` / `cases`; 0 to 1 if there are no cases.
 
     It is the set of shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
 
@@ -60,10 +60,10 @@ def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np
 
 
 def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
-    """Plot the figure that fits a study.
+    """Plot the kind of figure that suits the axes of a study.
 
     - two axes or more: a map, of regimes if they were measured
-    - samples alone: the distribution of the first measure
+    - random samples as the only axis: the distribution of the first measure
     - one axis: the first measure as points; with samples, the shares of regimes if they were measured
     """
     opened = Store(Path(store))
@@ -90,7 +90,7 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
 def figures(
     store: str | Path, measure: str | None = None, *, x: str | None = None, y: str | None = None, theory: bool = True
 ) -> Iterator[tuple[str, Figure]]:
-    """Yield the figures that fit a study, with their names: "map", "shares", "distribution", "tornado".
+    """Yield the figures that suit the axes of a study, with their names: "map", "shares", "distribution", "tornado".
 
     The arguments are those of `plot_map`.
 
@@ -101,7 +101,7 @@ def figures(
     if len(grid) >= 2:
         yield "map", plot_map(store, measure, x=x, y=y, theory=theory)
     elif x or y:
-        raise InputError("--over", f"selects a map, which needs two axes; this study has:  {', '.join(grid) or 'none'}")
+        raise InputError("--over", f"selects a map, which needs two axes; this study has: {', '.join(grid) or 'none'}")
     if grid and _has_labels(opened):
         yield "shares", plot_shares(store, x)
     if measure is not None or any(not _is_label(opened, name) for name in opened.names):
@@ -118,12 +118,14 @@ def plot_map(
     theory: bool = True,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Plot a map over two axes: of labels (regimes, jam modes) with the folds and torus points of exact jams, or of values.
+    """Plot a map over two axes.
+
+    It shows values, or labels (regimes, jam modes) with the folds and torus bifurcations of exact jams.
 
     **Arguments**
 
     - `measure`: its name in the store (default: the regime, if there is one)
-    - `x`, `y`: names of axes; along further axes the middle case is shown
+    - `x`, `y`: names of axes; for all other axes the case in the middle is shown
     - `theory`: True to draw the lines on which exact jams fold or lose their stability, computed by
       `branches(scene, exact=True)` if one of the axes is the rotor speed
 
@@ -142,7 +144,7 @@ def plot_map(
     rest = [d for d in rest if d != across]
     up = y or (rest[0] if rest else None)
     if across is None or up is None or across == up:
-        raise InputError("x", f"and y must be two axes; this study has: {', '.join(grid) or 'none'}")
+        raise InputError("x", f"and y must be two different axes; this study has: {', '.join(grid) or 'none'}")
     (xs, step_x), (ys, step_y) = _thinned(opened, across), _thinned(opened, up)
     steps = {across: slice(None, None, step_x), up: slice(None, None, step_y)}
     region = tuple(steps.get(d, slice(n // 2, n // 2 + 1)) for d, n in zip(dims, opened.shape, strict=True))
@@ -166,7 +168,7 @@ def plot_map(
 def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Drawn:
     """Plot the share of each label (regimes with their jam modes) over one axis, with Wilson's 95 % intervals.
 
-    Each share counts all cases of the other axes. **Returns** a matplotlib figure, or the given `ax`.
+    Each share is taken over all cases of the other axes. **Returns** a matplotlib figure, or the given `ax`.
     """
     from jaxvib.draw.sweeps import shares_chart
 
@@ -177,14 +179,16 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     if over not in grid:
         raise InputError("over", f"is {quoted(over)}; {suggest_name(str(over), grid)}")
     if not _has_labels(opened):
-        raise InputError("store", "has neither regime nor mode, of which shares can be shown; measure run.regime")
+        raise InputError(
+            "store", "contains neither regimes nor jam modes, so that there are no shares to show; measure run.regime"
+        )
     place = dims.index(over)
     hits: dict[str, np.ndarray] = {}
     for rows in opened.pieces():
         table = _labels(opened, rows)
         codes = np.moveaxis(table.codes, place, 0).reshape(table.codes.shape[place], -1)
         at = rows if place == 0 else slice(None)
-        for k, name in [(-1, "no answer"), *enumerate(table.names)]:
+        for k, name in [(-1, "no result"), *enumerate(table.names)]:
             hits.setdefault(name, np.zeros(opened.shape[place]))[at] += np.sum(codes == k, axis=1)
     total = np.sum(list(hits.values()), axis=0)
     shares = {name: (n / total, *wilson(n, total)) for name, n in hits.items() if np.any(n > 0)}
@@ -216,7 +220,8 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot the mean of a measure over the lowest and over the highest fifth of the values of each number that changes.
+    """Plot the mean of a measure over the cases with the lowest and with the highest fifth of the values of each varied
+    parameter.
 
     The number with the largest influence is on top. **Returns** a matplotlib figure, or the given `ax`.
     """
@@ -304,7 +309,8 @@ def _measure_label(store: Store, name: str) -> str:
 
 
 def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:
-    """Return the numbers of a measure in a region, the largest along a further dimension; NaN for missing ones."""
+    """Return the numbers of a measure in a region; the maximum along an additional dimension of the measure; NaN for missing
+    ones."""
     values = store.read(name, region).astype(float)
     return np.max(values, axis=-1) if values.ndim > len(store.shape) else values
 
@@ -317,7 +323,7 @@ def _is_label(store: Store, name: str) -> bool:
     return name == "mode" or "flag_meanings" in store.group[name].attrs
 
 
-def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Table:
+def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
     """Return the labels of the cases of a region: the name of the regime, and the jam mode of jammed loads."""
     words: list[str] = str(store.group["regime"].attrs["flag_meanings"]).split() if "regime" in store.names else ["not jammed"]
     first = len(words)
@@ -326,16 +332,17 @@ def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Table:
     codes = store.read("regime", region).astype(int) if "regime" in store.names else np.zeros(done.shape, int)
     codes = np.where(modes > 0, first + modes - 1, codes)
     names = [*words, *(f"jammed, mode {k}" for k in range(1, 2 * store.coordinates + 2))]
-    return _Table(np.where(done, codes, -1), names)
+    return _Labels(np.where(done, codes, -1), names)
 
 
 def _theory(
     store: Store, across: str, up: str, xs: np.ndarray, ys: np.ndarray
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the lines in the plane on which exact jams of the stored scene fold or lose their stability, by kind.
+    """Return the lines in the map on which exact jams of the stored scene fold or lose their stability, by kind.
 
-    Lines exist only if one axis is the rotor speed. If the other axis is a number of the start, which has no influence on
-    steady motions, the lines are straight. If it is a parameter of the scene, they connect the points at `_ROWS` of its values.
+    Lines exist only if one axis is the rotor speed. If the other axis is a parameter of the initial state, which has no
+    influence on steady motions, the lines are straight. If it is a parameter of the scene, they connect the points at `_ROWS`
+    of its values.
     """
     if _SPEED not in (across, up):
         return {}
@@ -345,13 +352,13 @@ def _theory(
     other, values, speeds = (up, ys, xs) if across == _SPEED else (across, xs, ys)
     fixed = other.startswith("start.")
     rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _ROWS))
-    spot = axis_of(scene, other, [float(rows[0])]).spot
-    scene = put(scene, (axis_of(scene, _SPEED, [float(speeds[-1])]).spot,), jnp.asarray([float(np.max(speeds))]))
+    target = axis_of(scene, other, [float(rows[0])]).target
+    scene = put(scene, (axis_of(scene, _SPEED, [float(speeds[-1])]).target,), jnp.asarray([float(np.max(speeds))]))
     found: list[dict[str, list[float]]] = []
     for value in rows[:1] if fixed else rows:
         try:
-            special = exact_branches(put(scene, (spot,), jnp.asarray([float(value)]))).special
-        except InputError:  # the exact theory does not cover this scene
+            special = exact_branches(put(scene, (target,), jnp.asarray([float(value)]))).special
+        except InputError:  # the exact method does not include this scene
             return {}
         kinds: dict[str, list[float]] = {}
         for point in special:
@@ -361,7 +368,7 @@ def _theory(
     lines: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for kind in sorted({kind for kinds in found for kind in kinds}):
         counts = {len(kinds.get(kind, [])) for kinds in found}
-        if len(counts) == 1:  # the same number of points in every row can be connected by lines
+        if len(counts) == 1:  # lines connect points only if every row has the same number of them
             parts = [(np.asarray([kinds[kind][k] for kinds in found]), rows) for k in range(counts.pop())]
         else:
             parts = [

@@ -19,7 +19,7 @@ from jaxvib.motion.stiffness import fastest_decay, steps_of
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.operations import calls_python, program_text
 from jaxvib.runtime.programs import cached
-from jaxvib.sweeps.axes import Spot, put, put_start
+from jaxvib.sweeps.axes import Target, put, put_start
 from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, Study
 from jaxvib.sweeps.identity import digest
 from jaxvib.sweeps.measures import Measure, RunMeasure
@@ -55,7 +55,7 @@ class Chunk(NamedTuple):
 def _each(
     scene: Scene,
     values: Array,
-    spots: tuple[Spot, ...],
+    targets: tuple[Target, ...],
     measures: tuple[Measure, ...],
     plan: BatchPlan | None,
     start: Start,
@@ -64,13 +64,13 @@ def _each(
     """Compute the measures of each case (cases, axes), and True for each case whose motion stayed finite."""
 
     def one(value: Array) -> tuple[tuple[Array, ...], Array]:
-        this = put(scene, spots, value)
+        this = put(scene, targets, value)
         evaluation, run = Evaluation(this), None
         if plan is not None:
             separation = (
                 START_SEPARATION if start == "jam" else None
             )  # loads that start at one angle stay together, even in an unstable jam
-            state = put_start(initial_state(this, start, mode=mode, separation=separation, throw=False), spots, value)
+            state = put_start(initial_state(this, start, mode=mode, separation=separation, throw=False), targets, value)
             run = run_in_batch(this, state, plan)
 
         def read(measure: Measure) -> Array:
@@ -94,20 +94,20 @@ def _cases(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tu
 
 
 @cached
-def _speeds(scene: Scene, values: Array, spots: tuple[Spot, ...]) -> tuple[Array, Array, Array, Array]:
+def _speeds(scene: Scene, values: Array, targets: tuple[Target, ...]) -> tuple[Array, Array, Array, Array]:
     def one(value: Array) -> tuple[Array, Array, Array, Array]:
-        this = put(scene, spots, value)
+        this = put(scene, targets, value)
         return (*frequency_bounds(this), fastest_decay(this), this.drive.speed)
 
     return jax.vmap(one)(values)
 
 
-def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: float, steps: int | None) -> BatchPlan:
+def planned(scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], until: float, steps: int | None) -> BatchPlan:
     """Return the plan of steps and window for all cases, from the fastest and the slowest of the study's `corners` (n, axes).
 
     Frequencies increase with each stiffness and decrease with each mass; therefore the corners have the extreme frequencies.
     """
-    fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), spots))
+    fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), targets))
     most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
     window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), most, until / 2.0)
     given = None if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
@@ -128,7 +128,7 @@ def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
     functions of measures refer to. It begins with `PYTHON` and differs each time if a measure calls Python from its program,
     because Python cannot be compared. Errors of tracing are passed on.
     """
-    values = jnp.zeros((1, len(study.spots)))
+    values = jnp.zeros((1, len(study.targets)))
 
     def cases(values: Array) -> tuple[tuple[Array, ...], Array]:
         return _each(study.scene, values, *study.choices)

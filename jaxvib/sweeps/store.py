@@ -239,7 +239,7 @@ class Store:
         shape = tuple(s.stop - s.start for s in region)
         try:
             if study.grid.samples:
-                drawn = study.grid.drawn(region[-1])
+                drawn = study.grid.sampled_values(region[-1])
                 for k, name in enumerate(self.sampled):
                     self.arrays[name][region[-1]] = drawn[:, k]
             for name, leaf in cases.found.items():

@@ -15,7 +15,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
-from jaxvib.sweeps.axes import SAMPLINGS, AxisSpec, Grid, axis_of, corners, require_apart, tile_of
+from jaxvib.sweeps.axes import SAMPLINGS, AxisSpec, Grid, axis_of, corners, require_disjoint, tile_of
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
 from jaxvib.sweeps.program import planned, traced_program
@@ -55,7 +55,7 @@ def study(
     if not isinstance(axes, Mapping) or not axes:
         raise InputError("axes", "is empty; name at least one number that varies, such as drive.speed")
     found = tuple(axis_of(scene, name, spec) for name, spec in axes.items())
-    require_apart(scene, found)
+    require_disjoint(scene, found)
     drawn = [axis.name for axis in found if axis.values is None]
     count(samples, "samples", low=0)
     require_one_of(sampling, SAMPLINGS, "sampling")
@@ -80,16 +80,16 @@ def study(
     chosen = tier or ("time" if runs else "leading")
     require_one_of(chosen, TIERS, "tier")
     measures = tuple(m.at_tier(tier) if tier and isinstance(m, Quantity) else m for m in measures)
-    spots = tuple(axis.spot for axis in found)
+    targets = tuple(axis.target for axis in found)
     plan = None
     if runs:
         if until is None:
             raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
         end = float(number(until, "s", "until", low=0.0, open_low=True))
         initial_state(scene, start, mode=mode, throw=False)
-        plan = planned(scene, corners(found), spots, end, None if steps is None else count(steps, "steps"))
-    elif until is not None or any(spot.number is None for spot in spots):
-        what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.spot.number is None)
+        plan = planned(scene, corners(found), targets, end, None if steps is None else count(steps, "steps"))
+    elif until is not None or any(target.number is None for target in targets):
+        what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.target.number is None)
         raise InputError(what, "is an option of runs, but no quantity is measured in a run; measure for example run.regime")
     grid = Grid(found, samples, seed, sampling, ())
     if math.prod(grid.shape) > _MAX_CASES:

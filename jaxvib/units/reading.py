@@ -1,4 +1,4 @@
-"""Conversion of texts with units and of pint quantities to SI numbers."""
+"""Conversion of strings with units and of pint quantities to SI numbers."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ _FACTORS = {
     "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4},
     "rad/s": {"rad/s": 1.0, "rpm": math.pi / 30.0, "Hz": 2.0 * math.pi},
 }
-"""Factors of the units in most drawings. Other units are read by pint, whose import takes half a second."""
+"""Factors of the most common units of engineering drawings. Other units are read by pint, whose import takes half a second."""
 
 _UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
-"""Errors, other than pint's own classes, that pint raises for a text that is no unit; it parses the text as Python."""
+"""Errors, other than pint's own classes, that pint raises for a string that is not a unit; it parses the string as Python."""
 
 
 def unit_name(unit: str) -> str:
@@ -88,13 +88,13 @@ def _example(unit: str) -> str:
 
 
 def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
-    """Return the SI magnitude of `value` in `unit`; numbers without a unit are in `unit` already.
+    """Return the SI magnitude of `value` in `unit`; numbers without a unit are taken to be in `unit`.
 
     Strings and pint quantities are converted. If `unit` contains an angle, a frequency in hertz counts as revolutions per
-    second (pint alone would convert 25 Hz to 25 rad/s), "1500 1/min" is 1500 rpm, and 1/s without an angle is refused.
+    second (pint alone would convert 25 Hz to 25 rad/s), "1500 1/min" is 1500 rpm, and 1/s without an angle raises an error.
 
-    **Raises** `InputError` for a text that is no number, an unknown unit, a unit of another dimension, and a value that is not
-    a real number (`require_real`).
+    **Raises** `InputError` for a string that is not a number, an unknown unit, a unit of another dimension, and a value that
+    is not a real number (`require_real`).
 
     >>> round(to_float("1500 rpm", "rad/s", "drive.speed"), 4)
     157.0796
@@ -115,7 +115,9 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         if parts is None:
             if len(text) < 100 and _COMMA.fullmatch(text):
                 point, none = quoted(text.replace(",", ".")), quoted(text.replace(",", ""))
-                raise InputError(field, f"is {quoted(value)}, with a comma; write {point} for a decimal comma, else {none}")
+                raise InputError(
+                    field, f"is {quoted(value)}, with a comma; write {point} if it is a decimal comma, otherwise {none}"
+                )
             raise _wrong_unit(value, unit, field)
         magnitude, written = float(parts[1]), (parts[2] + parts[3]).strip()
         factor = _FACTORS.get(unit, {}).get("rpm" if written in _PER_MINUTE else _SPELLINGS.get(written, written))
@@ -131,10 +133,10 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 
 
 def require_real(value: object, unit: str, field: str) -> None:
-    """Check that a value is a real number or an array of real numbers. All numbers of users pass this check.
+    """Check that a value is a real number or an array of real numbers. Every number that a user gives goes through this check.
 
-    **Raises** `InputError` for Booleans, complex numbers, dates, masked values, bytes, lists, None and objects that are no
-    number.
+    **Raises** `InputError` for Booleans, complex numbers, dates, masked values, bytes, lists, None and objects that are not
+    numbers.
 
     >>> require_real(True, "kg", "machine.mass")
     Traceback (most recent call last):
@@ -156,7 +158,7 @@ def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
 
 
 def _parsed(unit: str) -> Any:
-    """Return pint's unit for a text. **Raises** an error of `_UNREADABLE` or of pint for a text that is no unit."""
+    """Return pint's unit for a string. **Raises** an error of `_UNREADABLE` or of pint for a string that is not a unit."""
     import pint
 
     name = _SPELLINGS.get(unit, unit)
@@ -166,7 +168,8 @@ def _parsed(unit: str) -> Any:
 
 
 def _quantity(magnitude: float, written: str, value: str, unit: str | None, field: str) -> Any:
-    """Return a pint quantity of a number and the text of its unit. **Raises** `InputError` for a text that is no unit."""
+    """Return a pint quantity of a number and the string of its unit. **Raises** `InputError` for a string that is not a
+    unit."""
     import pint
 
     try:
@@ -188,7 +191,7 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
     try:
         registry, wanted = pint.get_application_registry(), _parsed(unit)
         units = registry.Unit(str(given.units))
-        (rest, angle, hertz), (wanted_rest, wanted_angle, wanted_hertz) = _roots(units), _roots(wanted)
+        (rest, angle, hertz), (wanted_rest, wanted_angle, wanted_hertz) = _exponents(units), _exponents(wanted)
         if (wanted_angle or wanted_hertz) and units == registry.Unit("1/min"):
             given, angle = registry.Quantity(given.m, "rpm"), 1.0
         if rest != wanted_rest:
@@ -198,17 +201,18 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
         if isinstance(error, InputError):
             raise
         raise _wrong_unit(text, unit, field) from error
-    if angle + hertz == wanted_angle + wanted_hertz:  # hertz count as turns on both sides
+    if angle + hertz == wanted_angle + wanted_hertz:  # 1 Hz is one revolution per second in both units
         return magnitude * (2.0 * math.pi) ** (hertz - wanted_hertz)
     if angle != wanted_angle and not rest.keys() - {"second"}:
         if unit == "rad/s":
-            raise InputError(field, f"is {quoted(text)}, which does not name the unit; write {_example(unit)}")
+            raise InputError(field, f"is {quoted(text)}, which does not state radians or revolutions; write {_example(unit)}")
         raise _wrong_unit(text, unit, field)
     return magnitude
 
 
-def _roots(units: Any) -> tuple[dict[str, float], float, float]:
-    """Return the powers of a pint unit: of its base units other than angles by their names, of its angles, and of hertz."""
+def _exponents(units: Any) -> tuple[dict[str, float], float, float]:
+    """Return the exponents in a pint unit: those of the base units other than angles by name, that of the angle, and that of
+    hertz."""
     import pint
 
     _, roots = pint.get_application_registry().get_root_units(units)
@@ -234,9 +238,9 @@ def unit_ratio(one: str, other: str) -> float | None:
 
 
 def in_own_unit(value: str | Quantity, field: str) -> tuple[float, str]:
-    """Return the magnitude and the SI unit of a text or a pint quantity in its own dimension; hertz become rad/s.
+    """Return the magnitude in SI and the SI unit of a string or a pint quantity of any dimension; Hz is converted to rad/s.
 
-    **Raises** `InputError` for a text that is no number with a unit.
+    **Raises** `InputError` for a string that is not a number with a unit.
 
     >>> in_own_unit("2 mm", "limit")
     (0.002, 'meter')
@@ -251,7 +255,7 @@ def in_own_unit(value: str | Quantity, field: str) -> tuple[float, str]:
         given = _quantity(float(parts[1]), (parts[2] + parts[3]).strip(), value, None, field)
     require_real(given.m, "", field)
     try:
-        _, _, hertz = _roots(pint.get_application_registry().Unit(str(given.units)))
+        _, _, hertz = _exponents(pint.get_application_registry().Unit(str(given.units)))
         given = given.to_base_units() * pint.get_application_registry().Quantity(2.0 * math.pi, "rad") ** hertz
         magnitude = _finite(given.m, field)
     except (pint.PintError, *_UNREADABLE) as error:

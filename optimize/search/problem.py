@@ -24,7 +24,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
 from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, guesses
 from optimize.quantities.quantity import BuiltinQuantity, Demand, Quantity, walk
-from optimize.space import DesignSpace, Held
+from optimize.space import DesignSpace, HeldQuantity
 
 _CHUNK = 64
 """Number of designs in a batch on a core."""
@@ -79,7 +79,7 @@ class Problem(eqx.Module):
         leading order. None if it is the same problem, or if the objective has no leading order."""
         objective = self.objective.easy
         demands = [replace(d, quantity=d.quantity.easy, limit=d.limit.easy) for d in self.demands]
-        held = tuple(Held(h.quantity.easy, h.value) for h in self.space.held)
+        held = tuple(HeldQuantity(h.quantity.easy, h.value) for h in self.space.held)
         same = objective == self.objective and demands == list(self.demands)
         if same and all(a.quantity == b.quantity for a, b in zip(held, self.space.held, strict=True)):
             return None

@@ -96,7 +96,7 @@ def test_a_large_machine_has_a_slider_for_all_springs():
     )
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(150.0))
     titles = {each.title: each for each in sliders_of(scene)}
-    every = titles["every link stiffness of the machine, times"]
+    every = titles["link stiffness of the machine, common factor"]
     np.testing.assert_array_equal(scene_at(scene, {every.name: 2.0}).machine.link_stiffness, np.full(n - 1, 2e4))
 
 

@@ -9,13 +9,13 @@ from jaxvib.runtime import primitive
 
 def test_primitives_take_rules(monkeypatch):
     """`jax.interpreters`: batches, derivatives, transposes, lowering."""
-    assert primitive.HAS_RULES
-    rules = {"evaluate": lambda x: [2.0 * x], "batch": lambda x, axes: ([2.0 * x[0]], axes)}
+    assert primitive.CAN_DEFINE_PRIMITIVES
+    rules = {"impl": lambda x: [2.0 * x], "batching_rule": lambda x, axes: ([2.0 * x[0]], axes)}
     doubled = primitive.primitive("doubled", **rules)
     assert doubled(jnp.asarray(2.0)) == [4.0]
     assert jax.vmap(lambda x: doubled(x)[0])(jnp.arange(3.0)).tolist() == [0.0, 2.0, 4.0]
-    monkeypatch.setattr(primitive, "HAS_RULES", False)
-    assert primitive.primitive("doubled", **rules) is rules["evaluate"]
+    monkeypatch.setattr(primitive, "CAN_DEFINE_PRIMITIVES", False)
+    assert primitive.primitive("doubled", **rules) is rules["impl"]
 
 
 @pytest.mark.parametrize("knows", [True, False])

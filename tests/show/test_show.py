@@ -11,7 +11,7 @@ from PIL import Image
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.show.layout import Tie, lanes
+from jaxvib.show.layout import Tie, order_of_ties
 from jaxvib.show.motion import of_orbit, of_run
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest
@@ -59,7 +59,7 @@ def test_every_machine_has_a_sketch_with_its_numbers(kind):
 
 def test_springs_cross_no_platform_that_they_do_not_hold():
     ties = [Tie(0, 1), Tie(0, 2), Tie(0, 3), Tie(1, 2), Tie(1, 3), Tie(2, 3), Tie(2, 2)]
-    order = lanes(ties, 3)
+    order = order_of_ties(ties, 3)
     place = {k: x for x, k in enumerate(order)}
     for k, tie in enumerate(ties):
         for level in range(tie.low + 1, tie.high):

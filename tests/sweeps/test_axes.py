@@ -9,7 +9,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.sweeps.axes import Axis, Grid, Spot, axis_of, put, put_start, samples, tile_of
+from jaxvib.sweeps.axes import Axis, Grid, Target, axis_of, put, put_start, samples, tile_of
 from jaxvib.sweeps.study import study
 from optimize import jam_frequency
 
@@ -70,10 +70,10 @@ def test_tiles_are_nearly_alike_and_no_larger_than_asked():
 def test_numbers_go_where_their_names_say():
     given = scene("two_mass", "balls")
     names = ["machine.stiffness[1]", "loads.drag", "start.rate[2]", "start.angle", "start.velocity"]
-    spots = [axis_of(given, name, [1.0, 2.0]).spot for name in names]
+    targets = [axis_of(given, name, [1.0, 2.0]).target for name in names]
     values = np.array([7e4, 2.5, 30.0, 0.4, -0.1])
     moving = dataclasses.replace(jv.initial_state(given), velocity=jnp.asarray([0.3, 0.7]))
-    put_in, state = put(given, spots, values), put_start(moving, spots, values)
+    put_in, state = put(given, targets, values), put_start(moving, targets, values)
     assert put_in.machine.stiffness.tolist() == [5e4, 7e4] and float(put_in.loads.drag) == 2.5
     assert state.rate[0].tolist() == [0.0, 0.0, 30.0] and np.allclose(state.angle[0], 0.4 + np.deg2rad([-1.0, 0.0, 1.0]))
     assert state.velocity.tolist() == [-0.1, -0.1] and state.displacement.tolist() == [0.0, 0.0]
@@ -87,11 +87,11 @@ RUN = ["run.mode"]
     [
         (dict(axes={}), "axes is empty; name at least one number"),
         (dict(axes={"drive.sped": [1.0]}), "is not a number of this scene; did you mean 'drive.speed'"),
-        (dict(axes={"start.rat": [1.0]}), "is not a number of a start; did you mean 'start.rate'"),
+        (dict(axes={"start.rat": [1.0]}), "is not a parameter of the initial state; did you mean 'start.rate'"),
         (dict(axes={"start.rate[3]": [1.0]}), "start.rate has 3 entries"),
         (
             dict(axes={"machine.mass": [40.0], "machine.mass[0]": [50.0]}),
-            r"changes a number that axes.machine.mass also changes",
+            r"changes a parameter that axes.machine.mass also changes",
         ),
         (
             dict(axes={"start.rate": [1.0], "start.rate[1]": [2.0]}, measure=RUN, until=1.0),
@@ -104,7 +104,7 @@ RUN = ["run.mode"]
         (dict(axes={"drive.speed": {"from": 1.0, "to": 2.0, "steps": 3}}), "steps is not a field of an axis"),
         (dict(axes={"drive": {"speed": [1.0]}}), "is not a number of this scene"),
         (dict(axes={"drive.speed": {"from": 1.0}}), "to is missing"),
-        (dict(axes={"drive.speed": {"from": 2.0, "to": 1.0, "count": 3}}), "goes from 2 to 1"),
+        (dict(axes={"drive.speed": {"from": 2.0, "to": 1.0, "count": 3}}), "has from = 2 and to = 1"),
         (dict(axes={"drive.speed": {"from": 1.0, "to": 2.0, "count": -3}}), "count is -3; it must be a whole number"),
         (dict(axes={"drive.speed": {"from": 1.0, "to": 2.0, "scale": "ln"}}), "scale is 'ln'; it must be 'even' or 'log'"),
         (dict(axes={"loads.drag": {"from": 0.0, "to": 2.0, "scale": "log"}}), "must be greater than 0 there"),
@@ -136,5 +136,5 @@ def test_what_is_not_allowed_is_said(more, says):
 def test_sampled_ranges_are_divided_by_ratio_on_request():
     share = np.array([0.0, 0.25, 0.5])
     for log, values in ((False, [1.0, 2500.75, 5000.5]), (True, [1.0, 10.0, 100.0])):
-        axis = Axis("drive.speed", "rad/s", None, 1.0, 1e4, log, Spot(None, "", None))
+        axis = Axis("drive.speed", "rad/s", None, 1.0, 1e4, log, Target(None, "", None))
         np.testing.assert_allclose(axis.at(share), values, rtol=1e-14)

@@ -78,7 +78,7 @@ def test_labels_have_a_colour_each_and_none_has_its_own():
     mesh = axis.collections[0]
     colours = [to_hex(c) for c in mesh.to_rgba(np.asarray(mesh.get_array())).reshape(-1, 4)]
     assert colours[1] == colours[2] and len(set(colours)) == 3
-    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "c", "no answer", "fold of exact jams"]
+    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "c", "no result", "fold bifurcations of exact jams"]
 
 
 def test_shares_are_those_of_the_cases(grid):

@@ -1,4 +1,7 @@
-"""Outlines of springs, dampers, boxes, circles and arrows as arrays of points (n, 2), NaN between separate lines; texts."""
+"""Outlines of springs, dampers, boxes, circles and arrows, and texts.
+
+An outline is an array of points (n, 2); NaN separates its lines.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ class Part(NamedTuple):
     - `points` (n, 2): points of the outline
     - `look`: options of matplotlib
     - `filled`: True for a filled outline
-    - `axis`: the rotor's axis, for a part that turns with the rotor
+    - `axis`: position of the rotor's axis, for a part that turns with the rotor
     """
 
     points: np.ndarray
@@ -44,10 +47,10 @@ class Text(NamedTuple):
 def _along(start: Point, end: Point, forward: np.ndarray, side: np.ndarray) -> np.ndarray:
     """Return points at the fractions `forward` of the line from `start` to `end`, at the distances `side` to its left."""
     a, b = np.asarray(start, float), np.asarray(end, float)
-    way = b - a
-    length = np.hypot(*way)
-    left = np.array([-way[1], way[0]]) / (length if length > 0.0 else 1.0)
-    return a + forward[:, None] * way + side[:, None] * left
+    direction = b - a
+    length = np.hypot(*direction)
+    left = np.array([-direction[1], direction[0]]) / (length if length > 0.0 else 1.0)
+    return a + forward[:, None] * direction + side[:, None] * left
 
 
 def spring(start: Point, end: Point, width: float = 0.2, coils: int = 6) -> np.ndarray:
@@ -70,10 +73,11 @@ def _zigzag(coils: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damper(start: Point, end: Point, width: float = 0.2, cup: float = 0.4) -> np.ndarray:
-    """Return a dashpot from one point to another: a cup at the first, with the length fraction `cup`, and a piston."""
-    pen, low, high = np.nan, 0.5 - 0.5 * cup, 0.5 + 0.5 * cup
-    forward = np.array([0.0, low, pen, high, low, low, high, pen, 1.0, 0.52, pen, 0.52, 0.52])
-    side = np.array([0.0, 0.0, pen, 0.5, 0.5, -0.5, -0.5, pen, 0.0, 0.0, pen, 0.36, -0.36]) * width
+    """Return a dashpot from one point to another: a cup on the side of the first point, whose length is the fraction `cup` of
+    the distance, and a piston."""
+    gap, low, high = np.nan, 0.5 - 0.5 * cup, 0.5 + 0.5 * cup
+    forward = np.array([0.0, low, gap, high, low, low, high, gap, 1.0, 0.52, gap, 0.52, 0.52])
+    side = np.array([0.0, 0.0, gap, 0.5, 0.5, -0.5, -0.5, gap, 0.0, 0.0, gap, 0.36, -0.36]) * width
     return _along(start, end, forward, side)
 
 
@@ -109,23 +113,23 @@ def turning_arrow(centre: Point, radius: float, direction: int) -> tuple[np.ndar
     return arc, arc[-1] + np.array([0.2 * along, 0.09 * across, -0.09 * across, 0.2 * along])
 
 
-def arrow(start: Point, way: Point, width: float = 0.09) -> np.ndarray:
+def arrow(start: Point, direction: Point, width: float = 0.09) -> np.ndarray:
     """Return the outline of an arrow; a short arrow has a shorter head, and an arrow of zero length is a point."""
-    length = float(np.hypot(*way))
+    length = float(np.hypot(*direction))
     head = min(0.28, 0.6 * length)
     shaft = (length - head) / length if length > 0.0 else 0.0
     slim = width * min(1.0, length / 0.28)
     forward = np.array([0.0, 0.0, shaft, shaft, 1.0, shaft, shaft, 0.0, 0.0])
     side = np.array([0.0, 0.5, 0.5, 1.3, 0.0, -1.3, -0.5, -0.5, 0.0]) * slim
-    return _along(start, (start[0] + way[0], start[1] + way[1]), forward, side)
+    return _along(start, (start[0] + direction[0], start[1] + direction[1]), forward, side)
 
 
 def ground(start: Point, end: Point, step: float = 0.22) -> np.ndarray:
     """Return the symbol of a fixed body: a line with short strokes on its right side."""
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-    many = max(2, int(length / step))
+    count = max(2, int(length / step))
     forward, side = [0.0, 1.0], [0.0, 0.0]
-    for share in (np.arange(many) + 0.5) / many:
+    for share in (np.arange(count) + 0.5) / count:
         forward += [np.nan, share, share - 0.6 * step / length]
         side += [np.nan, 0.0, -0.6 * step]
     return _along(start, end, np.array(forward), np.array(side))

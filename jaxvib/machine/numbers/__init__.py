@@ -1,6 +1,6 @@
-"""Units, bounds and words of the parameters of a scene, as metadata of the fields.
+"""Units, bounds and labels of the parameters of a scene, stored as metadata of dataclass fields.
 
-Constructors use this metadata to read their arguments. The module `named` uses it to name the numbers of a whole scene.
+Constructors use this metadata to read their arguments. The module `named` uses it to name the parameters of a whole scene.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ _KEY = "number"
 
 
 class NumberSpec(NamedTuple):
-    """Meaning of a number, or of an array of numbers, in a field of a part of a scene; `unit` returns it.
+    """Specification of a parameter, or of an array of parameters, in a field of a part of a scene; `unit` stores it in the
+    metadata of the field.
 
     **Attributes**
 
     - `units`: one unit for all entries, or one for each entry
-    - `bounds`
-    - `words`: name for a designer
-    - `each`: owner of an entry of an array, such as "platform"; "" for a single number
-    - `typical`: typical size in SI of a number that may be 0; None if 0 is its bound
+    - `bounds` of each entry
+    - `words`: name of the parameter in text for users
+    - `each`: kind of part to which each entry of an array belongs, such as "platform"; "" for a single number
+    - `typical`: typical magnitude in SI of a number that may have either sign; None if its lower bound is 0
     """
 
     units: tuple[str, ...]
@@ -43,7 +44,7 @@ class NumberSpec(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit, or different units of the entries, for tables."""
+        """Unit, or the different units of the entries separated by commas, for tables."""
         return ", ".join(dict.fromkeys(self.units))
 
     @property
@@ -53,7 +54,7 @@ class NumberSpec(NamedTuple):
 
 
 PLAIN = NumberSpec(("",), Bounds())
-"""Spec of a number whose field has no metadata: any number, in SI."""
+"""Specification of a number whose field has no metadata: any number, in SI."""
 
 
 def unit(
@@ -68,8 +69,9 @@ def unit(
 ) -> Mapping[str, NumberSpec]:
     """Return the metadata of a field of a machine, a load, a drive or an effect with a number or an array of numbers.
 
-    **Arguments**: as the attributes of `NumberSpec`. The bounds `low` and `high` are allowed values unless they are open. With
-    `each="load"`, one number may hold for all loads. In `words`, "{load}" stands for the kind of load.
+    **Arguments**: as the attributes of `NumberSpec`. The bounds `low` and `high` are allowed values unless `open_low` or
+    `open_high` is True. With `each="load"`, a single number may be given for all loads. In `words`, "{load}" stands for the
+    kind of load.
 
     >>> import equinox as eqx
     >>> class Seal(eqx.Module):
@@ -82,7 +84,7 @@ def unit(
 
 @functools.lru_cache(maxsize=256)
 def number_specs(part: type) -> Mapping[str, NumberSpec]:
-    """Return the spec of each number of a part of a scene, by the name of its field."""
+    """Return the specification of each parameter of a part of a scene, by the name of its field."""
     fields = dataclasses.fields(part)
     found = {field.name: field.metadata[_KEY] for field in fields if _KEY in field.metadata}
     return {name: spec._replace(words=spec.words or name.replace("_", " ")) for name, spec in found.items()}
@@ -91,7 +93,8 @@ def number_specs(part: type) -> Mapping[str, NumberSpec]:
 def read_numbers(part: type[eqx.Module], section: str, length: int | None = None, /, **values: Numbers) -> dict[str, Array]:
     """Return the arguments of a constructor as arrays in SI units, validated by the metadata of the fields of the same names.
 
-    **Arguments**: `section`, the table of a scene file for messages, or ""; `length` of arrays, None for any length.
+    **Arguments**: `section`, name of the table in a scene file, for error messages, or ""; `length` of arrays, None for any
+    length.
 
     **Raises** `InputError` for a wrong unit, a value out of bounds, and a list of another length.
 

@@ -1,4 +1,4 @@
-"""Spectra of a run: at its end, or of successive pieces as a waterfall."""
+"""Spectra of a run: of its end, or of successive segments (waterfall diagram)."""
 
 from __future__ import annotations
 
@@ -24,28 +24,29 @@ if TYPE_CHECKING:
     from jaxvib.display import SpeedUnit
     from jaxvib.draw.style import Drawn
 
-_FINER = 4
-"""Ratio of the resolution of a piece and the spacing of frequencies; the heights of peaks are then accurate to 2 %."""
+_ZERO_PADDING_FACTOR = 4
+"""Ratio of the frequency resolution of a segment to the spacing of the computed frequencies, by zero padding; heights of peaks
+are then accurate to 2 %."""
 
 _OVER = 1.5
 """Largest frequency of spectra, in units of the largest rotor speed."""
 
 
 class Spectrum(Result):
-    """Amplitudes over frequency, of P pieces of a run.
+    """Amplitude spectra of P segments of a run.
 
     Returned by `Run.spectrum`.
 
     A piece is weighted by Hann's window; a vibration of constant amplitude has a peak of that height, zero to peak, to 2 %.
 
-    **Attributes** (P pieces, nf frequencies)
+    **Attributes** (P segments, nf frequencies)
 
-    - `time` (P,), s: the middles of the pieces
-    - `frequency` (nf,), rad/s; its resolution is about 2 pi over the length of a piece
+    - `time` (P,), s: the middles of the segments
+    - `frequency` (nf,), rad/s; its resolution is about 2 pi divided by the duration of a segment
     - `amplitude` (P, nf, nd), m (rad for tilts)
     - `force` (P, nf, nb), N, on the foundation
-    - `rotor_speed` and `load_speed` (P,), rad/s: means of the pieces
-    - `resonances` (nd,), rad/s
+    - `rotor_speed` and `load_speed` (P,), rad/s: means over the segments
+    - `resonances` (nd,), rad/s: estimated natural frequencies
     - `coordinates` and `units` (nd,): names of the coordinates, and their units
     """
 
@@ -62,7 +63,7 @@ class Spectrum(Result):
     units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
 
     def summary(self) -> str:
-        """Return the strongest frequency of each coordinate in the last piece as text."""
+        """Return as text the frequency with the largest amplitude of each coordinate in the last segment."""
         last = self.amplitude[-1]
         peaks = np.argmax(last, axis=0)
         lines = [
@@ -70,7 +71,7 @@ class Spectrum(Result):
             for j, (name, unit, k) in enumerate(zip(self.coordinates, self.units, peaks, strict=True))
         ]
         return "\n".join(
-            [f"{self.time.size} parts, strongest components of the last one, zero to peak:", *(f"  {line}" for line in lines)]
+            [f"{self.time.size} segments; largest amplitudes of the last one, zero to peak:", *(f"  {line}" for line in lines)]
         )
 
     @validated
@@ -82,29 +83,31 @@ class Spectrum(Result):
         unit: SpeedUnit | None = None,
         ax: Axes | None = None,
     ) -> Drawn:
-        """Plot amplitudes over frequency for one piece, or a waterfall over time for several, darker for larger amplitudes.
+        """Plot amplitudes against frequency for one segment, or a waterfall diagram over time for several; larger amplitudes
+        are darker.
 
         Resonances and the speeds of rotor and loads are marked.
 
         **Arguments**
 
         - `show`: displacements or the force on the foundation
-        - `coordinate` by name; default in a waterfall: the one that moves most
+        - `coordinate` by name; default in a waterfall diagram: the one with the largest amplitude
         - `unit` of frequencies, "rad/s", "rpm" or "Hz"
         - `ax`: axes to draw onto
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for other names.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for unknown names of `show`, `coordinate`
+        and `unit`.
         """
         from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow import
 
         if show not in ("displacement", "force"):
             raise InputError("show", f"is {quoted(show)}; it must be 'displacement' or 'force'")
         if coordinate is not None and (show == "force" or coordinate not in self.coordinates):
-            known = "a force has none" if show == "force" else f"there are {', '.join(self.coordinates)}"
+            known = "a force has no coordinate; leave it out" if show == "force" else f"there are {', '.join(self.coordinates)}"
             raise InputError("coordinate", f"is {quoted(coordinate)}; {known}")
         series: dict[str, np.ndarray]
         if show == "force":
-            names = ["force, N"] if self.force.shape[2] == 1 else ["force across, N", "force up, N"]
+            names = ["force, N"] if self.force.shape[2] == 1 else ["horizontal force, N", "vertical force, N"]
             series = {name: self.force[:, :, k] for k, name in enumerate(names)}
         else:
             wanted = [k for k, name in enumerate(self.coordinates) if coordinate in (None, name)]
@@ -117,19 +120,21 @@ class Spectrum(Result):
 
 
 def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None, parts: int) -> Spectrum:
-    """Return the spectrum of a run's window if `parts` is 1, otherwise of this number of pieces of its trajectory."""
+    """Return the spectrum of a run's window if `parts` is 1, otherwise those of this number of segments of its trajectory."""
     count(parts, "parts")
     if parts > 1 and trajectory is None:
         raise InputError("parts", f"is {parts}, but the run saved its end only; simulate with save='all', or give 1")
     kept = window if parts == 1 or trajectory is None else trajectory
     time = np.asarray(kept.time, float)
-    # Neighbouring pieces share a half, since Hann's window suppresses the ends of each piece.
+    # Neighbouring segments overlap by one half, since the Hann window suppresses the ends of each segment.
     size = time.size if parts == 1 else 2 * time.size // (parts + 1)
     if size < 64:
-        raise InputError("parts", f"is {parts}, which leaves {size} samples for each part; 64 are needed, give fewer parts")
+        raise InputError(
+            "parts", f"is {parts}, which leaves {size} samples for each segment; at least 64 are needed, give fewer parts"
+        )
     starts = np.linspace(0, time.size - size, parts).astype(int)
     step = float(time[1] - time[0])
-    points = _FINER * 2 ** int(np.ceil(np.log2(size)))
+    points = _ZERO_PADDING_FACTOR * 2 ** int(np.ceil(np.log2(size)))
     frequency = 2.0 * np.pi * np.fft.rfftfreq(points, step)
     speed = np.asarray(kept.rotor_speed, float)
     keep = frequency <= _OVER * max(float(np.max(np.abs(speed))), 1e-300)

@@ -23,10 +23,10 @@ T = TypeVar("T")
 
 
 class OperationCount(NamedTuple):
-    """Number of operations of the equations of motion with a part.
+    """Number of operations in the equations of motion of a scene with a given part.
 
-    **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations` with it; `added`: difference to
-    the scene `beside` without it.
+    **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations` with the part; `added`:
+    increase over the scene without it, which `beside` describes.
     """
 
     part: str
@@ -39,14 +39,15 @@ class OperationCount(NamedTuple):
 def operation_counts() -> list[OperationCount]:
     """Count the operations that each effect, drive, machine and kind of loads adds to the equations of motion.
 
-    The scene is a platform with a ball at constant speed. An effect that this scene cannot have is counted in the simplest
-    scene that can have it. The counts do not depend on the parameters of the scene. **Returns** a list of `OperationCount`.
+    The reference scene is a platform with one ball and a constant rotor speed. An effect that this scene cannot have is
+    counted in the simplest scene that can have it. The counts do not depend on the values of the parameters. **Returns** a
+    list of `OperationCount`.
 
     >>> rows = operation_counts()
     >>> [row.added for row in rows if row.kind == "constant_speed"], min(row.added for row in rows if row.part == "effect") > 0
     ([0], True)
 
-    Source: ours.
+    Source: this package.
     """
     machines: dict[str, Machine] = {
         "one_mass": one_mass(mass=1.0, stiffness=1.0, damping=1.0),
@@ -82,7 +83,8 @@ def operation_counts() -> list[OperationCount]:
 
     platform, planar = (Scene(machines[kind], loads["ball"], constant) for kind in ("one_mass", "planar_rotor"))
     found = [
-        row("drive", kind, Scene(platform.machine, platform.loads, _made(drive)), platform) for kind, drive in DRIVES.items()
+        row("drive", kind, Scene(platform.machine, platform.loads, _build_with_halves(drive)), platform)
+        for kind, drive in DRIVES.items()
     ]
     for kind, machine in machines.items():
         each = balls(**{**sized, "count": 2}) if "stations" in kind else platform.loads
@@ -92,13 +94,15 @@ def operation_counts() -> list[OperationCount]:
     for kind, effect in EFFECTS.items():
         for host in hosts:
             with contextlib.suppress(InputError):  # this machine or these loads cannot have the effect
-                found.append(row("effect", kind, Scene(host.machine, host.loads, constant, (_made(effect),)), host))
+                found.append(
+                    row("effect", kind, Scene(host.machine, host.loads, constant, (_build_with_halves(effect),)), host)
+                )
                 break
     return found
 
 
-def _made(build: Callable[..., T]) -> T:
-    """Build an effect or a drive with 0.5 for each required number."""
+def _build_with_halves(build: Callable[..., T]) -> T:
+    """Build an effect or a drive with the value 0.5 for each required argument."""
     parameters = inspect.signature(build).parameters.values()
     return build(**{each.name: 0.5 for each in parameters if each.default is each.empty})
 
