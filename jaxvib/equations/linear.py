@@ -283,7 +283,7 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     matrix G, the rotor's `speed` n, rad/s, is needed.
 
     **Returns** (nd,) complex. **Raises** `InputError` for a carrier with a gyroscopic matrix if `speed` is None, for loads at
-    different stations, for a motor instead of an ideal drive, and for effects that this theory does not include.
+    different stations, for a motor instead of an ideal drive, and for effects that this function does not include.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)

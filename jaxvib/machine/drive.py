@@ -263,7 +263,7 @@ class SpinUp(IdealDrive):
 
     The speed is twice continuously differentiable.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `speed` n, rad/s, greater than 0; typical: 60 to 320 (600 to 3000 rpm)
     - `duration`, s, greater than 0; typical: 1 to 20
@@ -308,7 +308,7 @@ class RunUp(IdealDrive):
 
     The acceleration jumps when the working speed is reached; `simulate` ends a step at that time.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `speed` n, rad/s, greater than 0; typical: 60 to 500 (600 to 4800 rpm)
     - `acceleration`, rad/s^2, greater than 0; typical: 10 to 300
@@ -441,7 +441,7 @@ class SwitchedOff(Motor):
 
     `simulate` ends a step at that time. Steady motions are those after it: `torque` is the friction.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `motor` until then, such as an `InductionMotor`
     - `at`: time at which it is switched off, s, at least 0 (the default: it is off throughout); typical: 0 to 60

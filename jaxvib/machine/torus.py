@@ -149,7 +149,7 @@ def torus_balls(
     Their first coordinate is the angle about the axis. The second is the angle in the cross-section of the tube. `TorusBalls`
     has the equations. Dry friction is the effect `RollingFriction`, gravity along a vertical axis is `Gravity(along="axis")`.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `count` N: number of balls, at least 1; typical: 2
     - `mass` m of a ball, kg, one number or N; typical: 0.03 to 0.1, steel balls of 10 to 15 mm radius

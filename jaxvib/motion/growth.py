@@ -53,7 +53,7 @@ _TURNS, _SAMPLES = 3.0, 4096
 
 
 class GrowthStatus(eqx.Enumeration):
-    """Growth of small disturbances. Each member is the sentence shown to the user."""
+    """Growth of small disturbances. The value of each member is the message shown to the user."""
 
     regular = "small disturbances do not grow exponentially: derivatives of the motion are meaningful"
     unstable = "the motion is periodic and unstable: small disturbances grow exponentially and the machine leaves it"

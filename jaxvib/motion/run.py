@@ -50,7 +50,7 @@ def _detached(scene: Scene, kept: Trajectory) -> Array:
 
 
 class RunStatus(eqx.Enumeration):
-    """Outcomes of a run. Each member is the sentence shown to the user."""
+    """Outcomes of a run. The value of each member is the message shown to the user."""
 
     done = "the run reached its end"
     max_steps_reached = "the run needs more steps than max_steps to reach its end"

@@ -39,7 +39,7 @@ in units of the rounding."""
 
 
 class WhirlStatus(eqx.Enumeration):
-    """Outcomes of a computation of whirls. Each member is the sentence shown to the user."""
+    """Outcomes of a computation of whirls. The value of each member is the message shown to the user."""
 
     done = "the result was computed"
     refused = REFUSED

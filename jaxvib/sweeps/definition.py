@@ -29,7 +29,8 @@ PYTHON = "calls Python"
 
 
 class CaseStatus(eqx.Enumeration):
-    """Outcomes of a case. Each member is the sentence shown to the user. Their order is part of the store's format."""
+    """Outcomes of a case. The value of each member is the message shown to the user. Their order is part of the store's
+    format."""
 
     missing = "the case has not been computed yet"
     done = "the case was computed"
@@ -44,7 +45,7 @@ CASE_STATUSES = enumeration_names(CaseStatus)
 
 
 class SweepStatus(eqx.Enumeration):
-    """Progress of a study. Each member is the sentence shown to the user."""
+    """Progress of a study. The value of each member is the message shown to the user."""
 
     done = "every case was computed"
     partly = "some cases have not been computed yet; run the study again to continue"

@@ -22,7 +22,7 @@ from optimize.search.model import (
 from optimize.search.problem import Point, Problem, evaluate
 
 FEASIBLE = 1e-8
-"""Largest violation of held quantities and demands in the end, relative to their values."""
+"""Largest violation of held quantities and demands of a final design, relative to their values."""
 
 _UNREACHABLE_DECREASE = 1e-10
 """Predicted relative decrease that counts as zero if no step achieves it. It is the rounding error of derivatives of exact
@@ -32,7 +32,7 @@ _HIDDEN_DECREASE, _ROUNDING = 1e-13, 1e-15
 """Relative decrease of the objective that rounding can hide, and relative rounding error of the objective."""
 
 _KINK_STEPS = 4
-"""Number of first-order steps back onto a kink."""
+"""Number of first-order steps that move a design back onto a kink."""
 
 _ACTIVE_DISTANCE = 1e-6
 """Largest distance of a demand or a free parameter from its limit, relative to the limit, at which it counts as active."""
@@ -45,8 +45,11 @@ contradicts the others."""
 class Optimality(NamedTuple):
     """Optimality of designs.
 
-    **Attributes**: multipliers of `held` quantities (s, me) and of `demands` (s, mi), in units of the objective per unit of
-    relative excess; of `bounds` (s, d), positive at the upper one; the relative `kkt` residual (s,).
+    **Attributes** (s designs, me held quantities, mi demands, d free parameters)
+
+    - `held` (s, me) and `demands` (s, mi): Lagrange multipliers, in units of the objective per unit of relative violation
+    - `bounds` (s, d): multipliers of the bounds, positive at the upper bound
+    - `kkt` (s,): relative residual of the Karush-Kuhn-Tucker conditions
     """
 
     held: np.ndarray
@@ -70,7 +73,8 @@ class Polished(NamedTuple):
 
 
 def violation(problem: Problem, point: Point) -> np.ndarray:
-    """Return the largest relative violation (s,) of held quantities and demands; infinite for designs without values."""
+    """Return the largest relative violation (s,) of held quantities and demands; infinite for designs whose quantities do not
+    exist."""
     m = problem.equalities
     parts = np.concatenate([np.abs(point.values[:, 1 : 1 + m]), np.maximum(point.values[:, 1 + m :], 0.0)], axis=1)
     return np.where(point.exists(), np.max(parts, axis=1, initial=0.0), np.inf)
@@ -79,10 +83,10 @@ def violation(problem: Problem, point: Point) -> np.ndarray:
 def restore(
     problem: Problem, point: Point, steps: int, demanded: np.ndarray | None = None, shares: np.ndarray | None = None
 ) -> Point:
-    """Move designs the shortest way, to first order, onto their constraints inside the bounds.
+    """Move designs by the smallest change, to first order, onto their constraints inside the bounds.
 
     The constraints are the held quantities, the demands that are exceeded or marked in `demanded` (s, mi), and equal values of
-    the pieces of the objective that have `shares` (s, parts).
+    those pieces of the objective whose weight in `shares` (s, pieces) is not 0.
     """
     m, mi = problem.equalities, len(problem.demands)
     if m + mi == 0 and shares is None:
@@ -105,8 +109,8 @@ def restore(
 
 
 def _least_change(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, most: float = np.inf) -> np.ndarray:
-    """Move designs z (s, d) the shortest way to the linearized zeros of `values` (s, m) with `slopes` (s, m, d), inside the
-    bounds and each number by at most `most`."""
+    """Move designs z (s, d) by the smallest change to the linearized zeros of `values` (s, m) with `slopes` (s, m, d), inside
+    the bounds and each number by at most `most`."""
     wanted = -least_norm(slopes, values)
     stopped = ((z <= 0.0) & (wanted < 0.0)) | ((z >= 1.0) & (wanted > 0.0))
     step = -least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values)
@@ -116,8 +120,11 @@ def _least_change(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, most: f
 class Starts(NamedTuple):
     """Initial designs.
 
-    **Attributes**: the `point` with all of them, or None; the number of designs `drawn`, and of `existing` ones among these,
-    which have the objective; `nearest`: designs that miss the held quantities, at most the requested number, or None.
+    **Attributes**
+
+    - `point`: all initial designs, or None
+    - `drawn`: number of random designs; `existing`: number of those for which the objective exists
+    - `nearest`: designs that could not be moved onto the held quantities, at most the requested number, or None
     """
 
     point: Point | None
@@ -129,7 +136,8 @@ class Starts(NamedTuple):
 def draw_starts(
     problem: Problem, starts: int, seed: int, look: Callable[[Problem, np.ndarray], tuple[np.ndarray, ...]], rounds: int = 20
 ) -> Starts:
-    """Draw random designs in the bounds and move them onto the held quantities; repeat for designs without the objective."""
+    """Draw random designs in the bounds and move them onto the held quantities; repeat for designs for which the objective
+    does not exist."""
     random = np.random.default_rng(seed)
     kept: list[Point] = []
     others: list[Point] = []
@@ -183,7 +191,7 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
     Second derivatives of the Lagrangian are central differences of exact first ones. Violated constraints are penalized; if a
     violation does not vanish at the largest penalty, the constraints contradict each other.
     """
-    if problem.parts > 1:  # the descent does not compute the pieces
+    if problem.parts > 1:  # the descent does not compute the pieces of the objective
         point = evaluate(problem, point.z, point.known)
     size = np.maximum(np.abs(point.values[:, 0]), 1e-9 * np.max(np.abs(point.slopes[:, 0]), axis=1))
     size = np.where(size > 0.0, size, 1.0)
@@ -242,7 +250,7 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
 def _is_better(
     problem: Problem, here: Point, new: Point, merit: np.ndarray, new_merit: np.ndarray, left: np.ndarray
 ) -> np.ndarray:
-    """Return True for designs whose step is taken; `left` is the decrease of the objective that their models predict."""
+    """Return True for designs whose step is accepted; `left` is the decrease of the objective that their models predict."""
     kept = violation(problem, new) < np.maximum(FEASIBLE, violation(problem, here))
     better = new_merit < merit
     # The last step converges quadratically: rounding hides the decrease of the objective, but slopes are still exact.
@@ -261,12 +269,12 @@ def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, 
     z = np.clip(point.z + model.p, 0.0, 1.0)
     new = evaluate(problem, z, point.ahead(z))
     active = model.demands > 1e-6
-    mended = restore(problem, new, 2, active)
-    whole = mended.exists() & (violation(problem, mended) <= violation(problem, new))
-    best = mended.where(whole, new)
+    restored = restore(problem, new, 2, active)
+    as_feasible = restored.exists() & (violation(problem, restored) <= violation(problem, new))
+    best = restored.where(as_feasible, new)
     if problem.parts > 1:
-        even = restore(problem, best, _KINK_STEPS, active, model.shares)
-        best = even.where(_merit(problem, even, size, penalty) < _merit(problem, best, size, penalty), best)
+        on_kink = restore(problem, best, _KINK_STEPS, active, model.shares)
+        best = on_kink.where(_merit(problem, on_kink, size, penalty) < _merit(problem, best, size, penalty), best)
     return best
 
 
@@ -300,12 +308,12 @@ def optimality(problem: Problem, point: Point) -> Optimality:
         right = -np.einsum("smd,sd->sm", part, slope * free)
         dual = np.linalg.solve(gram + ridge[:, None, None] * np.eye(counts.shape[1]), right[..., None])[..., 0] * counts
         rest = slope + np.einsum("sm,smd->sd", dual, rows)
-        pushed = counts.copy()
-        pushed[:, m:] &= dual[:, m:] >= 0.0
+        kept_active = counts.copy()
+        kept_active[:, m:] &= dual[:, m:] >= 0.0
         inward = (at_low & (rest < 0.0)) | (at_high & (rest > 0.0))
-        if np.array_equal(pushed, counts) and not np.any(inward & ~free & ~fixed):
+        if np.array_equal(kept_active, counts) and not np.any(inward & ~free & ~fixed):
             break
-        counts, free = pushed, free | (inward & ~fixed)
+        counts, free = kept_active, free | (inward & ~fixed)
     bounds = np.where(free | fixed, 0.0, -rest)
     size = np.maximum(np.abs(slope).max(axis=1), np.abs(point.values[:, 0]))
     residual = np.max(np.abs(np.where(fixed, 0.0, rest + bounds)), axis=1) / np.maximum(size, 1e-300)

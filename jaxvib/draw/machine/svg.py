@@ -1,4 +1,4 @@
-"""Animated SVG drawings of a machine, which move in every browser without a script."""
+"""Animated SVG drawings of a machine, without JavaScript."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from matplotlib.colors import to_hex
 
 from jaxvib.draw.machine.parts import Part, Text
 
-_DOTS = 62.0
-"""SVG units per unit of the drawing."""
+_UNITS_PER_LENGTH = 62.0
+"""SVG units per unit of length of the drawing."""
 
-_POINT = 100.0 / 72.0
+_UNITS_PER_POINT = 100.0 / 72.0
 """SVG units per typographic point."""
 
 _SIZES = {"small": 8.3, "x-small": 7.0}
@@ -49,12 +49,15 @@ def svg(
     """
     left, right, bottom, top = limits
     lines = head.split("\n") if head else []
-    above = 1.35 * _SIZES["small"] * _POINT * len(lines)
+    above = 1.35 * _SIZES["small"] * _UNITS_PER_POINT * len(lines)
 
     def place(points: np.ndarray) -> np.ndarray:
-        return np.asarray(points, float) * (_DOTS, -_DOTS) + (-left * _DOTS, top * _DOTS + above)
+        return np.asarray(points, float) * (_UNITS_PER_LENGTH, -_UNITS_PER_LENGTH) + (
+            -left * _UNITS_PER_LENGTH,
+            top * _UNITS_PER_LENGTH + above,
+        )
 
-    wide, tall = (right - left) * _DOTS, (top - bottom) * _DOTS + above
+    wide, tall = (right - left) * _UNITS_PER_LENGTH, (top - bottom) * _UNITS_PER_LENGTH + above
     found = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:.0f} {tall:.0f}" width="{wide:.0f}" height="{tall:.0f}">'
     ]
@@ -64,7 +67,7 @@ def svg(
         places = place(np.array([(frame[k].x, frame[k].y) for frame in texts]))
         x, y = places[0].tolist()
         found.append(_shifted(_text(x, y, text.text, text.look), places - places[0], seconds))
-    found += [_text(0.0, 1.35 * _SIZES["small"] * _POINT * (k + 0.5), line, {}) for k, line in enumerate(lines)]
+    found += [_text(0.0, 1.35 * _SIZES["small"] * _UNITS_PER_POINT * (k + 0.5), line, {}) for k, line in enumerate(lines)]
     return "".join([*found, "</svg>"])
 
 
@@ -82,27 +85,27 @@ def _part(frames: Sequence[Part], place: Callable[[np.ndarray], np.ndarray], sec
     if first.axis is not None:
         x, y = place(np.asarray(first.axis))
         angles = f'from="0 {x:.1f} {y:.1f}" to="-360 {x:.1f} {y:.1f}"'
-        turning = f'<animateTransform attributeName="transform" type="rotate" {angles} {_for_ever(seconds / turns)}'
+        turning = f'<animateTransform attributeName="transform" type="rotate" {angles} {_repeat_attributes(seconds / turns)}'
         draw = f"{draw}>{turning}</path>"
         moved = place(np.array([frame.axis for frame in frames])) - (x, y)
     elif np.nanmax(np.abs(outlines - outlines[0] - shift[:, None])) < 0.05:
         draw, moved = f"{draw}/>", shift
     else:
         shapes = ";".join(_path(outline, first.filled) for outline in [*outlines, outlines[0]])
-        return f'{draw}><animate attributeName="d" values="{shapes}" {_for_ever(seconds)}</path>'
+        return f'{draw}><animate attributeName="d" values="{shapes}" {_repeat_attributes(seconds)}</path>'
     return _shifted(draw, moved, seconds)
 
 
 def _shifted(drawn: str, moved: np.ndarray, seconds: float) -> str:
-    """Return an SVG element that is translated by `moved` (n, 2), one position after the other and back to the first."""
+    """Return an SVG element that moves through the offsets `moved` (n, 2) and back to the first."""
     if np.max(np.abs(moved)) < 0.05:
         return drawn
     values = ";".join(f"{x:.1f} {y:.1f}" for x, y in [*moved.tolist(), moved[0].tolist()])
-    motion = f'<animateTransform attributeName="transform" type="translate" values="{values}" {_for_ever(seconds)}'
+    motion = f'<animateTransform attributeName="transform" type="translate" values="{values}" {_repeat_attributes(seconds)}'
     return f"<g>{drawn}{motion}</g>"
 
 
-def _for_ever(seconds: float) -> str:
+def _repeat_attributes(seconds: float) -> str:
     return f'dur="{seconds:.4g}s" repeatCount="indefinite"/>'
 
 
@@ -124,14 +127,14 @@ def _style(part: Part) -> str:
     dash = look.get("ls", "-")
     dashed = f' stroke-dasharray="{_DASHES[dash]}"' if dash in _DASHES else ""
     alpha = f' opacity="{look["alpha"]:g}"' if "alpha" in look else ""
-    return f' fill="{fill}" stroke="{stroke}" stroke-width="{look.get("lw", 1.0) * _POINT:.2f}"{dashed}{alpha}'
+    return f' fill="{fill}" stroke="{stroke}" stroke-width="{look.get("lw", 1.0) * _UNITS_PER_POINT:.2f}"{dashed}{alpha}'
 
 
 def _text(x: float, y: float, text: str, look: dict[str, object]) -> str:
-    size = _SIZES[str(look.get("fontsize", "small"))] * _POINT
+    size = _SIZES[str(look.get("fontsize", "small"))] * _UNITS_PER_POINT
     lines = text.split("\n")
     step = 1.25 * size
-    # Offset of the baseline of the first line, by the vertical alignment of the whole text.
+    # Offset of the baseline of the first line for each vertical alignment of the whole text.
     first = {"center": 0.35 * size - 0.5 * step * (len(lines) - 1), "bottom": -step * (len(lines) - 1), "top": 0.8 * size}
     base = y + first[str(look.get("va", "center"))]
     anchor = _ANCHORS[str(look.get("ha", "left"))]

@@ -1,4 +1,4 @@
-"""Effects, gravity and imbalances. The traced program contains only the effects of the scene."""
+"""Base class of effects; gravity and imbalances. The traced program contains only the effects of the scene."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ BALANCE_GRADE = 6.3e-3
 
 
 _AXES = {"up": 1, "axis": 2}
-"""Directions of gravity by the coordinate of a load's position."""
+"""Index of the coordinate of a load's position along which gravity acts, by direction."""
 
 
 class Typical(NamedTuple):
-    """Effect with typical values, for a scene that does not have it; `says` describes these numbers."""
+    """Effect with typical values, for a scene that does not have it; `says` describes these values."""
 
     effect: Effect
     says: str
@@ -51,7 +51,8 @@ def has_term(effects: Iterable[Effect], *kinds: type[Term]) -> bool:
 
 
 def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
-    """Return the acceleration of gravity of a scene with these `effects`, m/s^2, by axis. Gravity acts against the axis."""
+    """Return the acceleration of gravity of a scene with these `effects`, m/s^2, by axis. Gravity points in the negative
+    direction of the axis."""
     total: dict[int, Array] = {}
     for field in terms_of(effects, GravityField):
         total[field.axis] = total[field.axis] + field.g if field.axis in total else field.g
@@ -59,17 +60,16 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
 
 
 def has_half_turn(effects: Iterable[Effect]) -> bool:
-    """True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged; jams then have even harmonics only.
-
-    Friction may keep this symmetry. Gravity on the loads, an imbalance and forces between loads break it.
+    """True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged; the deviation of the load angle in
+    a jam then has even harmonics only. Some friction laws keep this symmetry. Gravity on the loads, an imbalance and forces
+    between loads break it.
     """
     terms = [term for effect in effects for term in effect.terms()]
     return all(isinstance(term, ContactFriction) and term.is_half_turn_symmetric for term in terms)
 
 
 class Effect(Part):
-    """Physical effect that a scene includes. A new effect is a subclass with its numbers and its `terms`.
-
+    """Physical effect that a scene includes. A new effect is a subclass with its parameters as fields and the method `terms`.
     `kind` is its name in scene files.
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
@@ -95,18 +95,18 @@ class Effect(Part):
     kind: eqx.AbstractVar[str]
 
     repeatable: ClassVar[bool] = False
-    """True if a scene may contain several such effects, for example supports at several places."""
+    """True if a scene may contain several effects of this class, for example supports at several places."""
 
     @abc.abstractmethod
     def terms(self) -> tuple[Term, ...]:
         """Return the terms that the effect adds to the equations.
 
-        Terms contain methods and numbers; nothing is computed here.
+        Terms contain functions and parameters; this method computes nothing.
         """
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return the effect with typical values, which audits add; None for an effect without such numbers.
+        """Return the effect with typical values, as an audit adds it; None for an effect without typical values.
 
         **Arguments**
 
@@ -120,13 +120,12 @@ class Effect(Part):
         """**Raises** `InputError` if the effect cannot act on this `machine` or these `loads`."""
 
     def prepare(self, loads: Loads) -> Effect:
-        """Return the effect after computing everything that depends on the numbers of the `loads` but not on time."""
+        """Return the effect with everything precomputed that depends on the parameters of the `loads` but not on time."""
         return self
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array | None:
-        """Return the fastest rate that the effect adds to the motion of the `loads`, rad/s or 1/s, which steps must resolve.
-
-        None if no motion that the effect adds is faster than that of the loads without it. `speed` is the rotor speed, rad/s.
+        """Return the fastest rate of the motion that the effect adds, rad/s or 1/s, which steps must resolve; None if it is
+        not faster than the motion of the `loads` without the effect. `speed` is the rotor speed, rad/s.
         """
         return None
 
@@ -134,7 +133,7 @@ class Effect(Part):
 class Gravity(Effect):
     """Gravity on the loads: V = m g p_up(u), the torque - m g R cos phi on a load on a circle.
 
-    Coordinates of platforms start at static equilibrium with the weight of the loads, so gravity adds nothing there.
+    Coordinates of platforms start at static equilibrium with the weight of the loads, so that gravity adds no force on them.
 
     **Arguments**
 
@@ -142,8 +141,8 @@ class Gravity(Effect):
     - `along`: "up", in the plane of rotation (horizontal axis, the default), or "axis", along the axis of a vertical rotor, for
       loads that move in that direction: V = m g p_axis(u)
 
-    **Raises** `InputError` for a wrong unit, a negative value or another direction. A scene raises it for gravity along an axis
-    in whose direction the loads do not move.
+    **Raises** `InputError` for a wrong unit, a negative value or an unknown direction. A scene raises it for gravity along an
+    axis in whose direction the loads do not move.
 
     >>> import jaxvib as jv
     >>> float(jv.Gravity().g)
@@ -164,8 +163,8 @@ class Gravity(Effect):
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
         """Return gravity in the rotor's plane, or along the axis if loads move in that direction."""
         if len(jax.eval_shape(loads.position, *loads.rest())) > _AXES["axis"]:
-            return Typical(cls(along="axis"), "g = 9.81 m/s^2 along the axis, if it is vertical")
-        return Typical(cls(), "g = 9.81 m/s^2 in the rotor's plane, if the axis is horizontal")
+            return Typical(cls(along="axis"), "g = 9.81 m/s^2 along a vertical axis")
+        return Typical(cls(), "g = 9.81 m/s^2 in the rotor's plane, for a horizontal axis")
 
     def terms(self) -> tuple[Term, ...]:
         """Return the gravity field, and the potential energy of the loads in it."""
@@ -183,11 +182,12 @@ class Gravity(Effect):
 
 
 class StaticImbalance(Effect):
-    """Static imbalance: the rotor's mass centre lies at e (cos(theta + angle), sin(theta + angle)) off its axis.
+    """Static imbalance: the offset of the rotor's mass centre from its axis is e (cos(theta + angle), sin(theta + angle)).
 
-    theta is the rotor's angle. The force on the machine at the rotor is - M e d^2/dt^2 of that direction.
+    theta is the rotor's angle. The force on the machine at the rotor is - M e d^2/dt^2 (cos(theta + angle), sin(theta +
+    angle)).
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `moment` M e, kg m, not negative; typical: 1e-4 to 0.05. Grade G6.3 of ISO 21940-11 allows M times 6.3 mm/s over the
       speed: 5e-4 for 37 kg at 460 rad/s
@@ -218,7 +218,7 @@ class StaticImbalance(Effect):
         return Typical(cls(moment), f"{1e3 * float(moment):.3g} g m, grade G6.3 of all the mass that moves with the rotor")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return M e (cos, sin) of the heavy side."""
+        """Return the term of the imbalance M e (cos, sin) toward the heavy side."""
         return (RotorImbalance(self.moment, self.angle),)
 
 
@@ -227,7 +227,7 @@ class MomentImbalance(Effect):
 
     The moment about the tilts of the machine is - (A - C) delta d^2/dt^2 (cos(theta + angle), sin(theta + angle)).
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `moment` (A - C) delta, kg m^2, of either sign; typical: 1e-5 to 1e-3
     - `angle` (- gamma in the paper), rad; typical: 0 (the default)
@@ -252,7 +252,8 @@ class MomentImbalance(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return the imbalance at `BALANCE_GRADE` at the radius of gyration on either side; None if the machine cannot tilt."""
+        """Return the moment imbalance of `BALANCE_GRADE` with its masses at the radius of gyration on both sides; None if the
+        machine cannot tilt."""
         mass, inertia = _moved_inertia(machine)
         if inertia is None:
             return None
@@ -260,7 +261,7 @@ class MomentImbalance(Effect):
         return Typical(cls(moment), f"{1e3 * float(moment):.3g} g m^2, grade G6.3 at the radius of gyration")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return (A - C) delta (cos, sin) of the moment."""
+        """Return the term of the moment (A - C) delta (cos, sin)."""
         return (RotorImbalance(self.moment, self.angle, about_tilts=True),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:

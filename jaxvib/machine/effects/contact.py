@@ -40,7 +40,7 @@ class LoadContact(Effect):
     their relative motion, rolling included; friction between loads is neglected. A contact lasts about pi sqrt(mu/k), which
     steps must resolve: equal steps need ten per contact, the default of `ensemble` and `capture`.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `stiffness` k, N/m, positive; typical: 4e4 to 1e6, softer than steel so that a contact lasts 1 to 10 ms. Ten times the
       stiffness needs about three times the steps

@@ -56,7 +56,7 @@ class DryFriction(Effect):
     motion without this friction. If the sign with friction differs, N is smaller than mu2 times the other forces, and so is the
     error.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `coefficient` mu2, at least 0; typical: about 0.0015 for ball bearings, 0.001 to 0.005 for rolling bearings
     - `diameter` d of the bearing, m; typical: 0.005 to 0.05

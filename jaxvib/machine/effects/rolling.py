@@ -34,7 +34,7 @@ class RollingFriction(Effect):
       speed width artanh(s), which tends to 0 with the width
     - The sign of N is that of the motion without this friction
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `coefficient` k, m, at least 0; typical: about 2e-5 to 4e-5 for steel balls on steel, 0 for none
     - `direction`: "along" the rolling (the default), or "each": for each coordinate separately, d_i = tanh(v_i/width), as

@@ -83,7 +83,7 @@ class Sliding(Effect):
     kappa/(kappa-1) mu R w^2/width steps per second. `RollingFriction` still acts against the motion of the centre of a sliding
     load.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `coefficient` mu, above 0; typical: about 0.1 for oiled steel on steel, 0.15 to 0.3 dry
     - `width`, m/s, positive; typical: 0.2 (the default). Half the width needs twice the steps

@@ -52,7 +52,7 @@ def _read_place(
 class CubicSupport(_Support):
     """Hardening (or softening) support: force k3 r^2 x on the foundation, r the distance from the rest position.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `stiffness` k3, N/m^3, negative for a softening support; typical: 1e7 to 1e10. It stiffens a support k by 1 % at the
       amplitude a if (3/4) k3 a^2 = 0.01 k: 3e7 for 5e4 N/m and 5 mm
@@ -108,7 +108,7 @@ class Stop(_Support):
 
     Under a platform it acts on the chosen sides; around a rotor's axis it is a ring of radius `gap`.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `stiffness` k, N/m, positive; typical: 1e5 to 1e7, that is 10 to 100 times the support. A stiffer stop needs shorter steps
     - `gap`, m; typical: 0.001 to 0.02

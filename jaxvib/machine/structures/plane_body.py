@@ -41,7 +41,7 @@ def support(
 
     u is the displacement (x, y) of the point `at`, a the `angle`.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `at` (2,): the point of the body, (x, y) m from its centre of mass without unbalances; typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
@@ -131,7 +131,7 @@ def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport
     Displacements are measured from static equilibrium, x to the right, y up, psi anticlockwise. The rotation is assumed to be
     small: kinematics are linear in q.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `mass` m, kg, exciters included, loads not; typical: 100 to 10000
     - `inertia` J about the centre of mass, kg m^2, exciters included, loads not; typical: 20 to 20000

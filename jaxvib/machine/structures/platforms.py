@@ -158,7 +158,7 @@ def two_mass(
         M_1 y_1'' + b_1 y_1' + k_1 y_1 + b_12 (y_1' - y_2') + k_12 (y_1 - y_2) = 0
         M_2 y_2'' + b_2 y_2' + k_2 y_2 - b_12 (y_1' - y_2') - k_12 (y_1 - y_2) = force of the loads, if they are on platform 2
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `mass` (2,), kg, loads not included; typical: 50 to 5000
     - `stiffness` (2,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support
@@ -194,7 +194,7 @@ def three_mass(
 
         M_i y_i'' + b_i y_i' + k_i y_i + sum_j [ b_ij (y_i' - y_j') + k_ij (y_i - y_j) ] = force of the loads on platform i
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `mass` (3,), kg, loads not included; typical: 50 to 5000
     - `stiffness` (3,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support

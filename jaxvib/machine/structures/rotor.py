@@ -139,7 +139,7 @@ def rotor(
     The same holds for z and psi, see `Rotor`, and for b1, b2, b3. w is the rotor speed; L1 and L2 are the positions of the
     supports with their signs.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `mass` M, kg, loads not included; typical: 5 to 50
     - `transverse_inertia` A about an axis across, kg m^2, loads not included; typical: 0.05 to 1
@@ -261,7 +261,7 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
 
         M y'' + b y' + k y = f_y,    M z'' + b z' + k z = f_z
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `mass` M, kg, loads not included; typical: 5 to 50
     - `stiffness` k, N/m; typical: 1e3 for a soft suspension, 1e5 to 1e6 for bearings

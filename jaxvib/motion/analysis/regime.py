@@ -47,7 +47,7 @@ _BALANCED = 0.02
 
 
 class RegimeName(eqx.Enumeration):
-    """Kinds of motion. Each member is the sentence shown to the user."""
+    """Kinds of motion. The value of each member is the message shown to the user."""
 
     swinging = "the loads swing and do not rotate"
     jammed = "the loads are jammed: they turn together, slower than the rotor"

@@ -1,4 +1,4 @@
-"""Time integration of the averaged equations: steps of many turns."""
+"""Time integration of the averaged equations, with steps that span many turns."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ _MAX_WINDOW_TURNS = 256
 
 
 class _Tolerance(WrappedController):
-    """Controller with errors relative to the length of a complex vector, since one of its parts is often 0."""
+    """Controller of the step size with errors relative to the norm of a complex vector, since its real or imaginary part is
+    often 0."""
 
     controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
@@ -94,7 +95,7 @@ class _Tolerance(WrappedController):
     ) -> Decision:
         def sizes(y: Array) -> Array:
             parts = jnp.split(jnp.abs(y), np.cumsum(self.blocks)[:-1])
-            # An angle grows without bound; its error is never relative.
+            # An angle grows without bound; only the absolute tolerance applies to it.
             return jnp.concatenate([*(jnp.broadcast_to(jnp.max(x), x.shape) for x in parts[:-1]), jnp.zeros_like(parts[-1])])
 
         # A NaN error would make the length of the next step NaN.
@@ -107,7 +108,7 @@ class _Tolerance(WrappedController):
 
 
 class _Units(eqx.Module):
-    """Units: the unbalance radius S/M of the loads, that times the rotor's speed, the rotor's speed, and 1 rad."""
+    """Units of the variables: the unbalance radius S/M of the loads, S/M times the rotor speed, the rotor speed, and 1 rad."""
 
     length: Array
     speed: Array
@@ -143,32 +144,32 @@ def envelope(
 ) -> Envelope:
     """Integrate the averaged equations of a scene from 0 to `until`: amplitudes and load speeds in place of vibrations.
 
-    A run-up through resonances, a capture or a passage takes steps of many turns. The result is the limit of light loads:
+    In a run-up through resonances, with capture or passage, each step spans many turns. The result is the limit of light loads:
 
     - its relative error is of first order in the loads' share of the mass times the dynamic magnification, and about as large
       as the result's `ripple`; typical: 1e-3 to 0.1
     - its equilibria are those of `jam_modes`
-    - near the line between capture and passage the smallest difference decides: use `simulate` there
+    - near the boundary between capture and passage small differences decide the outcome: use `simulate` there
 
-    `averaged_field` has the equations.
+    The equations are given in `averaged_field`.
 
     **Arguments**
 
     - `scene`, without effects other than gravity
     - `until`, s; typical: 5 to 600
-    - `start`, `mode`, `separation`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase: loads
-      that start apart separate if the averaged motion at one angle is unstable
+    - `start`, `mode`, `separation`, `spin_up`, `turns`, `adjoint`, `throw`: as in `simulate`. Each load has its own phase:
+      loads with slightly different initial angles separate if the averaged motion at one angle is unstable
     - `save`: "all" keeps `samples` (default 256) evenly spaced times; "window" keeps only the measuring window
-    - `stepsize_controller`: `Tolerance`, the error that a step may make, relative to the largest amplitude, and absolute in
-      natural units, for rates the rotor's speed, for phases 1 rad; typical: 1e-3 to 1e-6, default 1e-4. Or a step size
-      controller of diffrax
+    - `stepsize_controller`: `Tolerance`, the allowed error of a step: both relative to the largest amplitude and absolute in
+      natural units (rotor speed for rates, 1 rad for phases); typical: 1e-3 to 1e-6, default 1e-4. Or a step size controller
+      of diffrax
     - `solver` of diffrax for stiff systems; default: `Rodas4`
     - `max_steps`: the run fails after this number of steps; typical: 2^16 (the default)
 
-    Gravity has no mean torque on a load that turns. If a load turns too slowly against it, or its drag does not lift it from
-    the bottom of its track, the status is `not_turning`. Effects other than gravity are refused.
+    Gravity has no mean torque on a load that makes full turns. If a load is too slow to pass the top of its track, or its drag
+    cannot lift it from the bottom, the status is `not_turning`. Effects other than gravity raise `InputError`.
 
-    **Returns** `Envelope`. Gradients, forward and reverse, go through all of it; `jit` and `vmap` too.
+    **Returns** `Envelope`. Forward and reverse derivatives, `jit` and `vmap` are supported.
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish or is
     `not_turning`.
@@ -202,7 +203,7 @@ def envelope(
     if isinstance(start, State):
         state = validate_state(scene, start, mode, separation)
     else:
-        # The state of rest exists for every scene; therefore the compiled run makes it, which takes less time than here.
+        # The state of rest exists for every scene; therefore it is computed in the compiled run, which takes less time.
         known = start in ("rest", "spin_up") and mode is None and separation is None
         state = None if known else initial_state(scene, start, mode=mode, separation=separation, throw=throw)
     run = _run(scene, end, state, *choices)
@@ -212,7 +213,8 @@ def envelope(
 
 
 def _judged_by_separation(run: Envelope) -> Envelope:
-    """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
+    """Return the run with the status `would_separate` if its loads stay at nearly one angle although this motion is
+    unstable."""
     if not (float(run.drift) < SETTLED_DRIFT and status_name(run.status) == "done"):
         return run
     phase, time = np.asarray(run.window.phase), np.asarray(run.window.time)
@@ -250,7 +252,7 @@ def _run(
     max_steps: int,
 ) -> Envelope:
     begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
-    # A start that does not exist (a jam mode that is absent in one run of a batch) must not delay the other runs.
+    # A start that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(begin)
     begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
     model, nd = linear_model(scene), begin.displacement.shape[0]
@@ -300,7 +302,7 @@ def _run(
 
 
 def _saves(speed: Array, frequencies: Array, end: Array, samples: int, turns: int) -> list[diffrax.SubSaveAt]:
-    """Return the times of the measuring window at the end, and of the whole run if it has `samples`."""
+    """Return the saved times: those of the measuring window at the end, and those of the whole run if `samples` is not 0."""
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
     window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _MAX_WINDOW_TURNS / speed)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]
@@ -325,7 +327,8 @@ def _at_rest(scene: Scene) -> Amplitudes:
 
 
 def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[..., Array], Args]:
-    """Return the averaged equations on the integrator's vector, and their arguments; on scalars if there are few."""
+    """Return the averaged equations as a function of the integrator's vector, and their arguments; on scalars for small
+    systems."""
 
     def on_arrays(t: Array, y: Array, args: tuple[Averaged, _Units]) -> Array:
         field, units = args
@@ -377,10 +380,10 @@ def _measure(model: Model, window: Envelopes) -> Measured:
 
 
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
-    """Return True if every load can turn against its potential.
+    """Return True if every load can make full turns in its potential.
 
-    At the end it must have the energy to pass the top, I w^2/2 > (max V - min V)/2. If it did not have it at the start, drag
-    must have been able to lift it, D n > max |dV/dphi|.
+    At the end it must have the energy to pass the top, I w^2/2 > (max V - min V)/2. If it did not have this energy at the
+    start, drag must have been able to lift it, D n > max |dV/dphi|.
     """
     loads, potentials = scene.loads, terms_of(scene.all_effects, LoadPotential)
     if not potentials:

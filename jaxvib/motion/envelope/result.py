@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class EnvelopeStatus(eqx.Enumeration):
-    """Outcomes of an averaged run. Each member is the sentence shown to the user."""
+    """Outcomes of an averaged run. The value of each member is the message shown to the user."""
 
     done = "the averaged run reached its end"
     max_steps_reached = "the averaged run needs more steps than max_steps to reach its end"

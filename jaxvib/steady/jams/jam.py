@@ -1,4 +1,4 @@
-"""Leading-order jam modes: the speeds at which light loads jam, computed by algebra alone."""
+"""Leading-order jam modes: the speeds at which light loads jam, from algebraic equations, without time integration."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
 STABILITY_CRITERION = "by slope, for light loads that stay together"
-"""Criterion of the stability of a jam mode, and its condition."""
+"""Name of the stability criterion of jam modes, with its assumption."""
 
 
 class JamStatus(eqx.Enumeration):
-    """Outcomes of a jam mode. Each member is the sentence shown to the user."""
+    """Outcomes of a jam mode. The value of each member is the message shown to the user."""
 
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
@@ -68,11 +68,11 @@ class AbstractJam(Result):
     - `omega`: speed of the loads, rad/s; `rotor_speed`, rad/s
     - `stable`: True if the slope dn/dOmega > 0, for light loads that stay together (`phase_jams` shows if they do)
     - `slope`: dn/dOmega
-    - `displacement` (nd,): complex amplitudes at load angle Omega t, m (rad for tilts)
+    - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
     - `amplitude` (nd,), m (rad for tilts), zero to peak; typical: 0.5 to 10 mm
-    - `foundation_force`, N, zero to peak; for two directions of the force it is the root of the summed squares of their peaks
-      (sqrt 2 times the force of a circular whirl)
-    - `coordinates` (nd,): their names
+    - `foundation_force`, N, zero to peak; for two directions of the force it is the root of the sum of the squares of their
+      peaks (sqrt 2 times the force of a circular whirl)
+    - `coordinates` (nd,): names of the coordinates
     """
 
     mode: Array = eqx.field(metadata=in_unit("", "*"))
@@ -112,7 +112,7 @@ class Jam(AbstractJam):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the speed of the loads in `unit`, and the amplitudes, onto two axes `ax` if given.
+        """Plot the speed of the loads in `unit`, and the amplitudes; `ax`: two axes to plot onto.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -124,9 +124,9 @@ class JamModes(AbstractJam):
 
     Returned by `jam_modes`.
 
-    - A mode that does not exist holds NaN and the status `absent`. Its derivatives are 0, so that it does not spoil those of a
-      batch: test the status, not the gradient
-    - A mode without a bound has NaN amplitudes and the status `unbounded`
+    - A mode that does not exist holds NaN and the status `absent`. Its derivatives are 0 in place of NaN, which keeps the
+      derivatives of a batch finite: test the status, not the gradient
+    - A mode at an undamped resonance has NaN amplitudes and the status `unbounded`
 
     **Additional attributes**: `resonances` (nd,), rad/s, and the `folds` of the branch.
     """
@@ -149,7 +149,7 @@ class JamModes(AbstractJam):
     def row(self, mode: int, *, throw: bool = False) -> int:
         """Return the row of the jam mode with number `mode` in the arrays, also for a mode that does not exist.
 
-        **Raises** `InputError` for a number out of 1 .. 2 nd + 1; with `throw` also as `select`.
+        **Raises** `InputError` for a number outside 1 .. 2 nd + 1; with `throw` also the errors of `select`.
         """
         most = self.mode.shape[0]
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
@@ -170,8 +170,8 @@ class JamModes(AbstractJam):
     def select(self, mode: int, *, throw: bool = True) -> Jam:
         """Return the jam mode with number `mode`.
 
-        **Raises** `InputError` for a number out of 1 .. 2 nd + 1, `ComputationError` (status "absent") if it does not exist at
-        this rotor speed; with `throw=False`, and under a JAX transformation, the status shows it instead.
+        **Raises** `InputError` for a number outside 1 .. 2 nd + 1, `ComputationError` (status "absent") if it does not exist at
+        this rotor speed; with `throw=False`, and under a JAX transformation, the status states this and no error is raised.
         """
         row = self.row(mode, throw=throw)
         return _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), np.asarray(row, np.uint32))
@@ -189,9 +189,10 @@ class JamModes(AbstractJam):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the speeds of the loads in `unit` among the resonances, and amplitudes, by mode; onto two axes `ax` if given.
+        """Plot the load speed of each mode in `unit`, with the resonances, and the amplitudes; `ax`: two axes to plot onto.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an unknown unit or a wrong number of
+        axes.
         """
         return _modes_chart(self, self.resonances, unit, ax)
 
@@ -211,37 +212,39 @@ def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit | 
 
 @validated
 def jam_modes(scene: Scene) -> JamModes:
-    """Return every way in which light, coincident loads can jam at the scene's rotor speed, driven by drag and dry friction.
+    """Return all jam modes of light, coincident loads at the scene's rotor speed; drag and dry friction drive the loads.
 
-        sum b_W R^2 (n - Omega) + dry friction = mean braking torque of the vibration at Omega,  solved for Omega at the speed n
+        sum b_W R^2 (n - Omega) + dry friction = mean braking torque of the vibration at Omega,  solved for Omega at the rotor
+        speed n
 
-    The branch n(Omega) of `jam_rotor_speed` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that reaches the
-    rotor speed holds one mode.
+    The branch n(Omega) of `jam_rotor_speed` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that contains
+    the rotor speed gives one mode.
 
-    - Numbers follow the resonances: 2r - 1 rises toward the peak of resonance r, 2r falls from it, 2 nd + 1 is beyond the last.
-      So mode 3 is the jam just below the second resonance even if the first one is damped so much that modes 1 and 2 have
-      vanished
+    - Mode numbers follow the resonances: mode 2r - 1 is on the piece that rises to the peak of resonance r, mode 2r on the
+      piece that falls from it, and mode 2 nd + 1 is beyond the last resonance. So mode 3 is the jam just below the second
+      resonance even if the first one is damped so much that modes 1 and 2 have vanished
     - Rising pieces (odd modes) are stable by slope, falling ones are not
-    - If the branch has more peaks than resonances, the lowest ripples, each over a narrow range of rotor speeds, are left out
-    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) leaves a jam unchanged: it shakes at the rotor's speed,
-      loads at theirs, so that it has no mean torque at this order. Its vibration and force add to those of the loads; the
-      amplitudes and the foundation force are the loads' alone. If both count, use `simulate`
+    - If the branch has more peaks than resonances, the lowest peaks, each of which covers a narrow range of rotor speeds, are
+      ignored
+    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor speed
+      and that of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The amplitudes and
+      the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use `simulate`
 
     **Arguments**: `scene` with a drive of constant speed and loads with drag; typical: loads of 0.1 % to 5 % of the machine's
     mass. The relative error of the result is about this share times the magnification at resonance, see `jam_orbit`.
 
-    Resonances closer to each other than their damping share one peak of the branch: their modes are one pair, with the
-    number of the resonance nearest to the peak, and the status of the others is `absent`.
+    Resonances whose distance is smaller than their bandwidth have one common peak of the branch and one pair of modes, with
+    the number of the resonance nearest to the peak; the status of the other modes is `absent`.
 
     **Returns** `JamModes`; derivatives of every number with respect to every parameter of the scene are exact (implicit
     function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
 
     **Raises** `InputError` for
 
-    - loads without drag or at stations of their own
+    - loads without drag or at different stations
     - a machine whose coordinates couple through the rotor's speed
-    - a motor in place of a given speed
-    - effects that this theory leaves out (`CubicSupport`, `Stop`)
+    - a motor in place of a prescribed speed
+    - effects that this function does not include (`CubicSupport`, `Stop`)
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -278,7 +281,8 @@ def jams_of(scene: Scene) -> JamModes:
     chosen = jnp.argmax(hits, axis=1)
     omega = jnp.where(there, omega[chosen], n)
 
-    # Closer to a fold, rounding hides the difference between its rotor speed and the scene's; derivatives have no digits there.
+    # Closer to a fold, rounding errors hide the difference between its rotor speed and the scene's, and derivatives are not
+    # significant.
     speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
     close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
     close = (close | jnp.roll(close, -1))[chosen]
@@ -312,13 +316,13 @@ def jam_at(
 ) -> Jam:
     """Return the jam of mode `number` with load speed `omega` rad/s at a rotor speed (rad/s) at which it exists, all scalars.
 
-    **Arguments**: `rotor_speed` (default: that of the branch); `at_fold`: True if it lies at its fold (default: if the slope
+    **Arguments**: `rotor_speed` (default: that of the branch); `at_fold`: True if the jam is at a fold (default: if the slope
     of the branch is almost zero). Never returns `absent`; the caller has established that the mode exists.
     """
     speed, slope, displacement = branch_tangent(model, omega)
     rotor_speed = speed if rotor_speed is None else rotor_speed
     at_fold = jnp.abs(slope) < jnp.sqrt(jnp.finfo(omega.dtype).eps) if at_fold is None else at_fold
-    # Within a few units of the last digit of an undamped resonance the amplitude consists of rounding errors.
+    # Within a few units in the last place of an undamped resonance the amplitude consists of rounding errors.
     radius = model.unbalance / jnp.min(jnp.diagonal(model.mass))
     bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(radius.dtype).eps < radius)
     displacement = jnp.where(bounded, displacement, jnp.nan)
@@ -341,7 +345,7 @@ def jam_at(
 
 
 def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
-    """Return True if the vibration can hold every load against its drag; always True for equal loads.
+    """Return True if the torque of the vibration can balance the drag of every load; always True for equal loads.
 
     This is the case if the torque of the vibration on each load at its best phase, S w^2 |e^H B Y| / 2, reaches the torque
     b_W R^2 (n - w) of its drag. The vibration is largest for coincident loads.
@@ -364,7 +368,8 @@ def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
 
 
 def _solved_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]:
-    """Return load speeds on the monotone pieces at which the branch has the scene's rotor speed, and True if they exist."""
+    """Return load speeds on the monotone pieces at which the branch has the scene's rotor speed, and a mask of those that
+    exist."""
     target = model.scene.drive.speed
     gaps = pieces.speed_low - target, pieces.speed_high - target
     exists = (pieces.high > pieces.low) & (gaps[0] * gaps[1] <= 0.0)

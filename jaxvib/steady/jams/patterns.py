@@ -8,7 +8,7 @@ from jax import Array
 
 
 class PhasePattern(eqx.Enumeration):
-    """Relative phases of loads that turn at one speed. Each member is the sentence shown to the user."""
+    """Relative phases of loads that turn at one speed. The value of each member is the message shown to the user."""
 
     together = "all together"
     opposite = "in two opposite groups"

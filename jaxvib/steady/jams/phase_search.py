@@ -163,7 +163,8 @@ def phase_jams(
 
     **Returns** `PhaseJams`, or `PhaseJam` with `near`.
 
-    **Raises** `InputError` for loads without drag, drives without a given speed, and effects that this theory leaves out.
+    **Raises** `InputError` for loads without drag, drives without a given speed, and effects that this function does not
+    include.
 
     >>> import jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)

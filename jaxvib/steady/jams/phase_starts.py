@@ -1,4 +1,5 @@
-"""Starts of the search for jams at unequal phases: load speeds, and phases at which all loads need the same drag."""
+"""Initial values of the search for jams at unequal phases: load speeds, and phases at which the torque balance of all loads
+requires the same multiple of their drag."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ _STEPS_PER_ROUND, _MAX_ROUNDS = 7, 6
 """Newton steps in a round, after which converged phases are left out, and number of rounds."""
 
 _SPEEDS_PER_PROGRAM, _PHASES_PER_PROGRAM = 400, 2048
-"""Numbers of load speeds and of sets of phases in one program."""
+"""Numbers of load speeds and of sets of phases in one call of the program."""
 
 _PARTS_PER_CUT, _CUT_COUNT = 8, 2
 """Number of parts into which an interval of load speeds with a jam is divided, and number of divisions before Newton's method
@@ -33,22 +34,23 @@ starts."""
 
 
 _STARTS_PER_PROGRAM = 256
-"""Number of starts in one program; typical scenes need a few hundred."""
+"""Number of starts in one call of the program; typical scenes need a few hundred."""
 
 _STARTS_OF_CLUSTERS, _MAX_DIVISIONS = 16, 64
-"""Least number of random sets of phases for a division of equal loads into clusters, and largest number of divisions. If there
-are more divisions, they are not searched separately, and every load has an independent phase."""
+"""Minimum number of random sets of phases for a division of equal loads into clusters, and largest number of divisions. If
+there are more divisions, they are not searched separately, and every load has an independent phase."""
 
 
 def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return speeds (n,) and phases (n, count) of solved balances, from `number` random sets of phases in total.
+    """Return speeds (n,) and phases (n, count) of solutions of the torque balance, from `number` random sets of phases in
+    total.
 
-        T_j = (w^4/2) S Im(e^{-i a_j} F),      F = sum_k S_k A_jk e^{i a_k} the same for equal loads
+        T_j = (w^4/2) S Im(e^{-i a_j} F),      F = sum_k S_k A_jk e^{i a_k}, equal for equal loads
 
     Equal loads need the same torque, therefore Im(e^{-i a_j} F) is the same for all of them, and at most two phases a_j are
-    possible. Therefore no jam is missed by a search over all divisions of the equal loads into two clusters, with one body for
-    each cluster. The unknowns are two phases for each group of equal loads, whatever the number of its loads. The results are
-    not all distinct.
+    possible. Therefore no jam is missed by a search over all divisions of the equal loads into two clusters, with one load in
+    place of each cluster. The unknowns are two phases for each group of equal loads, whatever the number of its loads. The
+    results are not all distinct.
     """
     divisions = _divisions(equal_loads(balance))
     each = max(number // len(divisions), min(number, _STARTS_OF_CLUSTERS))
@@ -86,9 +88,9 @@ def equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
 def _at_resonances(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return starts at every natural frequency below the rotor speed, from each of the `phases`.
 
-    Two clusters of one size have a jam at the speed at which the carrier lags by exactly a quarter of a turn, which no grid of
-    load speeds meets. The jam of only two loads is left out: it exists at any drag, and the diagram over the drag has no curve
-    for it.
+    Two clusters of equal size have a jam at the speed at which the phase lag of the carrier is exactly 90 degrees; no grid of
+    load speeds contains this speed. For two loads this jam is not searched: it exists at any drag, and the diagram over the
+    drag has no curve for it.
     """
     frequencies = np.asarray(estimated_frequencies(balance.model.scene))
     inside = frequencies[(frequencies > 0.0) & (frequencies < float(balance.speed))]
@@ -112,7 +114,8 @@ def _divisions(groups: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _merged(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalance:
-    """Return the balance of clusters of equal loads: each is one load with the unbalance and the drag of all its loads."""
+    """Return the balance of clusters of equal loads: each cluster is one load with the total unbalance and drag of its
+    members."""
     first, many = np.unique(cluster, return_index=True, return_counts=True)[1:]
     averaged = balance.averaged
     scaled = [on_device(np.asarray(x)[first] * many) for x in (averaged.unbalance, averaged.drag, averaged.inertia)]
@@ -125,10 +128,10 @@ def _merged(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalance:
 def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find speeds (n,) and phases (n, count) close to jams, from sets of `phases` (ns, count) and regular sets.
 
-    At each of many load speeds the phases are solved for which all loads need the same multiple of their drag. Each pattern is
-    followed to the neighbouring load speeds. If its multiple passes 1 on the way, a jam lies between, and the interval is
-    narrowed down. Points whose multiple is near 1 are starts too, and so are the mirror images of all starts: of two patterns
-    that are nearly mirror images of each other, one is often hidden by steeper slopes.
+    At many load speeds the equations are solved for the phases at which all loads need the same multiple of their drag. Each
+    pattern is followed to the neighbouring load speeds. If this multiple crosses 1 between two speeds, a jam lies between, and
+    the interval is narrowed down. Points whose multiple is near 1 are starts too, and so are the mirror images of all starts:
+    of two patterns that are nearly mirror images of each other, Newton's method often misses the one with steeper slopes.
     """
     speeds, phases = load_speeds(balance), np.concatenate([phases, _regular_phases(balance)])
     at_speeds = _data_at_speeds(balance, speeds)
@@ -137,7 +140,7 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     if not good.any():
         return speeds[:1], phases[:1]
     row, size, angles = row[good], np.log(factor[good]), angles[good]
-    # The angles are in the turn that begins at -1 rad, since many phases are at 0 and pi, far from its ends.
+    # The angles are in the interval from -1 to 2 pi - 1 rad, since many phases are at 0 and pi, far from its ends.
     inside = angles[:, 1:] - 2.0 * np.pi * np.floor((angles[:, 1:] + 1.0) / (2.0 * np.pi))
     once = distinct_rows(np.concatenate([row[:, None], np.rint(1e4 * size[:, None]), np.rint(1e3 * inside)], axis=1))[0]
     row, size, angles = row[once], size[once], angles[once]
@@ -216,8 +219,8 @@ def _follow_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: 
 
 
 def _solve_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Solve for phases from starts (n, count), each at the load speed number `row` (n,), in rounds of Newton steps; each round
-    continues with the starts that have not converged.
+    """Solve for phases from starts (n, count), each at the load speed with the index `row` (n,), in rounds of Newton steps;
+    each round continues with the starts that have not converged.
 
     **Returns** the drag's multiple (n,), the phases, and True for the phases of a jam.
     """
@@ -226,8 +229,9 @@ def _solve_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: n
     for _ in range(_MAX_ROUNDS):
         found = in_chunks(_PHASES_PER_PROGRAM, _newton_round, row[left], phase[left], shared=(balance, at))
         factor[left], phase[left], residual[left] = found
-        # Three quarters of the digits must have converged: near a double solution, residuals with half of the digits allow
-        # phases far from both. At the end half of the digits is accepted, since solutions on a curve reach no more.
+        # Three quarters of the digits must have converged: near a double solution, a residual with half of the digits is
+        # possible for phases far from both. At the end half of the digits is accepted, since solutions that form a curve reach
+        # no smaller residual.
         left = left[~(residual[left] < eps**0.75)]
         if left.size == 0:
             break
@@ -267,10 +271,10 @@ def phases_near(
 ) -> tuple[Array, Array, Array]:
     """Solve for the phases (count,) of a jam at a given load speed by `steps` Newton steps from `start` (count,).
 
-    All loads must need the same multiple of their drag, - T_j / (b_j R_j^2 (n - w)), which is explicit; the phases are the
-    only unknowns.
+    All loads must need the same multiple of their drag, - T_j / (b_j R_j^2 (n - w)). The multiple is an explicit function of
+    the phases, which are therefore the only unknowns.
 
-    **Returns** the multiple, positive in a jam; the phases; and the remaining difference between the multiples, relative.
+    **Returns** the multiple, positive in a jam; the phases; and the remaining relative difference between the multiples.
     """
 
     def differ(x: Array, given: tuple[TorqueBalance, AtSpeed]) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Jams of light loads that turn together at unequal phases: torque balance on any carrier, every solution, stability."""
+"""Jams of light loads that rotate at one speed with unequal phases: torque balance for any carrier, solutions, stability."""
 
 from __future__ import annotations
 
@@ -37,21 +37,22 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn
 
 _SAME_JAM_DISTANCE = 0.02
-"""Relative difference of load speeds up to which jams of two theories count as the same."""
+"""Largest relative difference of load speeds at which jams of two methods count as the same."""
 
 
 class PhaseStatus(eqx.Enumeration):
-    """Outcomes of a jam of loads at different angles. Each member is the sentence shown to the user."""
+    """Outcomes of the search for a jam of loads at different angles. The value of each member is the message shown to the
+    user."""
 
     found = "the loads can jam at these phases"
-    with_rotor = "the loads turn with the rotor and balance it: they are not jammed"
+    with_rotor = "the loads turn with the rotor and cause no vibration: they balance each other and are not jammed"
     not_converged = "the search from this initial guess found no jam"
     unbounded = "the loads turn at an undamped resonance: the vibration grows without bounds"
     refused = REFUSED
 
 
 def degrees(angle: float) -> float:
-    """Return an angle in degrees from one in rad, rounded for display, so that rounding errors of 0 print as 0.
+    """Convert an angle from rad to degrees, rounded for display, so that rounding errors of 0 print as 0.
 
     >>> degrees(2.5e-19), degrees(3.141592653589793)
     (0.0, 180.0)
@@ -60,7 +61,8 @@ def degrees(angle: float) -> float:
 
 
 class AbstractPhaseJam(Result):
-    """Jams whose loads may be at different angles, phi_j = Omega t + phase_j, one or several; NaN if there is no jam.
+    """One or several jams whose loads may be at different angles, phi_j = Omega t + phase_j. Numbers are NaN if there is no
+    jam.
 
     **Attributes**
 
@@ -68,13 +70,13 @@ class AbstractPhaseJam(Result):
     - `omega` and `rotor_speed`, rad/s
     - `phase` (count,), rad; 0 for the first load
     - `pattern`: a `PhasePattern`
-    - `growth`, 1/s, of the fastest growing small disturbance, and `stable`: True if it is negative
-    - `displacement` (nd,): complex amplitudes at Omega t, m (rad for tilts)
+    - `growth`: growth rate of the fastest growing small disturbance, 1/s, and `stable`: True if it is negative
+    - `displacement` (nd,): complex amplitudes of q = Re(displacement exp(i Omega t)), m (rad for tilts)
     - `amplitude` (nd,), m (rad for tilts), zero to peak
-    - `foundation_force`, N, zero to peak (for two directions the root of the summed squares of their peaks: sqrt 2 times the
-      force of a circular whirl)
+    - `foundation_force`, N, zero to peak; for two directions the root of the sum of the squares of their peaks, which is sqrt
+      2 times the force of a circular whirl
     - `torque` (count,), N m: the mean torque of the vibration on each load
-    - `residual` of the balance, relative to the drag's torque
+    - `residual` of the torque balance, relative to the torque of the drag
     """
 
     status: PhaseStatus
@@ -125,7 +127,7 @@ class TorqueBalance(eqx.Module):
     """Balance of the mean torques on the loads of a scene.
 
     **Attributes**: the linear `model`; the `averaged` equations at the rotor speed of the scene; `direction` (count, nd),
-    complex: the force of each load on the coordinates, per unit force of the load.
+    complex: generalized force of each load per unit of its centrifugal force.
     """
 
     model: LinearModel
@@ -184,12 +186,12 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     L_j (np, nd) maps the carrier's coordinates to the displacement of the port at the station of load j; n is the rotor speed.
 
     **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a given speed, and
-    effects that this theory leaves out.
+    effects that this function does not include.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.14), jv.ConstantSpeed(460.0))
-    >>> abs(float(phase_torques(scene, 170.0, jnp.array([0.0, jnp.pi]))[0])) < 1e-12    # opposite: nothing vibrates
+    >>> abs(float(phase_torques(scene, 170.0, jnp.array([0.0, jnp.pi]))[0])) < 1e-12    # opposite phases: no vibration
     True
 
     Source: Artyunin 2013, the pendulums' equation of (1), averaged over a turn.
@@ -208,15 +210,15 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
         b_j R_j^2 (n - w) + T_j(w, a) = 0,     j = 1 .. count
 
-    is solved for w and all phases but the first, see `phase_torques`. Stability is the growth of small disturbances of the
-    averaged motion, q = Re(z(t) exp(i w t)), with free angles of the loads: an autonomous system of 4 nd + 2 count numbers,
-    without a quasi-static assumption. On supports that are equal in both directions averaging is exact.
+    is solved for w and all phases but the first, see `phase_torques`. Stability is determined by the growth rate of small
+    disturbances of the averaged motion, q = Re(z(t) exp(i w t)), in which the angle of each load is free: an autonomous system
+    of dimension 4 nd + 2 count, without a quasi-static assumption. For isotropic supports averaging is exact.
 
-    **Returns** `PhaseJam`; `vmap` over starts and scenes goes through it, derivatives of all but stability are those of the
-    implicit function theorem. An imbalance of the rotor is left out of amplitudes and forces, see `phase_jams`.
+    **Returns** `PhaseJam`; it works under `vmap` over starts and scenes. Derivatives of all results except stability follow
+    from the implicit function theorem. An imbalance of the rotor is not included in amplitudes and forces, see `phase_jams`.
 
-    **Raises** `InputError` for loads without drag, phases of another number than the loads, drives without a given speed, and
-    effects that this theory leaves out.
+    **Raises** `InputError` for loads without drag, a number of phases that differs from the number of loads, drives without a
+    given speed, and effects that this function does not include.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -242,7 +244,8 @@ def loads_with_drag(scene: Scene) -> CircularLoads:
 
 
 def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_numbers: bool = False) -> tuple[Array, Array]:
-    """Solve the torque balance for the load speed and the phases (count,) by Newton's method, differentiable by the balance.
+    """Solve the torque balance for the load speed and the phases (count,) by Newton's method, differentiable with respect to
+    the balance.
 
     `on_numbers`: evaluate on scalars (`damped_newton`), which is faster for many starts and takes longer to compile.
     """
@@ -311,8 +314,8 @@ def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
 
     **Arguments**: `omega` (n,) rad/s of the jams of light coincident loads.
 
-    **Returns** the `growth` of `PhaseJam` for each; NaN if there is no such jam nearby, if `omega` is NaN, and if loads lie
-    side by side or have dry friction, which this theory does not include.
+    **Returns** the `growth` of `PhaseJam` for each; NaN if there is no such jam nearby, if `omega` is NaN, or if the loads
+    have a finite radius or dry friction, which this function does not include.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)

@@ -44,7 +44,7 @@ then about 3e4 times as fast as the loads, and an orbit would take seconds to ho
 
 
 class OrbitStatus(eqx.Enumeration):
-    """Outcomes of a search for an exact jam. Each member is the sentence shown to the user."""
+    """Outcomes of a search for an exact jam. The value of each member is the message shown to the user."""
 
     found = "the loads can jam in this periodic motion"
     absent = "this mode does not exist at this rotor speed"

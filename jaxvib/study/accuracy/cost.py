@@ -109,7 +109,7 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
     >>> figure.axes[0].get_title()
     'a jam'
 
-    Source: ours.
+    Source: this package.
     """
     from jaxvib.draw.comparison import CostPanel, cost_chart  # slow import
 

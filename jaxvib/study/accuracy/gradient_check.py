@@ -43,7 +43,7 @@ counts as rounding."""
 
 
 class GradientStatus(eqx.Enumeration):
-    """Outcomes of a check. Each member is the sentence shown to the user."""
+    """Outcomes of a check. The value of each member is the message shown to the user."""
 
     agree = "every derivative agrees with finite differences"
     differ = "derivatives differ from finite differences by more than the tolerance plus the error of the differences"

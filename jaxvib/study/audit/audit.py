@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class AuditStatus(eqx.Enumeration):
-    """Outcomes of an audit. Each member is the sentence shown to the user."""
+    """Outcomes of an audit. The value of each member is the message shown to the user."""
 
     done = "the change by each effect was computed"
     unsettled = "the motion had not settled to the requested accuracy: smaller changes are not resolved; run longer"
@@ -152,7 +152,7 @@ def audit(
     >>> found.advised("needed"), found.advised("negligible")
     ([], ['gravity'])
 
-    Source: ours.
+    Source: this package.
     """
     if isinstance(accuracy, bool) or not isinstance(accuracy, (int, float)) or not 0.0 < accuracy < 1.0:
         raise InputError("accuracy", f"is {quoted(accuracy)}; it must be a number between 0 and 1, such as 0.01 for 1 %")

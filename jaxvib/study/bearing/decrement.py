@@ -119,7 +119,7 @@ def turning_points(record: Record) -> TurningPoints:
     >>> np.round(found.time, 5).tolist(), np.round(found.angle, 5).tolist()
     ([0.5, 1.0, 1.5, 2.0, 2.5], [-0.1, 0.1, -0.1, 0.1, -0.1])
 
-    Source: ours.
+    Source: this package.
     """
     t, f = record.time, record.angle
     rough = np.diff(f, 4)

@@ -43,7 +43,7 @@ _CONTRADICTS = 0.05
 
 
 class IdentifyStatus(eqx.Enumeration):
-    """Outcomes of a fit. Each member is the sentence shown to the user."""
+    """Outcomes of a fit. The value of each member is the message shown to the user."""
 
     found = "the fit explains the record up to noise"
     patterned = "the residuals of the fit are not noise: the friction law is incomplete and the intervals are wrong"

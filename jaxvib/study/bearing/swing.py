@@ -36,7 +36,7 @@ class BearingPendulum(eqx.Module):
 
     mu1 and mu2 are the bearing's viscous and dry friction; N is its radial load, along the rod.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `mass` m, kg; typical: 0.1 to 1
     - `length` l from the bearing's axis to the mass centre, m; typical: 0.1 to 0.5
@@ -92,7 +92,7 @@ class BearingPendulum(eqx.Module):
 
 
 class SwingStatus(eqx.Enumeration):
-    """Outcomes of a swing. Each member is the sentence shown to the user."""
+    """Outcomes of a swing. The value of each member is the message shown to the user."""
 
     swinging = "the pendulum still swings at the last time"
     stopped = "dry friction stopped the pendulum"
@@ -161,7 +161,7 @@ def swing(
 
     If the pendulum turns within the dead zone |tan f| < mu2 d/(2 l), dry friction holds it: it stays there for good.
 
-    **Arguments** (SI or texts with a unit)
+    **Arguments** (SI, or strings with a unit)
 
     - `pendulum`: a `BearingPendulum`
     - `time` (n,), s, ascending; typical: 10 to 200 s

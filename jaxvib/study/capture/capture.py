@@ -43,7 +43,7 @@ _SCAN = 32
 
 
 class CaptureStatus(eqx.Enumeration):
-    """Outcomes of a search for a threshold. Each member is the sentence shown to the user."""
+    """Outcomes of a search for a threshold. The value of each member is the message shown to the user."""
 
     found = "every start above the threshold was captured"
     all_captured = "every start was captured: the threshold is below the computed speeds"
