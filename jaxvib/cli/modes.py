@@ -55,7 +55,7 @@ def modes(
     if exact:
         _exact(loaded, csv, output)
         return
-    if phases or loaded.mounting().axes != (1,):
+    if phases or loaded.mounting.axes != (1,):
         if csv is not None:
             raise InputError(
                 "--csv", "writes branches over the load speed, which jams with unequal phases do not have; use --json"

@@ -335,7 +335,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 def require_one_point(scene: Scene) -> None:
     """**Raises** `InputError` if the loads have different stations along the machine's axis."""
-    _require_one_point(scene.mounting())
+    _require_one_point(scene.mounting)
 
 
 def _require_one_point(mount: Mount) -> None:
@@ -360,7 +360,7 @@ def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[Circ
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     loads, drive = scene.loads, scene.drive
-    mount = scene.mounting()
+    mount = scene.mounting
     if mount.turn is not None:
         problem = (
             "rotates with the housing of its exciter, which this function does not include: use simulate, settle or ensemble"

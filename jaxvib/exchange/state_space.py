@@ -169,7 +169,7 @@ def state_space(
 
 def _at_rest(scene: Scene, speed: Array) -> StateSpace:
     a, b, c, d = map(np.asarray, _rest_matrices(scene, speed))
-    carrier, mounting = scene.machine.structure(), scene.mounting()
+    carrier, mounting = scene.machine.structure(), scene.mounting
     states = (*coordinate_signals(carrier, "displacement", 0), *coordinate_signals(carrier, "velocity", 1))
     at_exciter = signals_of([f"exciter.{('across', 'up')[axis]}" for axis in mounting.axes], "N")
     outputs = (*states, *coordinate_signals(carrier, "acceleration", 2), *foundation_forces(carrier))

@@ -165,7 +165,7 @@ def _nodes(scene: Scene) -> list[_Node]:
 
 def _directions(scene: Scene) -> list[int]:
     """Return the numbers of the directions of a node's rows: 2 (+Y) across, 3 (+Z) up."""
-    return [2 + axis for axis in scene.mounting().axes]
+    return [2 + axis for axis in scene.mounting.axes]
 
 
 def _head(scene: Scene, path: Path) -> list[dict[str, Any]]:

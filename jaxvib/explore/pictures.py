@@ -116,7 +116,7 @@ def _draw_all(scene: Scene) -> None:
 
 def has_branches(scene: Scene) -> bool:
     """True if the jams of the scene form branches over the rotor speed, that is, if its machine only moves up and down."""
-    return scene.mounting().axes == (1,)
+    return scene.mounting.axes == (1,)
 
 
 def heading(scene: Scene) -> str:

@@ -124,7 +124,7 @@ def _is_adjustable(scene: Scene, name: str) -> bool:
 
 def _has_equal_loads(scene: Scene) -> bool:
     """True if all loads have equal parameters and no load has its own station, so that the number of loads can change."""
-    return scene.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
+    return scene.mounting.at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 
 def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Slider:

@@ -280,8 +280,10 @@ class Scene(Part):
         """Return the mount of the only exciter."""
         return self.machine.mount(self.exciter.place)
 
+    @property
     def mounting(self) -> Mount:
-        """Return the directions and shapes of the only exciter's mount, without its numbers."""
+        """Directions and shapes of the only exciter's mount, without its numbers."""
+        # A property, since each analysis reads it and a method of an Equinox module costs 30 us a call.
         return shapes_of(self.machine, self.exciter.place)[1]
 
     def replace(self, **parts: Any) -> Scene:

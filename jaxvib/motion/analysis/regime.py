@@ -282,7 +282,7 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     """Return the natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor the forward whirls at
     its speed."""
-    if scene.mounting().gyroscopic is None:
+    if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
     return jnp.sort(jnp.where(found.forward[0] & jnp.isfinite(found.speed[0]), found.speed[0], jnp.inf))

@@ -121,7 +121,7 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
 
     Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
     """
-    direction = turning(scene.mounting())
+    direction = turning(scene.mounting)
     size = circular_loads(scene).unbalance() if unbalance is None else unbalance
     receptance = jnp.sum(direction.conj() * (port_receptance(scene, omega) @ direction)).real
     return size**2 * omega**2 / 2.0 * receptance

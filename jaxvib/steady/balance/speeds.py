@@ -206,7 +206,7 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
     if not np.any(port):
         problem = "does not move with any coordinate, and its loads have no effect; put the exciter at a point that can move"
         raise InputError("machine.port", problem)
-    if scene.mounting().gyroscopic is not None:
+    if scene.mounting.gyroscopic is not None:
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; every motion needs one")
         return

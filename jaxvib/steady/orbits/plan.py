@@ -131,7 +131,7 @@ def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known
 
 def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
     """Return True if the leading order has the jam mode, the sign of dn/dOmega there, and its load speed, rad/s."""
-    if scene.mounting().gyroscopic is not None:
+    if scene.mounting.gyroscopic is not None:
         raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
     jams = jams_of(scene)
     light, speed = known(jams.omega)[jams.row(mode)], known(scene.drive.speed)

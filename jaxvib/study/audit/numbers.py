@@ -135,7 +135,7 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
 
 
 def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
-    if scene.mounting().tilt is not None:
+    if scene.mounting.tilt is not None:
         return None
     model = linear_model(scene)
     (port,) = model.mount.rows
@@ -151,7 +151,7 @@ def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRo
 
 def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     machine = scene.machine
-    if scene.mounting().axes != (1,) or has_term(scene.all_effects, SupportForce):
+    if scene.mounting.axes != (1,) or has_term(scene.all_effects, SupportForce):
         return None
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
     weight = _G * (float(jnp.trace(machine.carrier().mass)) + loads)

@@ -62,7 +62,7 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
         number = f" {kinds[: k + 1].count(effect.kind)}" if kinds.count(effect.kind) > 1 else ""
         rest = (*scene.all_effects[:k], *scene.all_effects[k + 1 :])
         yield Variant(effect.kind + number, True, scene.replace(effects=rest))
-    if scene.mounting().gyroscopic is not None:
+    if scene.mounting.gyroscopic is not None:
         machine = WithoutGyroscopic(scene.machine)
         yield Variant("gyroscopic coupling", True, eqx.tree_at(lambda s: s.machine, scene, machine))
     if not scene.drive.ideal and until is not None:
