@@ -79,7 +79,9 @@ class Criterion(Result):
         """Return the characteristic speeds and intervals as a table in text."""
 
         def written(intervals: list[list[float | None]]) -> str:
-            return ", ".join(f"{scale * a:.6g} .. {'infinity' if b is None else f'{scale * b:.6g}'}" for a, b in intervals)
+            return ", ".join(
+                f"{scale * (a or 0.0):.6g} .. {'infinity' if b is None else f'{scale * b:.6g}'}" for a, b in intervals
+            )
 
         table, (unit, scale) = criterion_table(self), speed_unit()
         lines = [f"{table['status']}", self.speeds.summary()]
