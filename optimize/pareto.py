@@ -117,7 +117,7 @@ def pareto(
 
     **Returns** `Front`, machines with the least `first` first; a single one if it is the best of both.
 
-    **Raises** as `synthesize`.
+    **Raises** as `synthesize`; `KeyboardInterrupt` if a search is interrupted.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -145,6 +145,8 @@ def pareto(
         # A flat objective has many minima; the first search ends at any of them.
         alike = [*given, objective < float(objective(best.scene))]
         then = synthesize(space, other, subject_to=alike, begin=best, seed=seed, verify=False, throw=False)
+        if "interrupted" in (best.status_name, then.status_name):
+            raise KeyboardInterrupt  # a front needs all of its searches
         return [best, then] if then.status_name != "contradictory" else [best]
 
     # The limit has no effect, but excludes machines without the other quantity and lets all searches share two programs.

@@ -20,7 +20,7 @@ from jaxvib.units.known import require_known
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import Quantity, require_quantity
 
-__all__ = ["Bounds", "DesignSpace", "HeldQuantity", "Source", "hold"]
+__all__ = ["Bounds", "Choice", "DesignSpace", "HeldQuantity", "Source", "hold"]
 
 Numbers = TypeVar("Numbers", np.ndarray, Array)
 

@@ -95,7 +95,7 @@ def synthesize(
       such run
     - `throw`: raise if demands contradict each other; otherwise the status and `limits` show it
     - `progress`: a function, called with the present step and its finished share (0 to 1). An interrupt (Ctrl-C) ends the
-      search with its best design
+      search at once with its best design, which is not polished and not verified
 
     **Returns** `Synthesis`.
 
@@ -127,10 +127,10 @@ def synthesize(
     kept = found.violation < 10.0 * FEASIBLE
     done = kept & (found.left < _CONVERGED)
     values = np.where(kept, found.point.values[:, 0], np.inf)
-    if not kept[best]:
-        status = SynthesisStatus.contradictory
-    elif found.interrupted:
+    if found.interrupted:
         status = SynthesisStatus.interrupted
+    elif not kept[best]:
+        status = SynthesisStatus.contradictory
     else:
         status = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged
 
@@ -140,12 +140,13 @@ def synthesize(
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
     reports = reported((*(q for _, q in named), objective, *sides), batch, problem)
     limits = limits_of(problem, demands, found, reports[1, len(named) + 1 :].reshape(-1, 2))
-    if throw and not kept[best]:
+    if throw and status is SynthesisStatus.contradictory:
         broken = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.broken)
         raise failure(SynthesisStatus.contradictory, f" (nearest: {broken}); widen the bounds or relax a demand")
     tell("checking", 0.9)
-    verify = verify and bool(kept[best])
-    run, unverified = _run(scene, mode, verify) if kept[best] else (None, "the machine does not meet all demands")
+    verify = verify and bool(kept[best]) and not found.interrupted
+    unfinished = "the search was interrupted" if found.interrupted else "the machine does not meet all demands"
+    run, unverified = _run(scene, mode, verify) if kept[best] and not found.interrupted else (None, unfinished)
     other = _other_tiers(scene, [q for _, q in named], verify, run, mode)
     rows = _table(space, scene, named, reports[:2, : len(named)], other)
     n = len(_standard(scene, mode, objective.of))
@@ -235,6 +236,9 @@ def _searched(
         existing, drawn = existing + found.existing, drawn + found.drawn
         if best is None or _rank(found) < _rank(best[2]):
             best = here, problem, found
+        if found.interrupted:
+            best = (*best[:2], best[2]._replace(interrupted=True))
+            break
     if best is None:
         missing = _missing(space, objective, demands, options)
         raise ComputationError(

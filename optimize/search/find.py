@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
@@ -17,7 +17,7 @@ from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
 from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, optimality, polish, violation
 from optimize.search.problem import Point, Problem, evaluate, looked_up
-from optimize.space import DesignSpace
+from optimize.space import Choice, DesignSpace
 
 _NODES = 400
 """Maximum number of bounds in a branch-and-bound search."""
@@ -89,8 +89,8 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     if first is None:
         return _find(problem, options, tell)
     if first.interrupted:
-        options = replace(options, iterations=0, polishing=0)
-    if _spread(problem):
+        begin, options = _few(first)[:1], replace(options, iterations=0, polishing=0)
+    elif _spread(problem):
         random = np.random.default_rng(options.seed).uniform(size=(2 * _STARTS_PER_BOUND, problem.space.size))
         begin = np.concatenate([_few(first), random])[: 2 * _STARTS_PER_BOUND]
     else:  # the best machines are near those of the first search
@@ -99,7 +99,10 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     if len(begin) == 0:
         begin = first.point.z[:_STARTS_PER_BOUND]
     found = _find(narrow, replace(options, begin=begin), lambda what, share: tell(what, 0.5 + 0.5 * share))
-    return None if found is None else found._replace(drawn=first.drawn, existing=first.existing)
+    if found is None:
+        return None
+    interrupted = first.interrupted or found.interrupted
+    return found._replace(drawn=first.drawn, existing=first.existing, interrupted=interrupted)
 
 
 def _with_lanes(problem: Problem, space: DesignSpace) -> Problem:
@@ -191,45 +194,73 @@ def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
     A bound is the best design with numbers free between two values of the catalogue. If it is not better than the best known
     choice, all choices between these values are skipped. Since each search is local, the global optimum is not guaranteed.
+    An interrupt (KeyboardInterrupt) ends the search with its best choice.
     """
     root = find(problem, options, lambda what, share: tell(what, 0.5 * share))
     choices = problem.space.choices
-    if root is None or not choices or root.violation[root.best] > 10.0 * FEASIBLE:
+    if root is None or not choices:
         return root
-    few = _few(root)
-    numbers = problem.space.numbers(few)
+    if root.interrupted:
+        return _nearest_choice(problem, root)
+    if root.violation[root.best] > 10.0 * FEASIBLE:
+        return root
     best: tuple[float, Found] | None = None
     order = itertools.count()
-    queue = [(float(root.point.values[root.best, 0]), next(order), root, numbers)]
-    nodes = 0
-    while queue and nodes < _NODES:
-        bound, _, node, begun = heapq.heappop(queue)
-        if best is not None and bound >= best[0] - 1e-9 * abs(best[0]):
-            break
-        where = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
-        off = [_away(choice.values, where[choice.start]) for choice in choices]
-        if max(off) < 1e-9:
-            best = (bound, node)
-            continue
-        choice = choices[int(np.argmax(off))]
-        allowed = [v for v in choice.values if node.bounds[0][choice.start] <= v <= node.bounds[1][choice.start]]
-        x = where[choice.start]
-        for part in ([v for v in allowed if v <= x], [v for v in allowed if v > x]):
-            if not part:
+    queue = [(float(root.point.values[root.best, 0]), next(order), root, problem.space.numbers(_few(root)))]
+    nodes, interrupted = 0, False
+    try:
+        while queue and nodes < _NODES:
+            bound, _, node, begun = heapq.heappop(queue)
+            if best is not None and bound >= best[0] - 1e-9 * abs(best[0]):
+                break
+            where = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
+            off = [_away(choice.values, where[choice.start]) for choice in choices]
+            if max(off) < 1e-9:
+                best = (bound, node)
                 continue
-            nodes += 1
-            low, high = (b.copy() for b in node.bounds)
-            low[choice.start], high[choice.start] = part[0], part[-1]
-            child = _bounded(problem, low, high, np.concatenate([where[None], begun])[:_STARTS_PER_BOUND], options)
-            if child is None or child.violation[child.best] > 10.0 * FEASIBLE:
-                continue
-            value = float(child.point.values[child.best, 0])
-            if best is None or value < best[0]:
-                tell(f"choosing, best {best[0]:.4g}" if best else "choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
-                heapq.heappush(queue, (value, next(order), child, begun))
+            for low, high in _halves(node, choices[int(np.argmax(off))], where):
+                nodes += 1
+                starts = np.concatenate([where[None], begun])[:_STARTS_PER_BOUND]
+                child = _bounded(problem, low, high, starts, max(options.polishing, 20))
+                if child is None or child.violation[child.best] > 10.0 * FEASIBLE:
+                    continue
+                value = float(child.point.values[child.best, 0])
+                if best is None or value < best[0]:
+                    tell(f"choosing, best {best[0]:.4g}" if best else "choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
+                    heapq.heappush(queue, (value, next(order), child, begun))
+    except KeyboardInterrupt:
+        interrupted = True
+        if best is None:
+            return _nearest_choice(problem, root)._replace(nodes=nodes)
     if best is None:
         return None
-    return best[1]._replace(drawn=root.drawn, existing=root.existing, nodes=nodes)
+    return best[1]._replace(drawn=root.drawn, existing=root.existing, interrupted=interrupted, nodes=nodes)
+
+
+def _halves(node: Found, choice: Choice, where: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the bounds of a node with the catalogue of `choice` below and above its value in the design `where`."""
+    allowed = [v for v in choice.values if node.bounds[0][choice.start] <= v <= node.bounds[1][choice.start]]
+    x = where[choice.start]
+    for part in ([v for v in allowed if v <= x], [v for v in allowed if v > x]):
+        if part:
+            low, high = (b.copy() for b in node.bounds)
+            low[choice.start], high[choice.start] = part[0], part[-1]
+            yield low, high
+
+
+def _nearest_choice(problem: Problem, root: Found) -> Found:
+    """Return the best design of an interrupted search with each number at the nearest value of its catalogue.
+
+    **Raises** `KeyboardInterrupt` if that design does not have the objective.
+    """
+    where = problem.space.within(*root.bounds).numbers(root.point.z[root.best])
+    low, high = (b.copy() for b in root.bounds)
+    for choice in problem.space.choices:
+        low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - where[choice.start]))
+    found = _bounded(problem, low, high, where[None], 0)
+    if found is None:
+        raise KeyboardInterrupt
+    return found._replace(drawn=root.drawn, existing=root.existing, interrupted=True)
 
 
 def _away(values: tuple[float, ...], x: float) -> float:
@@ -249,8 +280,8 @@ def _few(found: Found) -> np.ndarray:
     return np.reshape(kept[: _STARTS_PER_BOUND - 1], (-1, found.point.z.shape[1]))
 
 
-def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, options: Options) -> Found | None:
-    """Solve the problem with narrower bounds, from the designs with these `numbers`."""
+def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, polishing: int) -> Found | None:
+    """Solve the problem with narrower bounds by `polishing` steps from the designs with these `numbers`."""
     space = problem.space.within(low, high)
     narrow = _with_lanes(problem, space)
     z = np.asarray(space.shares(np.clip(numbers, low, high)))
@@ -258,7 +289,7 @@ def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.nd
     point = point.take(np.flatnonzero(point.exists()))
     if not len(point.z):
         return None
-    ended: Polished = polish(narrow, point, max(options.polishing, 20), lambda *_: None)
+    ended: Polished = polish(narrow, point, polishing, lambda *_: None)
     kept = _of_their_mode(narrow, ended.point)
     broken = np.where(kept.exists(), ended.violation, np.inf)
     if not np.any(np.isfinite(broken)):

@@ -1,6 +1,8 @@
 """Trade-offs against dense scans: every machine of a front is one that no other machine beats."""
 
 import itertools
+import sys
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -115,3 +117,16 @@ def test_the_figure_of_a_front_has_the_first_quantity_upward():
     assert [text.get_text() for text in axis.texts] == ["0", "1", "2"]
     np.testing.assert_allclose([text.xy for text in axis.texts], shown, rtol=1e-12)
     assert front.summary().splitlines()[:2] == ["mass, kg against sag, mm", "  10  3"]
+
+
+def test_interrupt_of_a_search_ends_the_front(monkeypatch):
+    searches = []
+
+    def interrupted(space, objective, **options):
+        searches.append(objective)
+        return SimpleNamespace(status_name="interrupted", scene=SCENE)
+
+    monkeypatch.setattr(sys.modules[pareto.__module__], "synthesize", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pareto(DesignSpace(SCENE, TWO), FLAT[0], BOWL[0])
+    assert len(searches) == 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from two_springs import FREE, SCENE, plain, point_of
 
-from optimize import DesignSpace, expected, jam_frequency, largest
+from optimize import DesignSpace, expected, hold, jam_frequency, largest, support_frequency_squared, synthesize
 from optimize.search import find as find_module
 from optimize.search.find import Found, Options, _away, _few, _of_their_mode, _spread, choose, find
 from optimize.search.polish import Optimality
@@ -135,6 +135,45 @@ def test_a_choice_that_is_the_best_anyway_needs_no_bounds():
     assert found.nodes == 0
 
 
+def interrupts(what_begins):
+    """A function that interrupts a search at a step, and the number of steps that it is told afterwards."""
+    after = []
+
+    def tell(what, share):
+        if after or what.startswith(what_begins):
+            after.append(what)
+        if len(after) == 1:
+            raise KeyboardInterrupt
+
+    return tell, after
+
+
+@pytest.mark.parametrize("stage", ["descending", "polishing"])
+def test_interrupt_of_the_first_stage_ends_without_polishing(stage, monkeypatch):
+    steps = []
+    polish = find_module.polish
+    monkeypatch.setattr(find_module, "polish", lambda p, point, n, tell: steps.append(n) or polish(p, point, n, tell))
+    costly = expected(NEAR, {"machine.stiffness": 0.05}, samples=4)
+    tell, _ = interrupts(stage)
+    found = find(problem_of(DesignSpace(SCENE, FREE), costly, [], 4), OPTIONS, tell)
+    assert found.interrupted and steps == {"descending": [0, 0], "polishing": [8, 0, 0]}[stage] and found.drawn == 4
+    assert len(found.point.z) == 1 and found.point.values[0, 0] < 20.0
+
+
+def test_interrupted_search_of_a_demand_is_not_contradictory():
+    space = DesignSpace(SCENE, FREE, [hold(support_frequency_squared(), 300.0)])
+    best = synthesize(space, NEAR, starts=4, iterations=25, polishing=8, progress=interrupts("descending")[0])
+    assert best.status_name == "interrupted" and best.unverified == "the search was interrupted" and best.run is None
+
+
+@pytest.mark.parametrize("stage", ["descending", "choosing"])
+def test_interrupted_choice_is_in_its_catalogue(stage):
+    tell, after = interrupts(stage)
+    problem, found = chosen(tell=tell)
+    numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
+    assert found.interrupted and set(np.round(numbers, 6)) <= set(CATALOGUE) and len(after) == 1
+
+
 def test_choices_keep_demands_or_there_are_none(monkeypatch):
     product = plain("product", lambda x, y: x * y)
     problem, found = chosen([product > 9.0])
@@ -150,7 +189,7 @@ def test_choices_keep_demands_or_there_are_none(monkeypatch):
 def test_between_narrower_bounds_the_best_is_at_them(bounds):
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], 4)
     low, high = (np.array(each) for each in bounds)
-    found = find_module._bounded(problem, low, high, np.array([[3e4, 3e4], [8e4, 1e4]]), OPTIONS)
+    found = find_module._bounded(problem, low, high, np.array([[3e4, 3e4], [8e4, 1e4]]), OPTIONS.polishing)
     numbers = problem.space.within(low, high).numbers(found.point.z)
     np.testing.assert_allclose(numbers, np.clip([[6e4, 5e4]] * 2, low, high), rtol=1e-9)
     np.testing.assert_array_equal(found.bounds, [low, high])
