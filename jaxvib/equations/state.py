@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 from jax import Array
@@ -54,6 +56,16 @@ class ExciterState(eqx.Module):
     spin: Spin | None = None
 
 
+class _Omitted:
+    """Default of an argument for which None is a value."""
+
+    def __repr__(self) -> str:
+        return "..."
+
+
+_OMITTED: Any = _Omitted()
+
+
 class State(eqx.Module):
     """Positions and velocities of all parts; also the time derivative of such a state.
 
@@ -62,7 +74,8 @@ class State(eqx.Module):
     - `displacement` q (nd,), m, and `velocity` q' (nd,), m/s, of the carrier's coordinates; tilts in rad and rad/s; typical:
       0.1 to 10 mm
     - `angle`, `rate`, `rotor`, `spin` of the exciter of a scene with one exciter, see `ExciterState`
-    - `exciters`: instead of these, an `ExciterState` for each exciter
+    - `exciters`: instead of these, an `ExciterState` for each exciter. Beside a single one they replace its values, so that
+      `dataclasses.replace(state, spin=None)` returns the state without a spin
 
     **Attributes**: `displacement`, `velocity` and `exciters`. Those of the only exciter are `angle`, `rate`, `rotor`, `spin`.
 
@@ -80,17 +93,22 @@ class State(eqx.Module):
         self,
         displacement: Array,
         velocity: Array,
-        angle: tuple[Array, ...] = (),
-        rate: tuple[Array, ...] = (),
-        rotor: tuple[Array, Array] | None = None,
-        spin: Spin | None = None,
+        angle: tuple[Array, ...] = _OMITTED,
+        rate: tuple[Array, ...] = _OMITTED,
+        rotor: tuple[Array, Array] | None = _OMITTED,
+        spin: Spin | None = _OMITTED,
         *,
         exciters: Sequence[ExciterState] | None = None,
     ):
-        if exciters is not None and (angle or rate or rotor is not None or spin is not None):
-            raise InputError("exciters", "are given together with angle, rate, rotor or spin; give these to an ExciterState")
+        named = {"angle": angle, "rate": rate, "rotor": rotor, "spin": spin}
+        given = {name: value for name, value in named.items() if value is not _OMITTED}
         self.displacement, self.velocity = displacement, velocity
-        self.exciters = (ExciterState(angle, rate, rotor, spin),) if exciters is None else tuple(exciters)
+        self.exciters = (ExciterState(**given),) if exciters is None else tuple(exciters)
+        if exciters is not None and given:
+            if len(self.exciters) != 1:
+                problem = f"are {len(self.exciters)}, together with {' and '.join(given)}; give these to an ExciterState"
+                raise InputError("exciters", problem)
+            self.exciters = (dataclasses.replace(self.exciters[0], **given),)
 
     @property
     def exciter(self) -> ExciterState:

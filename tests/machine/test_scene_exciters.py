@@ -1,5 +1,7 @@
 """Exciters of a scene: both forms of the constructor, singular properties, names, files, bad input."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,6 +40,16 @@ def test_tree_at_replaces_parts_through_singular_properties(where):
     state = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(2),), (jnp.zeros(2),))
     ones = jnp.ones(2)
     assert eqx.tree_at(lambda s: s.angle[0], state, ones).exciters[0].angle[0] is ones
+
+
+def test_replaced_values_of_a_state_reach_its_exciter():
+    state = jv.State(0, 1, (2, 3), (4, 5), (6, 7), jv.Spin(8, (9,)))
+    assert dataclasses.replace(state, spin=None) == jv.State(0, 1, (2, 3), (4, 5), (6, 7))
+    assert dataclasses.replace(state, velocity=9, rotor=None, angle=(3, 2)).exciters == (
+        jv.ExciterState((3, 2), (4, 5), None, jv.Spin(8, (9,))),
+    )
+    with pytest.raises(jv.InputError, match=r"^exciters are 2, together with spin; give these to an ExciterState"):
+        dataclasses.replace(jv.State(0, 1, exciters=[jv.ExciterState()] * 2), spin=None)
 
 
 def test_leaves_of_one_exciter_keep_their_order():
