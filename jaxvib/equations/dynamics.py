@@ -28,6 +28,7 @@ from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
 
 
@@ -171,7 +172,7 @@ def vector_field(scene: Scene) -> Dynamics:
     equation (1). The gyroscopic force depends on the rotor speed only. The term of the rotor's acceleration, C theta'' psi / 2,
     is neglected as in the paper.
     """
-    return dynamics_of(assemble(scene))
+    return dynamics_of(assemble(validate_scene(scene)))
 
 
 def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_solve) -> Dynamics:

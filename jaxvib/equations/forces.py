@@ -29,6 +29,7 @@ from jaxvib.machine.effects.terms import (
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached
 
 __all__ = ["energy", "foundation_force", "normal_force", "power"]
@@ -54,7 +55,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
 
     Source: the antiphase paper, equation (7).
     """
-    return assemble(scene).foundation_force(state.displacement, state.velocity)
+    return assemble(validate_scene(scene)).foundation_force(state.displacement, state.velocity)
 
 
 @validated
@@ -86,7 +87,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 
     Source: the energy of the equations in `vector_field`, derived here.
     """
-    return _energy(scene, state, _at_time(t, state))
+    return _energy(validate_scene(scene), state, _at_time(t, state))
 
 
 def _at_time(t: Array | float, state: State) -> Any:
@@ -168,7 +169,7 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
 
     Source: derived here from `vector_field`; for the drag of platforms the antiphase paper, equation (2).
     """
-    return _power(scene, _at_time(t, state), state)
+    return _power(validate_scene(scene), _at_time(t, state), state)
 
 
 @cached
@@ -278,7 +279,7 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
     Source: Strautmanis et al. 2018, equation (10), with the acceleration of the rotor.
     """
-    return _normal_force(scene, _at_time(t, state), state)
+    return _normal_force(validate_scene(scene), _at_time(t, state), state)
 
 
 @cached

@@ -32,8 +32,9 @@ if TYPE_CHECKING:
     import control
     import scipy.signal
 
-_MAX_RESIDUAL = 1e-6
-"""Largest residual acceleration of a load in a jam, relative to the acceleration by its drag alone."""
+_MAX_RESIDUAL = 1e-6, 1e-3
+"""Largest residual acceleration of a load in a jam, relative to the acceleration by its drag alone, in double and in single
+precision."""
 
 _AT_REST = (
     "linear machine with the masses of its loads at their places, at the rotor speed {speed:.6g} rad/s; inputs are forces on "
@@ -212,7 +213,7 @@ def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
     averaged_field(scene)  # raises errors for effects outside the averaged equations before anything is compiled
     found = jax.tree.map(np.asarray, _jam_matrices(scene, jam.omega, phase, jam.displacement))
     (a, b, c, d), x0, y0, residual = found
-    if not residual < _MAX_RESIDUAL:
+    if not residual < _MAX_RESIDUAL[residual.dtype.itemsize < 8]:
         problem = f"is not an equilibrium of the averaged equations of this scene (relative residual {float(residual):.1e})"
         raise InputError("at", f"{problem}; use a jam of this scene, or for different loads one from phase_jams(scene)")
     carrier, loads = scene.machine.structure(), range(1, scene.loads.count + 1)

@@ -17,15 +17,18 @@ from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
+from jaxvib.runtime.devices import float_dtype
 from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
 
-_VALID_SCENES: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
-"""Validated scenes by their `id`. Scenes are immutable, therefore a validated scene stays valid."""
+_VALID_SCENES: weakref.WeakValueDictionary[tuple[int, np.dtype], Scene] = weakref.WeakValueDictionary()
+"""Validated scenes by their `id` and the precision of their numbers. Scenes are immutable, therefore they stay valid."""
 
 
 def validate_scene(scene: Scene) -> Scene:
     """Return the scene with arrays for all its numbers. If no number is traced, check that the constructors allow them.
+
+    The arrays have the precision in which JAX computes, whatever the setting was when the scene was made.
 
     **Raises** `InputError` for an object that is not a scene, and for a number that is not allowed.
 
@@ -39,7 +42,8 @@ def validate_scene(scene: Scene) -> Scene:
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
-    if _VALID_SCENES.get(id(scene)) is scene:
+    precision = float_dtype()
+    if _VALID_SCENES.get((id(scene), precision)) is scene:
         return scene
     leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
     one = ".exciters[0]" if len(scene.exciters) == 1 else "-"
@@ -55,7 +59,7 @@ def validate_scene(scene: Scene) -> Scene:
                 _require_valid.__wrapped__(_SceneKey(numbers, scene))
             else:
                 _require_valid(_SceneKey(numbers, scene))
-        _VALID_SCENES[id(scene)] = scene
+        _VALID_SCENES[id(scene), precision] = scene
     return scene
 
 
@@ -150,7 +154,7 @@ def _number(name: str, leaf: object) -> Array:
     """Return a leaf as a floating-point array. **Raises** `InputError` for text, and for values that are not finite."""
     if not isinstance(leaf, str):
         require_real(leaf, "", name)
-    if not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact):
+    if not isinstance(leaf, jax.Array) or leaf.dtype != float_dtype():
         try:
             leaf = jnp.asarray(leaf, dtype=float)
         except (TypeError, ValueError) as error:

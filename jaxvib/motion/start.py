@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Literal, cast, get_args
 
 import equinox as eqx
@@ -236,7 +237,7 @@ def _require_shorter(duration: float, end: float) -> None:
 
 
 def validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None = None) -> State:
-    """Return a user's initial state, completed by the loads' own rotation.
+    """Return a user's initial state in the precision in which JAX computes, completed by the loads' own rotation.
 
     **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `separation` is given beside it.
     """
@@ -264,7 +265,7 @@ def validate_state(scene: Scene, state: State, mode: int | None, separation: Num
             elif own.angle or own.rate:
                 raise InputError("start.angle", "is given, but this exciter has no loads; leave angle and rate out")
     require_start(scene, state)
-    return with_spin(scene, state)
+    return with_spin(scene, jax.tree.map(partial(jnp.asarray, dtype=float), state))
 
 
 def _require_shapes(state: State | ExciterState, **lengths: int) -> None:

@@ -20,7 +20,7 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 
-__all__ = ["arrays_on_device", "known", "numpy_of", "on_device", "shared_devices", "take_a_device"]
+__all__ = ["arrays_on_device", "float_dtype", "known", "numpy_of", "on_device", "shared_devices", "take_a_device"]
 
 _VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 """Environment variables that restrict a process to some of the machine's accelerators."""
@@ -41,6 +41,11 @@ def shared_devices() -> list[object]:
 def known(value: ArrayLike) -> Any:
     """Convert a value to NumPy, because arithmetic on JAX arrays would compile a program; return a tracer unchanged."""
     return value if traced(value) else np.asarray(value)
+
+
+def float_dtype() -> np.dtype:
+    """Return the type of the floating-point numbers in which JAX computes at present."""
+    return np.dtype(np.float64 if jax.config.jax_enable_x64 else np.float32)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def numpy_of(tree: PyTree) -> ModuleType:

@@ -17,6 +17,7 @@ from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.mount import scaled
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory, mean_speeds
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -176,7 +177,7 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     >>> bool(run.regime.name == jv.RegimeName.jammed), int(run.regime.mode)
     (True, 1)
     """
-    return _regime(scene, stretch)
+    return _regime(validate_scene(scene), stretch)
 
 
 @cached

@@ -18,6 +18,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics import radau
+from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
 from jaxvib.units import count
 
@@ -109,7 +110,7 @@ def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | N
     **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor so slow that the allowed steps do
     not resolve a vibration of the carrier that outlasts the turn; the method would damp it.
     """
-    asked, most = np.asarray(speeds), 0.1 * float(jnp.finfo(float).max) ** 0.5
+    asked, most = np.asarray(speeds), 0.1 * float(np.finfo(float_dtype()).max) ** 0.5
     wrong = asked[~((asked > 0.0) & (asked < most))]
     if wrong.size:
         raise InputError("speeds", f"contain {wrong[0]:g} rad/s; they must be greater than 0 and below {most:.1e}")

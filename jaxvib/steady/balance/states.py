@@ -24,6 +24,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
+from jaxvib.runtime.devices import float_dtype
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.monodromy import (
     BATCH,
@@ -209,7 +210,7 @@ def _imbalance(scene: Scene) -> complex:
     moment = [complex(*map(float, each.moment)) for each in thrown]
     levers = scene.mount().rotor_levers[1:] if static else ()
     moment += [float(lever) * each for lever in levers if lever is not None for each in static]
-    if abs(sum(moment)) > 1e-9 * max(map(abs, moment), default=0.0):
+    if abs(sum(moment)) > _rounding() * max(map(abs, moment), default=0.0):
         problem = (
             "tilt the rotor: loads at one point cannot cancel a moment imbalance, or a static imbalance at another point "
             "(it acts at the mass centre of the rotor); leave it out, or simulate"
@@ -381,6 +382,11 @@ def stability_changes(
     return (left + right) / 2.0
 
 
+def _rounding() -> float:
+    """Return the relative difference from 0 that counts as rounding."""
+    return max(1e-9, 32.0 * float(np.finfo(float_dtype()).eps))
+
+
 def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
     """Return validated angles at which the loads cancel each other, and the number of their neutral directions."""
     sides, imbalance = _sides(circular_loads(scene)), _imbalance(scene)
@@ -393,7 +399,7 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
             raise failure(states.status)
         angles = states.angles[0]
     angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
-    if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > 1e-9 * sides.sum():
+    if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > _rounding() * sides.sum():
         raise InputError("angles", "leave an unbalance; use angles from balanced_states(scene).angles")
     _require_undisturbed(scene, angles)
     return angles, _neutral(sides, angles, turns=imbalance == 0.0).shape[1]
@@ -407,7 +413,7 @@ def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: in
 
 
 def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
-    if float(_disturbance(scene, angles)) > 1e-9 * float(scene.drive.speed) ** 2:
+    if float(_disturbance(scene, angles)) > _rounding() * float(scene.drive.speed) ** 2:
         raise InputError("effects", "disturb the balanced motion (gravity does); leave them out, or simulate")
 
 

@@ -30,6 +30,8 @@ from jaxvib.runtime.operations import program_text
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from scenes import BALLS, ROTOR, TWO_MASS, loads, machines, published
 
+jax.config.update("jax_enable_x64", True)  # before the parts below are made
+
 RECORDED = pathlib.Path(__file__).parents[2] / "data" / "golden.json"
 
 SPEED = jv.ConstantSpeed(120.0)
@@ -245,5 +247,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
     sys.exit(main())
