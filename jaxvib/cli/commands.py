@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from jaxvib.motion.start import Start
 
 
-_MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus")
-"""Names of `jaxvib.machine.files.TEMPLATES`, repeated here because that import is slow."""
+_SCREENS = ("linear-screen", "circular-screen", "feeder")
+_MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus", *_SCREENS)
+"""Names of `TEMPLATES` and `SCREENS` in `jaxvib.machine`, repeated here because that import is slow."""
 
 
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
@@ -28,15 +29,16 @@ _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "r
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep` or `identify`.
 
-    KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor or torus for a machine; design for `optimize`; sweep (a
-    study) for `sweep`; measurement (a recorded swing) for `identify`."""
+    KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus, linear-screen, circular-screen or feeder for a
+    machine; design for `optimize`; sweep (a study) for `sweep`; measurement (a recorded swing) for `identify`."""
     from jaxvib.machine.files import TEMPLATES
+    from jaxvib.machine.structures.screens import SCREENS
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
     from optimize.files import TEMPLATE as DESIGN
 
     files = {"design": DESIGN, "measurement": MEASUREMENT, "sweep": STUDY}
-    text = files[kind] if kind in files else TEMPLATES[kind.replace("-", "_")]
+    text = files[kind] if kind in files else {**TEMPLATES, **SCREENS}[kind.replace("-", "_")]
     name = "study" if kind == "sweep" else kind
     path = output.file(f"{name}.toml" if kind in files else "machine.toml")
     if path is None:

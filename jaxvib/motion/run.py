@@ -151,7 +151,7 @@ class Run(AbstractMeasured, PointAnswers, Result):
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
-                f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
+                f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
                 f"{rotor} at {speed_text(rotors, 6)}",
                 f"  {self.extent(self.scene)}",
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
@@ -159,6 +159,12 @@ class Run(AbstractMeasured, PointAnswers, Result):
                 *self._detachment(),
             ]
         )
+
+    @property
+    def _turning(self) -> str:
+        """Name of what `load_speed` belongs to."""
+        has_loads = [exciter.loads is not None for exciter in self.scene.exciters]
+        return "loads" if all(has_loads) else "loads and exciters" if any(has_loads) else "exciters"
 
     def _detachment(self) -> list[str]:
         times = np.asarray(self.detached)

@@ -61,6 +61,7 @@ class PlaneView(View):
         moved = [*(outline / self.scale), *self._supports, *self._axes, np.zeros(2)]
         self._rows = np.stack([np.asarray(machine.rows_at(jnp.asarray(at))) for at in moved])
         self._moved, self._corners = np.asarray(moved), len(outline)
+        self._below = 0.5 * float(np.min(outline[:, 0]) + np.max(outline[:, 0])), float(np.min(outline[:, 1])) - 0.12
         self.limits = self._limits(outline)
 
     def _struts(self, k: int, points: np.ndarray) -> list[_Strut]:
@@ -109,8 +110,8 @@ class PlaneView(View):
         small: Look = {"fontsize": "small"}
         mass, inertia = float(self.mass[0, 0]), float(self.mass[2, 2])
         words = f"M = {shown(mass, 'kg')}, J = {shown(inertia, 'kg m²')}"
-        left, _, bottom, top = self.limits
-        found = [Text(left + 0.1, top - 0.1, words, {**small, "va": "top"})]
+        bottom = self.limits[2]
+        found = [Text(*self._below, words, {**small, "ha": "center", "va": "top"})]
         seen: dict[int, list[_Strut]] = {}
         for strut in self.struts:
             seen.setdefault(strut.support, []).append(strut)

@@ -66,11 +66,15 @@ def _draw_deck(axis: Axes, view: View, deck: Deck) -> None:
     if view.scene.machine.places != "plane":
         raise InputError("deck", f"needs a body in a plane, not a machine of kind {quoted(view.scene.machine.kind)}")
     points, amplitude = np.asarray(deck.points), np.asarray(deck.amplitude)
-    magnify = magnification(points, amplitude)
-    for path in ellipses(points, amplitude, magnify):
-        axis.plot(*(view.scale * path).T, color=COLORS[1], lw=1.4, zorder=4.0)
-        axis.plot(*(view.scale * path[0]), "o", color=COLORS[1], ms=3.5, zorder=4.0)
-    _, right, bottom, _ = view.limits
+    magnify = min(magnification(points, amplitude), float(f"{0.35 / (view.scale * np.max(np.abs(amplitude))):.1g}"))
+    paths = [view.scale * path for path in ellipses(points, amplitude, magnify)]
+    for path in paths:
+        axis.plot(*path.T, color=COLORS[1], lw=1.4, zorder=4.0)
+        axis.plot(*path[0], "o", color=COLORS[1], ms=3.5, zorder=4.0)
+    left, right, bottom, top = view.limits
+    (low_x, low_y), (high_x, high_y) = (extreme(np.concatenate(paths), axis=0) for extreme in (np.min, np.max))
+    axis.set_xlim(min(left, low_x - 0.1), max(right, high_x + 0.1))
+    axis.set_ylim(min(bottom, low_y - 0.1), max(top, high_y + 0.1))
     note = f"ellipses drawn {magnify:g} x as large"
     axis.text(right, bottom, note, ha="right", va="bottom", fontsize="x-small", color="#555555")
 

@@ -10,13 +10,16 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
+from jaxvib.machine.structures.screens import SCREENS
 
 
-@pytest.mark.parametrize("kind", TEMPLATES)
+@pytest.mark.parametrize("kind", [*TEMPLATES, *SCREENS])
 def test_new_prints_a_scene_file_that_loads(typed, kind):
     code, out, _ = typed("new", kind)
     assert code == 0 and f" {kind.replace('_', '-')}" in typed("new", "--help")[1]
-    assert jv.scene_from_toml(out).machine.kind == {"torus": "planar_rotor"}.get(kind, kind)
+    assert jv.scene_from_toml(out).machine.kind == {"torus": "planar_rotor", **dict.fromkeys(SCREENS, "plane_body")}.get(
+        kind, kind
+    )
     assert "#" in out and "kg" in out
 
 
