@@ -13,11 +13,9 @@ from jax import Array
 from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling, synthesized
 from jaxvib.numerics.linalg import small_solve, solve_in_turn
+from jaxvib.steady.orbits.newton import Linearized, newton
 
 Parameter = Literal["omega", "rotor_speed"]
-
-_MAX_NEWTON_STEPS = 60
-"""Maximum number of Newton steps, rejected ones included; ordinary points take 4 to 6."""
 
 
 def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
@@ -155,25 +153,6 @@ def _speed_pair(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]
     return (value, x) if given == "omega" else (x, value)
 
 
-class _NewtonState(NamedTuple):
-    """State of Newton's iteration.
-
-    **Attributes**: `steps` taken; the best unknowns so far, `deviation` and `x`; `norm` of their residuals and the `scale` of
-    the torques in it; `change`: the Newton step there; `length`: the largest fraction of it that may be taken; `done`: True if
-    the iteration ends; `stalled`: True if it ends because no fraction of the step reduces the residuals.
-    """
-
-    steps: Array
-    deviation: Array
-    x: Array
-    norm: Array
-    scale: Array
-    change: Array
-    length: Array
-    done: Array
-    stalled: Array
-
-
 @eqx.filter_custom_jvp
 def _newton(
     model: CoincidentModel,
@@ -188,39 +167,26 @@ def _newton(
     if is_known:
         return deviation, start
     on = grid_of(*grid)
-    tiny = 128.0 * jnp.finfo(value.dtype).eps
     # At a given load speed the response of the carrier is known, unless it depends on the rotor speed.
     fixed = given == "omega" and model.linear.mount.gyroscopic is None
     known = _port_response(model, on, value, start) if fixed else None
-    no = jnp.asarray(False)
 
-    def moved(now: _NewtonState) -> tuple[Array, Array]:
+    def move(unknowns: tuple[Array, Array], change: Array, length: Array) -> tuple[Array, Array]:
+        deviation, x = unknowns
         # A step changes deviations by at most 1 rad and the load speed by at most half: the linear model is useless beyond.
-        most = 1.0 / jnp.maximum(jnp.max(jnp.abs(now.change[:-1])), 1e-300)
+        most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
         if given == "rotor_speed":
-            most = jnp.minimum(most, 0.5 * jnp.abs(now.x / now.change[-1]))
-        change = jnp.minimum(now.length, most) * now.change
-        return now.deviation + change[:-1].reshape(now.deviation.shape), now.x + change[-1]
+            most = jnp.minimum(most, 0.5 * jnp.abs(x / change[-1]))
+        change = jnp.minimum(length, most) * change
+        return deviation + change[:-1].reshape(deviation.shape), x + change[-1]
 
-    def step(now: _NewtonState) -> _NewtonState:
-        there = moved(now)
-        residual, matrix, scale = _linearize(model, on, given, value, *there, known)
+    def linearize(deviation: Array, x: Array) -> Linearized:
+        residual, matrix, scale = _linearize(model, on, given, value, deviation, x, known)
         norm = jnp.sqrt(jnp.mean(residual[:-1] ** 2))
-        # Newton's method squares the reduction of the residuals: if the next step will end below rounding, the residuals after
-        # it need no evaluation. The reduction by the first step, from psi = 0, allows no such prediction.
-        predicted_converged = (norm * (norm / now.norm) ** 2 < tiny / 16.0 * scale) & (now.steps > 0)
-        change = -solve_in_turn(matrix, residual)
-        done = (norm < tiny * scale) | predicted_converged
-        then = _NewtonState(now.steps + 1, *there, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), done, no)
-        stalled = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(now.change)) | (now.norm < 16.0 * tiny * now.scale)
-        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, done=stalled, stalled=stalled)
-        return jax.tree.map(lambda a, b: jnp.where(norm < now.norm, a, b), then, stay)
+        return Linearized(norm, scale, lambda: -solve_in_turn(matrix, residual))
 
     one, change = jnp.ones_like(start), jnp.zeros(deviation.size + 1, deviation.dtype)
-    # The first iteration only evaluates the residuals at the start, since the initial norm is infinite.
-    begin = _NewtonState(jnp.asarray(-1), deviation, start, jnp.inf * one, one, change, one, no, no)
-    end = jax.lax.while_loop(lambda now: (now.steps < _MAX_NEWTON_STEPS) & ~now.done, step, begin)
-    return moved(end._replace(change=jnp.where(end.done & ~end.stalled, end.change, 0.0)))
+    return newton(linearize, move, (deviation, start), change, one)
 
 
 @_newton.def_jvp
