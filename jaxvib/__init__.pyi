@@ -60,6 +60,7 @@ from jaxvib.steady.shapes import ModeShapes, mode_shapes
 from jaxvib.steady.orbits.diagram import ExactBranches
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus
+from jaxvib.steady.orbits.synchronous import SynchronousOrbit, SynchronousStatus, synchronous_orbit
 from jaxvib.study.maps.stability_onset import stability_map, stability_onset
 
 # Auto-balancing, whirl
@@ -214,6 +215,9 @@ __all__ = [
     "Orbit",
     "OrbitStatus",
     "ExactBranches",
+    "synchronous_orbit",
+    "SynchronousOrbit",
+    "SynchronousStatus",
     "stability_map",
     "stability_onset",
     # Auto-balancing, whirl

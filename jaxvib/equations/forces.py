@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import dynamics_of
-from jaxvib.equations.exciter import ExciterDynamics
-from jaxvib.equations.model import assemble
+from jaxvib.equations.dynamics import Dynamics, dynamics_of
+from jaxvib.equations.exciter import ExciterDynamics, RotorDynamics
+from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.sliding import contact_force, dot, kinematics
 from jaxvib.equations.state import ExciterState, State
 from jaxvib.errors import InputError
@@ -32,7 +32,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached
 
-__all__ = ["energy", "foundation_force", "normal_force", "power"]
+__all__ = ["drive_torques", "energy", "foundation_force", "normal_force", "power"]
 
 
 @validated
@@ -188,18 +188,57 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
             given.append(spun)
             lost += losses
         driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
-        motor = dynamics.drive.torque_and_inertia(t, driven)
-        if motor is not None:
-            given.append(driven * motor[0])
-            continue
-        torque = braking + _imbalance_rate(exciter, mount, turn) @ change.velocity
-        weight = dynamics.weight(t, own)
-        given.append(driven * (torque if weight is None else torque + weight))
+        given.append(driven * _drive_torque(t, exciter, dynamics, mount, own, change.velocity, (turn, driven, braking)))
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         x, v = rows @ state.displacement, rows @ state.velocity
         if term.resistance is not None:
             lost.append(term.resistance(x, v) @ v)
     return sum(given[1:], given[0]), sum(lost[1:], lost[0])
+
+
+def _drive_torque(
+    t: Array,
+    exciter: Exciter,
+    dynamics: RotorDynamics,
+    mount: Mount,
+    state: ExciterState,
+    acceleration: Array,
+    rotor: tuple[Array, Array, Array],
+) -> Array:
+    """Return the torque of a drive, N m.
+
+    It follows from the `acceleration` of the carrier, and from the angle, the speed relative to the housing and the braking by
+    the loads of the `rotor`.
+    """
+    turn, driven, braking = rotor
+    motor = dynamics.drive.torque_and_inertia(t, driven)
+    if motor is not None:
+        return motor[0]
+    torque = braking + _imbalance_rate(exciter, mount, turn) @ acceleration
+    weight = dynamics.weight(t, state)
+    return torque if weight is None else torque + weight
+
+
+def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tuple[Array, Array]:
+    """Return the torque of each drive in the direction of its rotation, N m, and its power, W, (N,) each.
+
+    `field`: `dynamics_of` the model. Loads that spin or slide are not included.
+    """
+    change, torques, powers = field(t, state), [], []
+    for exciter, dynamics, mount, own in zip(model.scene.exciters, field.exciters, model.mounts, state.exciters, strict=True):
+        turn, speed = dynamics.drive.rotor_angle(t, own.rotor), dynamics.drive.rotor_speed(t, own.rotor)
+        braking = jnp.zeros_like(speed)
+        if isinstance(dynamics, ExciterDynamics):
+            loads = dynamics.loads
+            braking = jnp.sum(loads.resistance(own.angle, own.rate, speed)[0])
+            for term in terms_of(dynamics.effects, ContactFriction):
+                rubbing = term.friction(loads, own.angle, own.rate, speed, total_gravity(dynamics.effects))
+                braking = braking + jnp.sum(rubbing.forces(mount.load_rates(change.velocity))[0])
+        driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
+        torque = _drive_torque(t, exciter, dynamics, mount, own, change.velocity, (turn, driven, braking))
+        torques.append(exciter.direction * torque)
+        powers.append(driven * torque)
+    return jnp.stack(torques), jnp.stack(powers)
 
 
 def _load_power(

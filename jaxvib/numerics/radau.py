@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -9,7 +12,7 @@ from numpy.polynomial import legendre
 
 from jaxvib.numerics.linalg import small_solve
 
-__all__ = ["NODES", "steps_for", "transition"]
+__all__ = ["NODES", "flow", "steps_for", "transition"]
 
 _STAGES = 6
 
@@ -69,3 +72,17 @@ def transition(slopes: Array, h: float | Array) -> Array:
     found = small_solve(jnp.eye(stages * m, dtype=slopes.dtype) - matrix, right)
     whole = jnp.concatenate([found, jnp.eye(2 * m, dtype=slopes.dtype)]).reshape(stages + 2, m, 2 * m)
     return jnp.tensordot(forms[:, -1], whole, 1).reshape(2 * m, 2 * m)
+
+
+def flow(slopes: Callable[[Array], Array], size: int, turn: float, steps: int | Array, dtype: jnp.dtype) -> Array:
+    """Transition matrix (2 m, 2 m) of (x, x') over the time `turn` of x'' = P(t) x + R(t) x', in equal steps of `transition`.
+
+    **Arguments**: `slopes(t)`: [P, R] (m, 2 m); `size` m; `steps`, a Python number (then reverse derivatives exist) or a scalar
+    array.
+    """
+    h = jnp.asarray(turn / steps, dtype)
+
+    def step(k: Array, over: Array) -> Array:
+        return transition(jax.vmap(slopes)((k + jnp.asarray(NODES, dtype)) * h), h) @ over
+
+    return jax.lax.fori_loop(0, steps, step, jnp.eye(2 * size, dtype=dtype))

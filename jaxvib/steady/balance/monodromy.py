@@ -76,14 +76,7 @@ def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
         return jnp.concatenate([change.velocity, change.azimuth_rate]) / (sizes * speed**2)
 
     still = jnp.zeros(2 * (nd + n), sizes.dtype)
-    h = jnp.asarray(2.0 * jnp.pi / steps, sizes.dtype)
-
-    def step(k: Array, flow: Array) -> Array:
-        points = (k + jnp.asarray(radau.NODES, sizes.dtype)) * h
-        slopes = jax.vmap(lambda turn: jax.jacfwd(lambda x: acceleration(turn, x))(still))(points)
-        return radau.transition(slopes, h) @ flow
-
-    return jax.lax.fori_loop(0, steps, step, jnp.eye(still.size, dtype=sizes.dtype))
+    return radau.flow(lambda turn: jax.jacfwd(lambda x: acceleration(turn, x))(still), nd + n, 2.0 * np.pi, steps, sizes.dtype)
 
 
 @cached

@@ -35,7 +35,7 @@ from jaxvib.units import count, known_number
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["Orbit", "OrbitStatus", "orbits"]
+__all__ = ["Orbit", "OrbitStatus", "judgement_of", "numbers_of", "orbits", "plot_period", "swing"]
 
 
 _MAX_INTEGRATION_STEPS = 2**17
@@ -138,10 +138,8 @@ class Orbit(Result):
 
     @property
     def judgement(self) -> str:
-        """Text "stable" or "unstable", or that the stability is not known."""
-        if np.isnan(self.multiplier):
-            return "stability unknown"
-        return "stable" if self.stable else "unstable"
+        """Text "stable" or "unstable", or that the stability is unknown."""
+        return judgement_of(self.multiplier, self.stable)
 
     def force_peaks(self) -> Array:
         """Return the greatest foundation force in each of 16 equal parts of the period, N, (16,); the largest is
@@ -172,24 +170,47 @@ class Orbit(Result):
 
         **Returns** a matplotlib figure, or the given `ax`, which has three axes.
         """
-        from jaxvib.draw.results import signals_chart  # slow import
+        deviation = self.deviation_orders, self.deviation_harmonics, "load angle - Ωt, degrees", "load", "all loads"
+        return plot_period(self.orders, self.displacement_harmonics, self.units, deviation, self.force_harmonics, ax)
 
-        theta = np.linspace(0.0, 2.0 * np.pi, 721)
 
-        def signal(harmonics: Array, orders: tuple[int, ...]) -> np.ndarray:
-            return np.real(np.asarray(harmonics) @ np.exp(1j * np.asarray(orders)[:, None] * theta)).T
+def judgement_of(multiplier: Array, stable: Array) -> str:
+    """Return "stable" or "unstable", or that the stability is unknown, for the largest `multiplier` of a motion."""
+    if np.isnan(multiplier):
+        return "stability unknown"
+    return "stable" if stable else "unstable"
 
-        motion = signal(self.displacement_harmonics, self.orders)
-        deviation = np.rad2deg(signal(self.deviation_harmonics, self.deviation_orders))
-        force = signal(self.force_harmonics, self.orders)
-        shown = [f"m{unit}" for unit in dict.fromkeys(self.units)]
-        several = [f"load {k + 1}" for k in range(deviation.shape[1])]
-        panels = [
-            (f"displacement, {' or '.join(shown)}", 1e3 * motion, [f"coordinate {k + 1}" for k in range(motion.shape[1])]),
-            ("load angle - Ωt, degrees", deviation, several if len(several) > 1 else ["all loads"]),
-            ("foundation force, N", force, ["across", "up"][-force.shape[1] :]),
-        ]
-        return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)
+
+def plot_period(
+    orders: tuple[int, ...],
+    displacement: Array,
+    units: tuple[str, ...],
+    deviation: tuple[tuple[int, ...], Array, str, str, str],
+    force: Array,
+    ax: Onto,
+) -> Drawn:
+    """Plot a period of a motion over the angle Omega t from its harmonics.
+
+    `deviation`: orders and harmonics of the bodies' deviations, the title of their panel, and the names of one of several
+    bodies and of a single one.
+    """
+    from jaxvib.draw.results import signals_chart  # slow import
+
+    theta = np.linspace(0.0, 2.0 * np.pi, 721)
+
+    def signal(harmonics: Array, orders: tuple[int, ...]) -> np.ndarray:
+        return np.real(np.asarray(harmonics) @ np.exp(1j * np.asarray(orders)[:, None] * theta)).T
+
+    deviation_orders, angles, title, one, alone = deviation
+    motion, turned, forces = signal(displacement, orders), np.rad2deg(signal(angles, deviation_orders)), signal(force, orders)
+    shown = " or ".join(f"m{unit}" for unit in dict.fromkeys(units))
+    several = [f"{one} {k + 1}" for k in range(turned.shape[1])]
+    panels = [
+        (f"displacement, {shown}", 1e3 * motion, [f"coordinate {k + 1}" for k in range(motion.shape[1])]),
+        (title, turned, several if len(several) > 1 else [alone]),
+        ("foundation force, N", forces, ["across", "up"][-forces.shape[1] :]),
+    ]
+    return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)
 
 
 @cached
@@ -208,7 +229,7 @@ def _at(orbit: Orbit, theta: Array | np.ndarray) -> tuple[Array, Array, tuple[Ar
 
 @cached
 def _relative_amplitude(orders: tuple[int, ...], displacement: Array, i: int, j: int) -> Array:
-    return _swing(np.asarray(orders), displacement[i - 1 : i] - displacement[j - 1 : j])[0]
+    return swing(np.asarray(orders), displacement[i - 1 : i] - displacement[j - 1 : j])[0]
 
 
 @cached
@@ -345,7 +366,7 @@ def _motion_quantities(
     velocity = motion.omega * (harmonics.displacement * grid.orders[None])
     power = power + model.linear.dissipated(velocity)
     nd = harmonics.displacement.shape[0]
-    swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
+    swings = swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
     # Components of the foundation force are combined as those of a vector.
     force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
     contact_torque = _least_contact_torque(model, grid, motion, harmonics)
@@ -408,14 +429,14 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     return side * (jax.lax.fori_loop(0, 3, halley, (starts + width / each * best, begin))[1] @ both)
 
 
-def _swing(orders: np.ndarray, harmonics: Array) -> Array:
+def swing(orders: np.ndarray, harmonics: Array) -> Array:
     """Return (max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
     symmetric = bool(np.all(orders % 2 == 1))  # the signal changes its sign in half a period
 
     def highest(c: Array) -> Array:
         return greatest(_peaks(orders, c, half=symmetric))  # maximum between samples, maybe not next to the largest one
 
-    def swing(c: Array) -> Array:
+    def one(c: Array) -> Array:
         return highest(c) if symmetric else (highest(c) + highest(-c)) / 2.0
 
-    return jax.vmap(swing)(harmonics)
+    return jax.vmap(one)(harmonics)

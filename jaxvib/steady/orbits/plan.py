@@ -6,18 +6,22 @@ Only this module tests which numbers are known. Under a JAX transformation the n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.equations.coincident import coincident_model
-from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
-from jaxvib.errors import InputError
-from jaxvib.machine.effects.base import has_half_turn
+from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag, require_terms
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.drive import ConstantSpeed, SwitchedOff
+from jaxvib.machine.effects.base import has_half_turn, has_term
+from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadPotential, RotorImbalance, SupportForce
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import known, numpy_of, on_device
 from jaxvib.runtime.programs import cached
@@ -25,10 +29,10 @@ from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.solve import Parameter
 from jaxvib.steady.orbits.stability import is_stiff
-from jaxvib.units import Number, count, number
+from jaxvib.units import Number, Numbers, count, number, numbers
 from jaxvib.units.known import is_known
 
-__all__ = ["OrbitPlan", "plan_orbit"]
+__all__ = ["OrbitPlan", "SynchronousPlan", "plan_orbit", "plan_synchronous"]
 
 _COLLOCATION_POINTS = (16, 32, 64, 128)
 """Collocation points on half a period, tried in turn until the accuracy is reached."""
@@ -79,7 +83,7 @@ def plan_orbit(
     all_known = is_known(scene, omega, near)
     # Starts have no derivatives. A known scene stays the same object, because it is validated already.
     frozen = scene if all_known else jax.tree.map(lambda x: x if is_known(x) else jax.lax.stop_gradient(x), scene)
-    accuracy = _accuracy(scene, accuracy)
+    accuracy = _accuracy(scene.drive.speed.dtype, accuracy)
     loads = jammed_loads(frozen)
     require_drag(loads)
 
@@ -110,12 +114,12 @@ def plan_orbit(
     )
 
 
-def _accuracy(scene: Scene, accuracy: float | None) -> float:
-    floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
+def _accuracy(dtype: jnp.dtype, accuracy: float | None, usual: float = 1e-9) -> float:
+    floor = 1e3 * float(jnp.finfo(dtype).eps)
     if accuracy is None:
-        return 1e-9 if floor < 1e-9 else 1e-3
+        return usual if floor < 1e-9 else 1e-3
     if not accuracy >= floor:
-        raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
+        raise InputError("accuracy", f"is {accuracy}; {dtype} numbers allow {floor:.0e} and above")
     return accuracy
 
 
@@ -149,3 +153,91 @@ def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
 @cached
 def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
     return is_stiff(coincident_model(jammed_model(scene)), omega, speed)
+
+
+_SYNCHRONOUS_POINTS = (17, 33, 65, 129)
+"""Collocation points on a period, tried in turn until the accuracy is reached."""
+
+_SYNCHRONOUS_TERMS = (GravityField, LoadPotential, RotorImbalance, ContactFriction, SupportForce)
+"""Terms that exact synchronous motions include."""
+
+
+@dataclass(frozen=True)
+class SynchronousPlan:
+    """Plan of an exact synchronous motion.
+
+    **Attributes**: the `scene` with drives that no longer change; starts of `speed`, rad/s, and `phases` (N,), rad; numbers of
+    collocation `points` to try in turn; relative `accuracy`; `is_known`: True if all numbers have values.
+    """
+
+    scene: Scene
+    speed: Array
+    phases: Array
+    points: tuple[int, ...]
+    accuracy: float
+    is_known: bool
+
+
+def plan_synchronous(
+    scene: Scene,
+    regime: Any,
+    *,
+    speed: Number | None,
+    phases: Numbers | None,
+    accuracy: float | None,
+    points: int | None,
+) -> SynchronousPlan:
+    """Validate the arguments of `synchronous_orbit`, and choose start and points. **Raises** `InputError`."""
+    if regime is not None and (speed is not None or phases is not None):
+        raise InputError("regime", "is given beside speed or phases; give one of them")
+    if regime is not None:
+        speed, phases = regime.speed, regime.phases
+    scene = validate_scene(scene)
+    require_terms(scene.all_effects, _SYNCHRONOUS_TERMS, "is|are not part of a synchronous motion")
+    for k, exciter in enumerate(scene.exciters):
+        _require_one_body(exciter, scene.place_of(k))
+        drive = exciter.drive
+        if drive.ideal and not drive.constant:
+            scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, ConstantSpeed(cast(Array, drive.speed)))
+        if isinstance(drive, SwitchedOff):
+            scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive.at, scene, jnp.zeros_like(drive.at))
+    shaken = [e for e in scene.exciters if e.drive.ideal and e.loads is None]
+    motors = [e.drive.speed for e in scene.exciters if not e.drive.ideal and not isinstance(e.drive, SwitchedOff)]
+    if shaken:
+        start = shaken[0].drive.speed
+    elif speed is not None:
+        start = number(speed, "rad/s", "speed", low=0.0, open_low=True)
+    elif motors:
+        start = jnp.mean(jnp.stack(motors))
+    else:
+        raise InputError("speed", "is missing; give the speed near which the loads turn, rad/s, for example speed=95.0")
+    count_of = len(scene.exciters)
+    angles = jnp.zeros(count_of, start.dtype) if phases is None else numbers(phases, "rad", "phases", count_of)
+    all_known = is_known(scene, start, angles)
+    tried = _SYNCHRONOUS_POINTS if all_known else _SYNCHRONOUS_POINTS[1:2]
+    return SynchronousPlan(
+        scene=scene,
+        speed=start,
+        phases=angles,
+        points=tried if points is None else (count(points, "points", low=3, each=256.0),),
+        accuracy=_accuracy(start.dtype, accuracy, 1e-8),
+        is_known=all_known,
+    )
+
+
+def _require_one_body(exciter: Exciter, place: str) -> None:
+    """**Raises** `InputError` for an exciter whose bodies have no common speed."""
+    loads, drive = exciter.loads, exciter.drive
+    if loads is None:
+        return
+    if exciter.unbalance is not None or has_term(exciter.effects, RotorImbalance):
+        problem = (
+            "turn at a speed of their own beside the rotor's unbalance, so that no motion repeats; leave one out, or simulate"
+        )
+        raise InputError(f"{place}loads", problem)
+    if not drive.ideal:
+        raise InputError(f"{place}drive", f"is {quoted(drive.kind)}; loads need a drive of given speed here, use ConstantSpeed")
+    if not loads.circular:
+        raise InputError(f"{place}loads.kind", f"is {quoted(loads.kind)}; this holds for loads on a circle, simulate others")
+    if getattr(loads, "ball_radius", None) is not None and loads.count > 1:
+        raise InputError(f"{place}loads.ball_radius", "is given; here loads are at one angle, leave it out, or simulate")

@@ -17,7 +17,7 @@ from jaxvib.numerics.linalg import small_solve
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
 
-__all__ = ["Floquet", "floquet", "is_stiff", "steps_for"]
+__all__ = ["Floquet", "deflate", "floquet", "is_stiff", "steps_for"]
 
 _PHASE_PER_STEP = 0.7
 """Phase of the carrier's fastest motion in an explicit step, rad. With order 8 the error of the multipliers is then 1e-12 for
@@ -272,7 +272,7 @@ def floquet(
     transition = _implicit_transition if implicit else _explicit_transition
     whole, *relative = transition(equations, grid, harmonics, fields, sizes, h, steps)
     flip: Any = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
-    trivial, rest = jax.vmap(_deflate, in_axes=-1)(flip[:, None, None] * whole, equations.along_orbit(grid, harmonics))
+    trivial, rest = jax.vmap(deflate, in_axes=-1)(flip[:, None, None] * whole, equations.along_orbit(grid, harmonics))
     roots = _eigenvalues(rest).T
     inner = _eigenvalues(jnp.moveaxis(relative[0], -1, 0)).T if relative else None
     return Floquet(roots, inner, trivial)
@@ -415,7 +415,7 @@ def _eigenvalues(matrices: Array) -> Array:
     return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
 
 
-def _deflate(matrix: Array, known: Array) -> tuple[Array, Array]:
+def deflate(matrix: Array, known: Array) -> tuple[Array, Array]:
     """Return the eigenvalue of the eigenvector `known`, and a matrix with the other eigenvalues."""
     unit = known / jnp.linalg.norm(known)
     mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))

@@ -1,0 +1,293 @@
+"""Exact synchronous motions: every exciter turns once in a period of the machine's motion."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.equations.forces import drive_torques
+from jaxvib.equations.state import State
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.orbits.describe import judgement_of, plot_period, swing
+from jaxvib.steady.orbits.plan import SynchronousPlan, plan_synchronous
+from jaxvib.steady.orbits.whole import (
+    PeriodicScene,
+    WholeMotion,
+    body_counts,
+    collocation_error,
+    is_forced,
+    multipliers_of,
+    periodic_scene,
+    solve_whole,
+    state_of,
+)
+from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.units import Number, Numbers, known_number
+
+if TYPE_CHECKING:
+    from jaxvib.draw.style import Drawn, Onto
+
+__all__ = ["SynchronousOrbit", "SynchronousStatus", "synchronous_orbit"]
+
+_UNKNOWN_STEPS = 64
+"""Number of integration steps for the multipliers under a JAX transformation; reverse derivatives need a static number."""
+
+_STABLE_MARGIN = 1e3
+"""Distance of the largest multiplier from 1, in units of rounding, below which a disturbance neither grows nor decays."""
+
+
+class SynchronousStatus(eqx.Enumeration):
+    """Outcomes of a search for a synchronous motion. Each member is the sentence shown to the user."""
+
+    found = "the exciters can turn together in this periodic motion"
+    not_converged = "no periodic motion was found near the given speed and phases: the equations of motion could not be met"
+    different_speeds = "ideal drives turn unbalances at different speeds, so that no motion repeats"
+    under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
+    at_fold = "the motion is at a fold or in a family of equal motions: it has no gradient"
+    refused = REFUSED
+
+
+class _HasSpeedAndPhases(Protocol):
+    """Synchronous regime of the averaged theory."""
+
+    @property
+    def speed(self) -> Array:
+        """Speed Omega, rad/s."""
+        ...
+
+    @property
+    def phases(self) -> Array:
+        """Phases alpha (N,), rad."""
+        ...
+
+
+class SynchronousOrbit(Result):
+    """Exact synchronous motion: th_k = sigma_k (theta + alpha_k + psi_k(theta)), theta = Omega t, psi_k of mean 0.
+
+    th_k is the angle of the rotor of exciter k, or of its loads if its rotor is balanced; sigma_k is the direction of the
+    exciter. Returned by `synchronous_orbit`. Numbers are NaN if the status is `not_converged` or `different_speeds`. Signals
+    are Re sum_k c_k exp(i k theta).
+
+    **Attributes**
+
+    - `status`: a `SynchronousStatus`
+    - `speed` Omega, rad/s, and `phases` alpha (N,), rad
+    - `torque` (N,), N m: mean torque of each drive in the direction of its rotation; `power` (N,), W: its mean power
+    - `amplitude` (nd,), m, of rotations rad, and `foundation_force`, N: zero to peak, (max - min)/2 over the period; for two
+      directions of the force the root of their summed squares
+    - `stable`: True if small disturbances decay, that is `multiplier` < 1
+    - `multiplier`: largest modulus of the non-trivial Floquet multipliers
+    - `multipliers`, complex: all of them; `trivial`: the multiplier that is 1, as computed, NaN if an ideal drive turns an
+      unbalance, because then no shift in time is a motion
+    - `residual` of the equations of motion, relative; `error`: estimate of the relative error of speed and displacements, and
+      of the error of angles, rad, from the number of harmonics
+    - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m, of
+      rotations rad, and `force_harmonics` (nb, K), N, of the orders 0, 1, 2, ...
+    - `scene`
+    """
+
+    status: SynchronousStatus
+    speed: Array = eqx.field(metadata=in_unit("rad/s"))
+    phases: Array = eqx.field(metadata=in_unit("rad", "exciter"))
+    torque: Array = eqx.field(metadata=in_unit("N m", "exciter"))
+    power: Array = eqx.field(metadata=in_unit("W", "exciter"))
+    stable: Array = eqx.field(metadata=in_unit(""))
+    multiplier: Array = eqx.field(metadata=in_unit(""))
+    multipliers: Array = eqx.field(metadata=in_unit("", "floquet"))
+    trivial: Array = eqx.field(metadata=in_unit(""))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N"))
+    residual: Array = eqx.field(metadata=in_unit(""))
+    error: Array = eqx.field(metadata=in_unit(""))
+    deviation_harmonics: Array = eqx.field(metadata=in_unit("rad", "body", "order"))
+    displacement_harmonics: Array = eqx.field(metadata=in_unit("m or rad", "coordinate", "order"))
+    force_harmonics: Array = eqx.field(metadata=in_unit("N", "direction", "order"))
+    scene: Scene = eqx.field(metadata=SCENE)
+
+    @property
+    def judgement(self) -> str:
+        """Text "stable" or "unstable", or that the stability is unknown."""
+        return judgement_of(self.multiplier, self.stable)
+
+    @validated
+    def at(self, theta: Number) -> State:
+        """Return the state of the motion at the angle `theta` = Omega t, rad. For many angles use `jax.vmap(orbit.at)`.
+
+        **Raises** `InputError` for an angle that is not finite.
+        """
+        angle = known_number(theta, "rad", "theta")
+        return _at(self.scene, self.speed, self.displacement_harmonics, self.deviation_harmonics, angle)
+
+    def summary(self) -> str:
+        """Return the result as a few lines of text; amplitudes zero to peak."""
+        units = self.scene.machine.structure().units
+        amplitudes = ", ".join(f"{float(a):.6g} {unit}" for a, unit in zip(self.amplitude, units, strict=True))
+        phases, torques = (", ".join(f"{float(x):.6g}" for x in each) for each in (self.phases, self.torque))
+        return (
+            f"{self.message}\nspeed {float(self.speed):.9g} rad/s, phases {phases} rad, "
+            f"{self.judgement} (largest multiplier {float(self.multiplier):.6g})\n"
+            f"torques {torques} N m, power {float(jnp.sum(self.power)):.6g} W\n"
+            f"amplitude {amplitudes}, foundation force {float(self.foundation_force):.6g} N\n"
+            f"{self.displacement_harmonics.shape[-1] - 1} harmonics leave an error of {float(self.error):.1e}"
+        )
+
+    @validated
+    def plot(self, *, ax: Onto = None) -> Drawn:
+        """Plot a period over the angle Omega t: displacements, angles ahead of uniform rotation, force on the foundation.
+
+        **Returns** a matplotlib figure, or the given `ax`, which has three axes.
+        """
+        orders = tuple(range(self.displacement_harmonics.shape[-1]))
+        deviation = orders, self.deviation_harmonics, "angle - Ωt, degrees", "body", "the body"
+        units = self.scene.machine.structure().units
+        return plot_period(orders, self.displacement_harmonics, units, deviation, self.force_harmonics, ax)
+
+
+@cached
+def _at(scene: Scene, omega: Array, displacement: Array, deviation: Array, theta: Array) -> State:
+    k = np.arange(displacement.shape[-1])
+    wave = jnp.exp(1j * k * theta)
+    q, v = (displacement @ wave).real, omega * (displacement @ (1j * k * wave)).real
+    return state_of(scene, theta, q, v, (deviation @ wave).real, (deviation @ (1j * k * wave)).real, omega)
+
+
+@validated
+def synchronous_orbit(
+    scene: Scene,
+    regime: _HasSpeedAndPhases | None = None,
+    *,
+    speed: Number | None = None,
+    phases: Numbers | None = None,
+    accuracy: float | None = None,
+    points: int | None = None,
+    throw: bool = True,
+) -> SynchronousOrbit:
+    """Return the exact periodic motion in which all exciters turn at one mean speed Omega.
+
+        th_k = sigma_k (theta + alpha_k + psi_k(theta)),  q(theta),    theta = Omega t,    psi_k and q periodic
+
+    The full equations of motion are met at equally spaced points of the period (trigonometric collocation of q and all
+    angles), by Newton's method from the given speed and phases. If they are far from every motion, another motion may be found,
+    or none. The turning body of an exciter is
+
+    - the rotor with its unbalance, without loads. Under a motor, Omega follows from the motors' torques. An ideal drive turns
+      it by th_k = sigma_k n t (phase 0) and gives Omega = n
+    - the loads at one angle on a balanced rotor under an ideal drive: the exciters jam together
+
+    **Arguments**: `scene` with effects without free rotation of loads; and
+
+    - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two numbers:
+    - `speed`: start of Omega, rad/s or text; default: the mean speed of the motors; typical: 60 to 320
+    - `phases` (N,): starts of alpha, rad; default: 0. The first of those that can move is kept, as the origin of time
+    - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-8 (the default; in
+      single precision 1e-3)
+    - `points`: a fixed number of points on a period in place of that; typical: 17 to 65. Under `jit` and `vmap` the default is
+      33, and the status shows if it is too small
+    - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
+
+    **Returns** `SynchronousOrbit`; derivatives of its numbers with respect to every number of the scene by the implicit
+    function theorem, forward and reverse.
+
+    **Raises** `InputError` for wrong arguments and for exciters whose motion has no common period; `ComputationError` with
+    the status "not_converged" or "different_speeds".
+
+    >>> import jaxvib as jv
+    >>> springs = [jv.support(at=(x, 0.0), stiffness=(4e5, 4e5), damping=(2e3, 2e3)) for x in (-1.0, 1.0)]
+    >>> screen = jv.plane_body(mass=2000.0, inertia=600.0, supports=springs)
+    >>> motor = jv.DCMotor("1000 rpm", stall_torque=300.0, inertia=0.5)
+    >>> exciters = [jv.Exciter(drive=motor, unbalance=1.5, at=(x, 0.0), direction=d) for x, d in ((-0.3, 1), (0.3, -1))]
+    >>> orbit = jv.synchronous_orbit(jv.Scene(screen, exciters=exciters), phases=[0.0, 3.1])
+    >>> round(float(orbit.phases[1]), 6), bool(orbit.stable)
+    (3.141593, True)
+
+    Source: Blekhman 1988, Synchronization in Science and Technology, whose averaged motions these continue.
+    """
+    plan = plan_synchronous(scene, regime, speed=speed, phases=phases, accuracy=accuracy, points=points)
+    if not plan.is_known:
+        return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
+    orbit = None
+    for count in plan.points:
+        new = _solve(plan, count)
+        if orbit is None or float(new.error) < float(orbit.error):
+            orbit = new
+        if not float(new.error) > plan.accuracy:  # NaN if there is no motion
+            break
+    assert orbit is not None
+    return outcome(orbit, throw=throw, failures=("not_converged", "different_speeds"))
+
+
+def _solve(plan: SynchronousPlan, points: int, steps: int | None = None) -> SynchronousOrbit:
+    return _solve_program(plan.scene, plan.speed, plan.phases, points, steps, plan.accuracy)
+
+
+@cached
+def _solve_program(
+    scene: Scene, speed: Array, phases: Array, points: int, steps: int | None, accuracy: float
+) -> SynchronousOrbit:
+    """Solve for one synchronous motion with a number of collocation points.
+
+    `steps` for the multipliers in a period; None for as many as the machine needs, without reverse derivatives.
+    """
+    whole, grid, forced = periodic_scene(scene, phases), grid_of(points, False), is_forced(scene)
+    motion = solve_whole(whole, grid, speed, forced=forced)
+    residual, error = collocation_error(whole, grid, motion, forced=forced)
+    multipliers, trivial = multipliers_of(whole, grid, motion, steps, forced=forced)
+    eps = float(jnp.finfo(speed.dtype).eps)
+    largest = jnp.max(jnp.abs(multipliers))
+    is_met = residual < 4096.0 * eps
+    equal = jnp.asarray(True)
+    for exciter in scene.exciters:
+        if exciter.drive.ideal and exciter.loads is None:
+            equal = equal & (jnp.abs(exciter.drive.speed / speed - 1.0) < 64.0 * eps)
+    status = SynchronousStatus.where(error <= accuracy, SynchronousStatus.found, SynchronousStatus.under_resolved)
+    nearest = jnp.min(jnp.abs(multipliers - 1.0))
+    status = SynchronousStatus.where(nearest < eps**0.4, SynchronousStatus.at_fold, status)
+    status = SynchronousStatus.where(is_met, status, SynchronousStatus.not_converged)
+    status = SynchronousStatus.where(equal, status, SynchronousStatus.different_speeds)
+    there = is_met & equal
+    numbers = {
+        **_quantities(whole, grid, motion), "multiplier": largest, "multipliers": multipliers, "trivial": trivial,
+        "error": error,
+    }  # fmt: skip
+    numbers = {name: jnp.where(there, x, jnp.nan) for name, x in numbers.items()}
+    stable = there & (largest < 1.0 - _STABLE_MARGIN * eps)
+    return SynchronousOrbit(status=status, stable=stable, residual=residual, scene=scene, **numbers)
+
+
+def _quantities(scene: PeriodicScene, grid: Grid, motion: WholeMotion) -> dict[str, Array]:
+    """Return the fields of a motion that follow from the coordinates at the points."""
+    x, omega = motion
+    nd, theta, rate = scene.coordinates, jnp.asarray(grid.theta, x.dtype), x @ grid.first.T
+    state = jax.vmap(scene.state, in_axes=(0, 1, 1, None))(theta, x, rate, omega)
+    torque, power = jax.vmap(lambda t, s: drive_torques(scene.model, scene.field, t, s))(theta / omega, state)
+    force = jax.vmap(scene.model.foundation_force)(state.displacement, state.velocity)
+    harmonics = analyzed(jnp.concatenate([x[:nd] * scene.length, x[nd:], force.T]), deviation_analysis(grid))
+    bodies = x.shape[0]
+    displacement, deviation, forces = harmonics[:nd], harmonics[nd:bodies].at[:, 0].add(scene.phases), harmonics[bodies:]
+    swings = swing(grid.deviation_orders, jnp.concatenate([displacement, forces]))
+    counts = body_counts(scene.model.scene)
+    ends = np.cumsum([0, *counts])
+    means = [jnp.mean(deviation[a:b, 0].real) if b > a else jnp.zeros_like(omega) for a, b in itertools.pairwise(ends)]
+    return {
+        "speed": omega,
+        "phases": jnp.stack(means),
+        "torque": jnp.mean(torque, axis=0),
+        "power": jnp.mean(power, axis=0),
+        "amplitude": swings[:nd],
+        "foundation_force": jnp.sqrt(jnp.sum(swings[nd:] ** 2)),
+        "deviation_harmonics": deviation,
+        "displacement_harmonics": displacement,
+        "force_harmonics": forces,
+    }

@@ -1,0 +1,339 @@
+"""Periodic motions of whole scenes: every coordinate by trigonometric collocation of the full equations of motion."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.dynamics import Dynamics, dynamics_of
+from jaxvib.equations.linear import linear_model
+from jaxvib.equations.model import Model, assemble
+from jaxvib.equations.state import ExciterState, State
+from jaxvib.machine.drive import Motor
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.numerics import radau
+from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling
+from jaxvib.numerics.linalg import small_solve, solve_in_turn
+from jaxvib.steady.orbits.newton import Linearized, newton
+from jaxvib.steady.orbits.stability import deflate
+
+__all__ = [
+    "PeriodicScene",
+    "WholeMotion",
+    "body_counts",
+    "collocation_error",
+    "is_forced",
+    "multipliers_of",
+    "periodic_scene",
+    "solve_whole",
+    "state_of",
+]
+
+
+def body_counts(scene: Scene) -> tuple[int, ...]:
+    """Return for each exciter the number of its bodies: its loads; or a motor's rotor; or none, if an ideal drive turns it."""
+    return tuple(int(not e.drive.ideal) if e.loads is None else e.loads.count for e in scene.exciters)
+
+
+def unbalance_of(exciter: Exciter) -> Array:
+    """Return the static moment of an exciter's rotor, or of its loads at one angle, kg m."""
+    if exciter.loads is None:
+        assert exciter.unbalance is not None
+        return exciter.unbalance
+    loads = cast(CircularLoads, exciter.loads)
+    return jnp.sum(jnp.broadcast_to(loads.mass * loads.radius, (loads.count,)))
+
+
+def _inertia_of(exciter: Exciter) -> Array:
+    """Return the moment of inertia of an exciter's loads or of its motor's rotor about the axis, kg m^2."""
+    if exciter.loads is None:
+        return cast(Motor, exciter.drive).inertia
+    loads = cast(CircularLoads, exciter.loads)
+    return jnp.sum(jnp.broadcast_to(loads.inertia_factor() * loads.mass * loads.radius**2, (loads.count,)))
+
+
+def is_forced(scene: Scene) -> bool:
+    """True if an ideal drive turns an unbalance, and therefore gives the period of the motion."""
+    return any(e.drive.ideal and e.loads is None for e in scene.exciters)
+
+
+class PeriodicScene(eqx.Module):
+    """Equations of a scene whose bodies turn once in a period of theta = Omega t.
+
+    The coordinates x (n,) are those of the carrier divided by `length`, and a deviation psi for each body, whose angle is
+    sigma (theta + alpha + psi) with the direction sigma of its exciter.
+
+    **Attributes**: the assembled `model`; `field`, its equations of motion; `length`, m: a typical displacement; `phases` alpha
+    (bodies,), rad. Deviations about them are small, so that their derivatives lose no digits; `feedback`: angular acceleration
+    of a body due to an acceleration of the carrier by `length`.
+    """
+
+    model: Model
+    field: Dynamics
+    length: Array
+    phases: Array
+    feedback: Array
+
+    @property
+    def coordinates(self) -> int:
+        """Number of the carrier's coordinates."""
+        return self.model.carrier.mass.shape[0]
+
+    @property
+    def size(self) -> int:
+        """Number n of all coordinates."""
+        return self.coordinates + sum(body_counts(self.model.scene))
+
+    def state(self, theta: Array, x: Array, rate: Array, omega: Array) -> State:
+        """Return the state at the angle `theta`; `rate` is dx/dtheta."""
+        nd = self.coordinates
+        q, v, deviation = x[:nd] * self.length, rate[:nd] * (self.length * omega), self.phases + x[nd:]
+        return state_of(self.model.scene, theta, q, v, deviation, rate[nd:], omega)
+
+    def acceleration(self, theta: Array, x: Array, rate: Array, omega: Array) -> Array:
+        """Return d^2 x / dtheta^2 by the equations of motion."""
+        change = self.field(theta / omega, self.state(theta, x, rate, omega))
+        parts = [change.velocity / self.length]
+        for exciter, own in zip(self.model.scene.exciters, change.exciters, strict=True):
+            if own.rate:
+                parts.append(exciter.direction * own.rate[0])
+            elif own.rotor is not None:
+                parts.append(exciter.direction * own.rotor[1][None])
+        return jnp.concatenate(parts) / omega**2
+
+    def slopes(self, theta: Array, x: Array, rate: Array, omega: Array) -> tuple[Array, Array]:
+        """Return the derivatives (n, 2 n + 1) of `acceleration` with respect to `x`, `rate` and `omega`, and itself."""
+
+        def of_all(every: Array) -> tuple[Array, Array]:
+            x, rate = jnp.split(every[:-1], 2)
+            found = self.acceleration(theta, x, rate, every[-1])
+            return found, found
+
+        return jax.jacfwd(of_all, has_aux=True)(jnp.concatenate([x, rate, omega[None]]))
+
+
+def state_of(
+    scene: Scene, theta: Array, displacement: Array, velocity: Array, deviation: Array, deviation_rate: Array, omega: Array
+) -> State:
+    """Return the state of a scene from the motion of its carrier, the deviations psi of its bodies, and d psi/dtheta."""
+    ends = np.cumsum([0, *body_counts(scene)])
+    exciters = []
+    for exciter, begin, end in zip(scene.exciters, ends, ends[1:], strict=False):
+        angle = exciter.direction * (theta + deviation[begin:end])
+        rate = exciter.direction * omega * (1.0 + deviation_rate[begin:end])
+        exciters.append(_exciter_state(exciter, angle, rate))
+    return State(displacement, velocity, exciters=exciters)
+
+
+def _exciter_state(exciter: Exciter, angle: Array, rate: Array) -> ExciterState:
+    if exciter.loads is not None:
+        return ExciterState((angle,), (rate,))
+    return ExciterState() if exciter.drive.ideal else ExciterState(rotor=(angle[0], rate[0]))
+
+
+def periodic_scene(scene: Scene, phases: Array) -> PeriodicScene:
+    """Return the equations of a scene for its periodic motions, with a phase (N,) near that of each exciter."""
+    counts = body_counts(scene)
+    model = assemble(scene)
+    length = sum(map(unbalance_of, scene.exciters), jnp.zeros(())) / jnp.min(jnp.diagonal(model.carrier.mass))
+    each = jnp.repeat(phases, np.asarray(counts), total_repeat_length=sum(counts))
+    ratios = [unbalance_of(e) / _inertia_of(e) for e, count in zip(scene.exciters, counts, strict=True) if count]
+    feedback = length * functools.reduce(jnp.maximum, ratios) if ratios else jnp.ones_like(length)
+    return PeriodicScene(model, dynamics_of(model), *jax.lax.stop_gradient((length, each, feedback)))
+
+
+class WholeMotion(NamedTuple):
+    """Periodic motion on a grid: `x` (n, M), see `PeriodicScene`; `omega`, rad/s."""
+
+    x: Array
+    omega: Array
+
+
+class _Collocation(NamedTuple):
+    """Equations at the points of a grid: `residual` (n, M); `scale` of its terms; `matrix`, its derivative by all unknowns."""
+
+    residual: Array
+    scale: Array
+    matrix: Array
+
+
+def _rates(grid: Grid, x: Array) -> tuple[Array, Array]:
+    return x @ grid.first.T, x @ grid.second.T
+
+
+def _residual(scene: PeriodicScene, grid: Grid, x: Array, omega: Array) -> Array:
+    """Return d^2 x/dtheta^2 minus the acceleration by the equations of motion at the points, (n, M)."""
+    rate, second = _rates(grid, x)
+    theta = jnp.asarray(grid.theta, x.dtype)
+    return second - jax.vmap(scene.acceleration, in_axes=(0, 1, 1, None), out_axes=1)(theta, x, rate, omega)
+
+
+def _collocation(scene: PeriodicScene, grid: Grid, x: Array, omega: Array, *, forced: bool) -> _Collocation:
+    """Return residuals and their Jacobian.
+
+    Without forcing, the speed Omega is the last unknown, and the last equation keeps the mean deviation of the first body.
+    """
+    n, m = x.shape
+    rate, second = _rates(grid, x)
+    theta = jnp.asarray(grid.theta, x.dtype)
+    slopes, acceleration = jax.vmap(scene.slopes, in_axes=(0, 1, 1, None), out_axes=(2, 1))(theta, x, rate, omega)
+    by_x, by_rate, by_omega = slopes[:, :n], slopes[:, n : 2 * n], -slopes[:, -1]
+    residual = second - acceleration
+    turning = rate.at[scene.coordinates :].add(1.0)
+    terms = jnp.einsum("ijm,jm->im", jnp.abs(by_x), jnp.abs(x)) + jnp.einsum("ijm,jm->im", jnp.abs(by_rate), jnp.abs(turning))
+    one, same = np.eye(n)[:, None, :, None], np.eye(m)[None, :, None, :]
+    matrix = jnp.asarray(
+        one * grid.second[None, :, None, :]
+        - jnp.moveaxis(by_x, 2, 1)[:, :, :, None] * same
+        - jnp.moveaxis(by_rate, 2, 1)[:, :, :, None] * grid.first[None, :, None, :]
+    ).reshape(n * m, n * m)
+    scale = 1.0 + jnp.max(terms)
+    if forced:
+        return _Collocation(residual, scale, matrix)
+    pin = np.zeros((n, m))
+    pin[scene.coordinates] = 1.0 / m
+    row = jnp.asarray(np.append(pin.ravel(), 0.0), x.dtype)
+    matrix = jnp.concatenate([jnp.concatenate([matrix, by_omega.reshape(-1, 1)], axis=1), row[None]])
+    return _Collocation(residual, scale, matrix)
+
+
+def solve_whole(
+    scene: PeriodicScene, grid: Grid, omega: Array, *, forced: bool, known: WholeMotion | None = None
+) -> WholeMotion:
+    """Solve for the periodic motion of a scene by Newton's method.
+
+        x'' = f(theta, x, x', Omega)    at the M points of the grid,    mean psi of the first body = 0
+
+    **Arguments**: `omega`: the speed of a `forced` motion, otherwise its initial value; `known`: the
+    solution, if it is known. Derivatives with respect to every number of the scene, and with respect to `omega` of a forced
+    motion, follow from the implicit function theorem.
+    """
+    if known is None:
+        start = _start(scene, grid, omega)
+    else:
+        start, omega = known.x, omega if forced else known.omega
+    speed = omega if forced else jax.lax.stop_gradient(omega)
+    points = (grid.theta.size, grid.symmetric)
+    x, w = _solve(scene, speed, jax.lax.stop_gradient(start), grid=points, forced=forced, is_known=known is not None)
+    return WholeMotion(x, w)
+
+
+def _start(scene: PeriodicScene, grid: Grid, omega: Array) -> Array:
+    """Return the linear response of the carrier to bodies that turn uniformly.
+
+    q = Re(Y e^(i theta)),    D(Omega) Y = Omega^2 sum_k S_k B_k^T (1, -i sigma_k) e^(i alpha_k)
+    """
+    model, phases, force = linear_model(scene.model.scene), list(scene.phases), []
+    for exciter, mount, count in zip(model.scene.exciters, model.mounts, body_counts(model.scene), strict=True):
+        own = [phases.pop(0) for _ in range(count)]
+        direction = jnp.stack([(1.0 + 0.0j, -1.0j * exciter.direction)[axis] for axis in mount.axes])
+        force.append(unbalance_of(exciter) * jnp.exp(1j * (own[0] if own else 0.0)) * (mount.rows[0].T @ direction))
+    response = small_solve(model.dynamic_stiffness(omega, model.scene.top_speed), omega**2 * sum(force[1:], force[0]))
+    q = (response[:, None] * np.exp(1j * grid.theta)[None]).real / scene.length
+    still = jnp.zeros((scene.phases.size, grid.theta.size), omega.dtype)
+    return jax.lax.stop_gradient(jnp.concatenate([q.astype(omega.dtype), still]))
+
+
+@eqx.filter_custom_jvp
+def _solve(
+    scene: PeriodicScene, omega: Array, start: Array, *, grid: tuple[int, bool], forced: bool, is_known: bool
+) -> tuple[Array, Array]:
+    if is_known:
+        return start, omega
+    on, size, weight = grid_of(*grid), start.size, jnp.minimum(scene.feedback, 1.0)
+
+    def move(unknowns: tuple[Array, Array], change: Array, length: Array) -> tuple[Array, Array]:
+        x, w = unknowns
+        # A step turns bodies by at most 1 rad and changes the speed by at most half: the linear model is useless beyond.
+        turned = change[:size].reshape(x.shape)[scene.coordinates :]
+        most = 1.0 / jnp.max(jnp.abs(turned), initial=1e-30)
+        if not forced:
+            most = jnp.minimum(most, 0.5 * jnp.abs(w / change[-1]))
+        change = jnp.minimum(length, most) * change
+        return x + change[:size].reshape(x.shape), w if forced else w + change[-1]
+
+    def linearize(x: Array, w: Array) -> Linearized:
+        found = _collocation(scene, on, x, w, forced=forced)
+        right = found.residual.ravel() if forced else jnp.append(found.residual.ravel(), 0.0)
+        # Residuals of the carrier count with the torques that they cause. Otherwise no step that turns bodies would reduce the
+        # norm, because the torques between bodies are small beside the forces on the carrier.
+        carrier, bodies = jnp.split(found.residual, [scene.coordinates])
+        norm = jnp.sqrt((jnp.sum((weight * carrier) ** 2) + jnp.sum(bodies**2)) / size)
+        return Linearized(norm, found.scale, lambda: -solve_in_turn(found.matrix, right))
+
+    change = jnp.zeros(size if forced else size + 1, start.dtype)
+    return newton(linearize, move, (start, omega), change, jnp.ones_like(omega))
+
+
+@_solve.def_jvp
+def _solve_jvp(primals, tangents, *, grid: tuple[int, bool], forced: bool, is_known: bool):
+    scene, omega, start = primals
+    x, w = _solve(scene, omega, start, grid=grid, forced=forced, is_known=is_known)
+    on = grid_of(*grid)
+    by_omega = tangents[1] if forced else None
+    change = eqx.filter_jvp(lambda s, v: _residual(s, on, x, v), (scene, w), (tangents[0], by_omega))[1].ravel()
+    matrix = _collocation(scene, on, x, w, forced=forced).matrix
+    found = -jnp.linalg.solve(matrix, change if forced else jnp.append(change, 0.0))
+    speed = (jnp.zeros_like(w) if by_omega is None else by_omega) if forced else found[-1]
+    return (x, w), (found[: x.size].reshape(x.shape), speed)
+
+
+def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, forced: bool) -> tuple[Array, Array]:
+    """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion.
+
+    The error is that of the speed, relative, of angles, rad, and of displacements, relative to the largest one. It is the
+    change by one Newton step with the residuals at twice as many points, and the highest harmonic.
+    """
+    scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
+    found, nd = _collocation(scene, grid, x, omega, forced=forced), scene.coordinates
+    fine = grid_of(2 * grid.theta.size, grid.symmetric)
+    between = _residual(scene, fine, x @ resampling(grid, fine), omega) @ resampling(fine, grid)
+    change = solve_in_turn(found.matrix, between.ravel() if forced else jnp.append(between.ravel(), 0.0))
+    last = jnp.abs(analyzed(x, deviation_analysis(grid))[:, -1:])
+    off = jnp.concatenate([jnp.abs(change[: x.size].reshape(x.shape)), last], axis=1)
+    largest = jnp.maximum(jnp.max(jnp.abs(x[:nd])), 1e-3)  # phases can leave the carrier at rest
+    each = jnp.max(off[:nd]) / largest, jnp.max(off[nd:], initial=0.0), 0.0 if forced else jnp.abs(change[-1] / omega)
+    return jnp.max(jnp.abs(found.residual)) / found.scale, jnp.max(jnp.stack([jnp.asarray(e) for e in each]))
+
+
+def multipliers_of(
+    scene: PeriodicScene, grid: Grid, motion: WholeMotion, steps: int | None, *, forced: bool
+) -> tuple[Array, Array]:
+    """Return the Floquet multipliers of the full state about a periodic motion, and the trivial one.
+
+    Without forcing the trivial multiplier of a shift in time is not among the others; with forcing it is NaN. `steps` of
+    `radau.flow` in a period; None for as many as the carrier's fastest vibration needs.
+    """
+    x, omega = motion
+    n, orders = x.shape[0], jnp.asarray(grid.deviation_orders, x.dtype)
+    harmonics = analyzed(x, deviation_analysis(grid))
+
+    def slopes(theta: Array) -> Array:
+        wave = jnp.exp(1j * orders * theta)
+        at = theta, (harmonics @ wave).real, (harmonics @ (1j * orders * wave)).real, omega
+        return scene.slopes(*at)[0][:, : 2 * n]
+
+    whole = radau.flow(slopes, n, 2.0 * np.pi, _steps_for(scene, omega) if steps is None else steps, x.dtype)
+    if forced:
+        return jnp.linalg.eigvals(whole), jnp.full_like(omega, jnp.nan)
+    rate, second = _rates(grid, x)
+    along = jnp.concatenate([rate[:, 0].at[scene.coordinates :].add(1.0), second[:, 0]])
+    trivial, rest = deflate(whole, along)
+    return jnp.linalg.eigvals(rest), trivial
+
+
+def _steps_for(scene: PeriodicScene, omega: Array) -> Array:
+    """Return the number of steps in a period that resolve the carrier's fastest vibration."""
+    carrier, gyroscopic = scene.model.carrier, scene.model.mounts[0].gyroscopic
+    half = jnp.linalg.inv(jnp.linalg.cholesky(carrier.mass))
+    fastest = jnp.sqrt(jnp.max(jnp.abs(jnp.linalg.eigvalsh(half @ carrier.stiffness @ half.T))))
+    if gyroscopic is not None:
+        fastest = fastest + scene.model.scene.top_speed * jnp.linalg.norm(half @ gyroscopic @ half.T)
+    return radau.steps_for(2.0 * np.pi * (fastest / omega + 2.0))

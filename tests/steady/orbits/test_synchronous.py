@@ -1,0 +1,258 @@
+"""Exact synchronous motions against equations of motion by hand, integrated by SciPy, and against closed forms."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+import jaxvib as jv
+
+G = 9.81
+
+
+def body(stiffness=(4e5, 7e5), damping=(2e3, 3e3), mass=2000.0, inertia=600.0, angle=0.0, places=((-1.0, -0.2), (1.1, -0.1))):
+    supports = [jv.support(at=at, stiffness=stiffness, damping=damping, angle=angle) for at in places]
+    return jv.plane_body(mass=mass, inertia=inertia, supports=supports)
+
+
+def motor(speed=100.0, torque=300.0, inertia=0.5):
+    return jv.DCMotor(speed, stall_torque=torque, inertia=inertia)
+
+
+def symmetric(places, unbalance=1.5, damping=2e3, directions=None, drive=None, **body_numbers):
+    """Equal supports in x and y without coupling, equal exciters."""
+    stiffness, damping = (4e5, 4e5), (damping, damping)
+    machine = body(stiffness, damping, places=((-1.0, 0.0), (1.0, 0.0)), **body_numbers)
+    directions = [1] * len(places) if directions is None else directions
+    drive = motor() if drive is None else drive
+    pairs = zip(places, directions, strict=True)
+    return jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=unbalance, at=p, direction=d) for p, d in pairs])
+
+
+@pytest.fixture(scope="module")
+def general():
+    """Two different motors in opposite directions, inclined supports, gravity."""
+    exciters = [
+        jv.Exciter(drive=motor(), unbalance=1.5, at=(-0.3, 0.2)),
+        jv.Exciter(
+            drive=jv.InductionMotor(100.4, breakdown_torque=200.0, breakdown_slip=0.2, inertia=0.4), unbalance=1.2,
+            at=(0.35, 0.25), direction=-1,
+        ),
+    ]  # fmt: skip
+    return jv.Scene(body(angle=0.3), exciters=exciters, effects=jv.Gravity())
+
+
+@pytest.fixture(scope="module")
+def orbit(general):
+    return jv.synchronous_orbit(general, phases=[0.0, 3.0])
+
+
+def by_hand(t, y, scene=None):
+    """Rate of (x, y, psi, th_1, th_2 and their rates) of the general scene, from the equations of motion on paper."""
+    q, v = y[:3], y[5:8]
+    mass, stiffness, damping = np.diag([2000.0, 2000.0, 600.0]), np.zeros((3, 3)), np.zeros((3, 3))
+    turn = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
+    for a, b in ((-1.0, -0.2), (1.1, -0.1)):
+        rows = turn @ np.array([[1.0, 0.0, -b], [0.0, 1.0, a]])
+        stiffness += rows.T @ np.diag([4e5, 7e5]) @ rows
+        damping += rows.T @ np.diag([2e3, 3e3]) @ rows
+    matrix, force = np.zeros((5, 5)), np.zeros(5)
+    matrix[:3, :3], force[:3] = mass, -stiffness @ q - damping @ v
+    kloss = lambda w: 2.0 * 200.0 * (1.0 - w / 100.4) * 0.2 / ((1.0 - w / 100.4) ** 2 + 0.04)  # noqa: E731
+    exciters = [
+        (1.5, 0.5, (-0.3, 0.2), 1, lambda w: 300.0 * (1.0 - w / 100.0)),
+        (1.2, 0.4, (0.35, 0.25), -1, kloss),
+    ]
+    for k, (s, inertia, (a, b), sigma, torque) in enumerate(exciters, 3):
+        angle, rate = y[k], y[5 + k]
+        rows = np.array([[1.0, 0.0, -b], [0.0, 1.0, a]])
+        out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        own = sigma * torque(sigma * (rate - v[2]))
+        matrix[:3, k] += s * rows.T @ along
+        force[:3] += s * rate**2 * rows.T @ out
+        force[2] -= own
+        matrix[k, k], matrix[k, :3], force[k] = inertia, s * along @ rows, own - s * G * np.cos(angle)
+    return np.concatenate([y[5:], np.linalg.solve(matrix, force)])
+
+
+def flat(state):
+    rotors = [own.rotor for own in state.exciters]
+    return np.concatenate([state.displacement, [r[0] for r in rotors], state.velocity, [r[1] for r in rotors]])
+
+
+def turned_once(orbit, begin):
+    turn = 2.0 * np.pi / float(orbit.speed)
+    return solve_ivp(by_hand, (0.0, turn), begin, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+
+
+def test_state_returns_after_one_turn_by_scipy(orbit):
+    assert orbit.status_name == "found" and orbit.error < 1e-9
+    end = turned_once(orbit, flat(orbit.at(0.0)))
+    assert np.max(np.abs(end - flat(orbit.at(2.0 * np.pi)))) < 1e-8
+    assert np.max(np.abs(end - flat(orbit.at(0.0)) - 2.0 * np.pi * np.array([0, 0, 0, 1, -1] + 5 * [0]))) < 1e-8
+
+
+def test_multipliers_equal_differences_of_runs_by_scipy(orbit):
+    begin, columns = flat(orbit.at(0.0)), []
+    for k, step in enumerate([1e-6] * 3 + [1e-5] * 2 + [1e-4] * 5):
+        change = step * np.eye(10)[k]
+        columns.append((turned_once(orbit, begin + change) - turned_once(orbit, begin - change)) / (2.0 * step))
+    expected = np.linalg.eigvals(np.stack(columns, axis=1))
+    expected = np.delete(expected, np.argmin(np.abs(expected - 1.0)))
+    found = np.asarray(orbit.multipliers)
+    assert abs(float(orbit.trivial) - 1.0) < 1e-9
+    assert np.max([np.min(np.abs(found - e)) for e in expected]) < 1e-6
+    assert np.max([np.min(np.abs(expected - e)) for e in found]) < 1e-6
+
+
+def test_mean_powers_of_motors_equal_the_dissipation(general, orbit):
+    theta = 2.0 * np.pi * np.arange(64) / 64.0
+    states = jax.vmap(orbit.at)(theta)
+    supplied, lost = jax.vmap(lambda s: jv.power(general, 0.0, s))(states)
+    assert float(jnp.sum(orbit.power)) == pytest.approx(float(jnp.mean(supplied)), rel=1e-10)
+    assert float(jnp.mean(lost)) == pytest.approx(float(jnp.mean(supplied)), rel=1e-8)
+
+
+def test_circular_translation_meets_the_closed_form():
+    # L(Omega) = N c S^2 Omega^5 / |D|^2, all in phase, places with the sum zero
+    places = [(0.3 * np.cos(a), 0.3 * np.sin(a)) for a in (0.1, 0.1 + 2.0 * np.pi / 3.0, 0.1 + 4.0 * np.pi / 3.0)]
+    orbit = jv.synchronous_orbit(symmetric(places))
+
+    def balance(w):
+        d = 8e5 - 2000.0 * w**2 + 4e3j * w
+        return 300.0 * (1.0 - w / 100.0) - 3.0 * 4e3 * 1.5**2 * w**5 / abs(d) ** 2
+
+    speed = brentq(balance, 90.0, 100.0, xtol=1e-13)
+    amplitude = 3.0 * 1.5 * speed**2 / abs(8e5 - 2000.0 * speed**2 + 4e3j * speed)
+    assert float(orbit.speed) == pytest.approx(speed, rel=1e-13)
+    np.testing.assert_allclose(orbit.amplitude[:2], amplitude, rtol=1e-12)
+    np.testing.assert_allclose(orbit.torque, 300.0 * (1.0 - speed / 100.0), rtol=1e-10)
+    assert float(orbit.amplitude[2]) < 1e-12 and np.max(np.abs(orbit.phases)) < 1e-12
+
+
+def test_phases_opposite_to_a_triangle_leave_the_body_at_rest():
+    angles = 2.0 * np.pi * np.arange(3) / 3.0
+    scene = symmetric([(0.4 * np.cos(a), 0.4 * np.sin(a)) for a in angles])
+    orbit = jv.synchronous_orbit(scene, phases=-angles)
+    assert float(orbit.speed) == pytest.approx(100.0, rel=1e-13)
+    assert np.max(orbit.amplitude) < 1e-13 and np.max(np.abs(orbit.torque)) < 1e-9
+    assert orbit.status_name == "found" and bool(orbit.stable)
+
+
+def test_opposite_ideal_exciters_throw_along_a_straight_line():
+    scene = symmetric([(0.0, 0.0)] * 2, directions=(1, -1), drive=jv.ConstantSpeed(100.0))
+    orbit = jv.synchronous_orbit(scene)
+    amplitude = 2.0 * 1.5 * 100.0**2 / abs(8e5 - 2000.0 * 100.0**2 + 4e5j)
+    np.testing.assert_allclose(orbit.amplitude, [amplitude, 0.0, 0.0], rtol=1e-12, atol=1e-14)
+    assert float(orbit.speed) == 100.0 and np.isnan(orbit.trivial) and bool(orbit.stable)
+    assert float(jnp.sum(orbit.power)) == pytest.approx(0.5 * 4e3 * (amplitude * 100.0) ** 2, rel=1e-10)
+
+
+def test_opposite_motors_settle_at_minus_the_sum_of_polar_angles():
+    # Soft supports: alpha_2 - alpha_1 = -(d_1 + d_2), a straight line at (d_1 + d_2)/2.
+    length, polar = (0.5, 0.4), (0.4, 2.2)
+    places = [(r * np.cos(d), r * np.sin(d)) for r, d in zip(length, polar, strict=True)]
+    machine = body((40.0, 40.0), (2.0, 2.0), places=((-1.0, 0.0), (1.0, 0.0)))
+    exciters = [jv.Exciter(drive=motor(), unbalance=0.2, at=p, direction=d) for p, d in zip(places, (1, -1), strict=True)]
+    orbit = jv.synchronous_orbit(jv.Scene(machine, exciters=exciters), phases=[0.0, -2.4])
+    assert float(orbit.phases[1] - orbit.phases[0]) == pytest.approx(-sum(polar), abs=2e-3)
+    x, y = np.asarray(orbit.displacement_harmonics[:2, 1])
+    assert abs((y / x).imag) < 2e-3 and np.arctan((y / x).real) == pytest.approx(sum(polar) / 2.0, abs=2e-3)
+
+
+def test_one_jammed_exciter_equals_jam_orbit():
+    machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed("600 rpm"))
+    jam = jv.jam_orbit(scene, mode=3)
+    orbit = jv.synchronous_orbit(scene, speed=jam.omega, points=33)
+    assert float(orbit.speed) == pytest.approx(float(jam.omega), rel=1e-11)
+    assert float(orbit.power[0]) == pytest.approx(float(jam.power), rel=1e-8)
+    np.testing.assert_allclose(orbit.amplitude, jam.amplitude, rtol=1e-9)
+    assert float(orbit.foundation_force) == pytest.approx(float(jam.foundation_force), rel=1e-9)
+    gaps = np.abs(np.asarray(orbit.multipliers)[:, None] - np.asarray(jam.multipliers)[None])
+    assert np.max(np.min(gaps, axis=0)) < 1e-8 and bool(orbit.stable) == bool(jam.stable)
+
+
+def test_motor_that_is_off_follows_the_other_one():
+    scene = symmetric([(-1.1, 0.0), (1.1, 0.0)])
+    off = jv.SwitchedOff(motor(), at=5.0, bearing=0.02)
+    exciters = [scene.exciters[0], jv.Exciter(drive=off, unbalance=1.5, at=(1.1, 0.0))]
+    orbit = jv.synchronous_orbit(jv.Scene(scene.machine, exciters=exciters), phases=[0.0, -0.2])
+    assert bool(orbit.stable) and float(orbit.torque[1]) == pytest.approx(-0.02 * float(orbit.speed), rel=1e-6)
+    assert float(orbit.torque[0]) > 0.02 * float(orbit.speed) and -np.pi / 2.0 < float(orbit.phases[1]) < 0.0
+
+
+GRADED = ("exciters[0].unbalance", "exciters[1].drive.speed", "machine.mass")
+
+
+def with_numbers(scene, numbers):
+    where = lambda s: (s.exciters[0].unbalance, s.exciters[1].drive.speed, s.machine.mass)  # noqa: E731
+    return eqx.tree_at(where, scene, tuple(numbers))
+
+
+def answers(numbers, scene, **options):
+    orbit = jv.synchronous_orbit(with_numbers(scene, numbers), phases=[0.0, 3.0], points=17, throw=False, **options)
+    return jnp.stack([orbit.speed, orbit.phases[1], orbit.torque[0], orbit.amplitude[0], orbit.foundation_force])
+
+
+def test_gradients_equal_finite_differences(general):
+    numbers = jnp.array([1.5, 100.4, 2000.0])
+    forward, reverse = jax.jacfwd(answers)(numbers, general), jax.jacrev(answers)(numbers, general)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-12)
+    for k, step in enumerate(1e-5 * numbers):
+        change = step * jnp.eye(3)[k]
+        slope = (answers(numbers + change, general) - answers(numbers - change, general)) / (2.0 * step)
+        np.testing.assert_allclose(forward[:, k], slope, rtol=2e-6, atol=1e-9)
+
+
+def test_batches_under_jit_equal_single_motions(general):
+    many = jnp.array([[1.5, 100.4, 2000.0], [1.4, 103.0, 2100.0]])
+    found = jax.jit(jax.vmap(lambda n: answers(n, general)))(many)
+    np.testing.assert_allclose(found, jnp.stack([answers(n, general) for n in many]), rtol=1e-9)
+
+
+def test_motion_without_damping_is_found_and_not_called_stable():
+    scene = symmetric([(-0.3, 0.0), (0.3, 0.0)], directions=(1, -1), damping=0.0)
+    orbit = jv.synchronous_orbit(scene, phases=[0.0, np.pi])
+    assert orbit.status_name == "found" and abs(float(jnp.sum(orbit.power))) < 1e-9
+    assert not bool(orbit.stable) and float(orbit.multiplier) > 1.0 - 1e-9
+
+
+def test_regimes_of_two_motors_exchange_stability_with_the_distance():
+    # Same rotation, both at the distance l from the centre: in phase is stable if M l^2 > 2 J, antiphase if M l^2 < 2 J.
+    for distance, steady in ((0.4, np.pi), (1.1, 0.0)):
+        scene = symmetric([(-distance, 0.0), (distance, 0.0)], unbalance=0.5)
+        for phase in (0.0, np.pi):
+            orbit = jv.synchronous_orbit(scene, phases=[0.0, phase])
+            assert orbit.status_name == "found" and bool(orbit.stable) == (phase == steady)
+
+
+def test_motors_that_cannot_synchronise_end_in_a_status(general):
+    apart = with_numbers(general, (1.5, 200.0, 2000.0))
+    with pytest.raises(jv.ComputationError, match="no periodic motion"):
+        jv.synchronous_orbit(apart, phases=[0.0, 3.0])
+    orbit = jv.synchronous_orbit(apart, phases=[0.0, 3.0], throw=False, points=17)
+    assert orbit.status_name == "not_converged" and np.isnan(orbit.speed) and not bool(orbit.stable)
+
+
+def test_ideal_drives_at_different_speeds_have_a_status():
+    scene = symmetric([(0.0, 0.0)] * 2, directions=(1, -1), drive=jv.ConstantSpeed(100.0))
+    scene = eqx.tree_at(lambda s: s.exciters[1].drive.speed, scene, 90.0)
+    assert jv.synchronous_orbit(scene, throw=False).status_name == "different_speeds"
+
+
+def test_wrong_input_ends_in_one_sentence(general):
+    machine, loads = body(), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    with pytest.raises(jv.InputError, match="speed is missing"):
+        jv.synchronous_orbit(jv.Scene(machine, loads, jv.ConstantSpeed(60.0)))
+    with pytest.raises(jv.InputError, match="loads turn at a speed of their own"):
+        jv.synchronous_orbit(jv.Scene(machine, exciters=[jv.Exciter(loads, motor(), unbalance=1.0)]))
+    with pytest.raises(jv.InputError, match="loads need a drive of given speed"):
+        jv.synchronous_orbit(jv.Scene(machine, exciters=[jv.Exciter(loads, motor())]))
+    with pytest.raises(jv.InputError, match="phases has 3 values"):
+        jv.synchronous_orbit(general, phases=[0.0, 1.0, 2.0])
+    with pytest.raises(jv.InputError, match="regime is given beside speed"):
+        jv.synchronous_orbit(general, jv.synchronous_orbit(general, phases=[0.0, 3.0]), speed=100.0)
