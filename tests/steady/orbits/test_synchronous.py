@@ -151,7 +151,7 @@ def test_opposite_ideal_exciters_throw_along_a_straight_line():
     assert float(jnp.sum(orbit.power)) == pytest.approx(0.5 * 4e3 * (amplitude * 100.0) ** 2, rel=1e-10)
 
 
-def test_opposite_motors_settle_at_minus_the_sum_of_polar_angles():
+def test_phase_of_opposite_motors_is_minus_the_sum_of_angles():
     # Soft supports: alpha_2 - alpha_1 = -(d_1 + d_2), a straight line at (d_1 + d_2)/2.
     length, polar = (0.5, 0.4), (0.4, 2.2)
     places = [(r * np.cos(d), r * np.sin(d)) for r, d in zip(length, polar, strict=True)]
@@ -214,14 +214,14 @@ def test_batches_under_jit_equal_single_motions(general):
     np.testing.assert_allclose(found, jnp.stack([answers(n, general) for n in many]), rtol=1e-9)
 
 
-def test_motion_without_damping_is_found_and_not_called_stable():
+def test_motion_without_damping_is_not_called_stable():
     scene = symmetric([(-0.3, 0.0), (0.3, 0.0)], directions=(1, -1), damping=0.0)
     orbit = jv.synchronous_orbit(scene, phases=[0.0, np.pi])
     assert orbit.status_name == "found" and abs(float(jnp.sum(orbit.power))) < 1e-9
     assert not bool(orbit.stable) and float(orbit.multiplier) > 1.0 - 1e-9
 
 
-def test_regimes_of_two_motors_exchange_stability_with_the_distance():
+def test_stable_phase_of_two_motors_depends_on_their_distance():
     # Same rotation, both at the distance l from the centre: in phase is stable if M l^2 > 2 J, antiphase if M l^2 < 2 J.
     for distance, steady in ((0.4, np.pi), (1.1, 0.0)):
         scene = symmetric([(-distance, 0.0), (distance, 0.0)], unbalance=0.5)
