@@ -1,7 +1,7 @@
 """Checks of the arguments of public functions against the annotations of their signatures.
 
 The decorator `validated` is applied to every public function and to the public methods of results. An argument of a wrong type,
-such as None in place of a scene, a text in place of a count or a list in place of a function, therefore raises an error with a
+such as None in place of a scene, a string in place of a count or a list in place of a function, therefore raises an error with a
 message of one sentence before anything is traced. Each function itself checks the properties that a type does not express:
 bounds, units and names of numbers.
 """
@@ -269,7 +269,7 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
     if kind is complex or _is_array(kind):
         return _problem_of_array(value)
     if kind is str:
-        return None if isinstance(value, str) else "a text"
+        return None if isinstance(value, str) else "a string"
     if origin is not None and isinstance(origin, type):
         return _problem_of_container(value, origin, inner)
     if isinstance(kind, type):

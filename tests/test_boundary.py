@@ -44,7 +44,7 @@ def question(
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"word": 3}, "word is 3; it must be a text"),
+        ({"word": 3}, "word is 3; it must be a string"),
         ({"flag": 1}, "flag is 1; it must be True or False"),
         ({"count": True}, "count is True; it must be a whole number"),
         ({"count": 2.0}, "count is 2.0; it must be a whole number"),

@@ -23,7 +23,7 @@ _MACHINE_NUMBERS = ("machine.stiffness", "machine.link_stiffness", "machine.damp
 """Numbers of a machine that have sliders."""
 
 _MAX_SINGLE_SLIDERS = 12
-"""Maximum number of sliders for single parameters of a machine. A machine with changed parameters has one slider for all of a
+"""Maximum number of sliders for single parameters of a machine. A machine with more parameters has one slider for all of a
 field, such as all stiffnesses."""
 
 _VALUE_FACTORS = tuple(np.geomspace(0.1, 10.0, 81).tolist())

@@ -225,7 +225,7 @@ class ConstantSpeed(IdealDrive):
 
         theta' = n
 
-    **Arguments**: `speed` n, rad/s or a text such as "1500 rpm"; greater than 0; typical: 60 to 320 rad/s (600 to 3000 rpm).
+    **Arguments**: `speed` n, rad/s or a string such as "1500 rpm"; greater than 0; typical: 60 to 320 rad/s (600 to 3000 rpm).
 
     **Raises** `InputError` for a wrong unit or a speed that is not positive.
 
@@ -357,7 +357,7 @@ class DCMotor(Motor):
 
         T = stall_torque (1 - theta' / speed)
 
-    **Arguments** (SI or texts with a unit; all greater than 0)
+    **Arguments** (SI, or strings with a unit; all greater than 0)
 
     - `speed` without a load, rad/s; typical: 100 to 320 (1000 to 3000 rpm)
     - `stall_torque`, N m; typical: 1 to 50
@@ -391,7 +391,7 @@ class InductionMotor(Motor):
 
         T = 2 T_b s s_b / (s^2 + s_b^2),    s = 1 - theta' / speed
 
-    **Arguments** (SI or texts with a unit; all greater than 0)
+    **Arguments** (SI, or strings with a unit; all greater than 0)
 
     - `speed`: synchronous speed, rad/s; typical: "750 rpm", "1000 rpm", "1500 rpm" or "3000 rpm" on a grid of 50 Hz
     - `breakdown_torque` T_b, the largest torque, N m; typical: 2 to 3 times the rated torque, 8 to 250 for 0.5 to 15 kW at 1500

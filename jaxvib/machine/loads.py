@@ -324,7 +324,7 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 
         kappa m R^2 phi'' = - b_W R^2 (phi' - speed) - m p'(phi) . (acceleration of the track),    p = R (cos phi, sin phi)
 
-    **Arguments** (SI or texts with a unit such as "800 g")
+    **Arguments** (SI, or strings with a unit such as "800 g")
 
     - `count` N: number of balls, at least 1; typical: 1 to 4
     - `mass` m of a ball, kg, positive, one number for all or N of them; typical: 0.05 to 1

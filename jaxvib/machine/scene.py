@@ -135,7 +135,7 @@ def unbalance(*, force: Number, at: Number) -> Array:
 
         S = F / w^2
 
-    **Arguments** (SI or texts with a unit, greater than 0)
+    **Arguments** (SI, or strings with a unit, greater than 0)
 
     - `force` F, N, at that speed; typical: "1 kN" to "200 kN"
     - `at` w, rad/s: the speed at which the force is stated; typical: "750 rpm" to "3000 rpm"

@@ -105,7 +105,7 @@ the run, after which each load speed differs from its final value by less than 1
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:
-    """Return a measure, looked up by name if it is a text. **Raises** `InputError` for other values."""
+    """Return a measure, looked up by name if it is a string. **Raises** `InputError` for other values."""
     if isinstance(given, (Quantity, RunMeasure)):
         return given
     if isinstance(given, str) and given in RUN_MEASURES:

@@ -150,7 +150,7 @@ def require_real(value: object, unit: str, field: str) -> None:
 
 
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
-    """Return the error for a text that is not in `unit`, or for a text without a readable unit if `unit` is None."""
+    """Return the error for a string that is not in `unit`, or for a string without a readable unit if `unit` is None."""
     wanted = "not a number with a unit" if unit is None else f"not in {unit}" if unit else "not a plain number"
     return InputError(
         field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"

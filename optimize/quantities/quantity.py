@@ -344,7 +344,7 @@ def _constant(value: float, unit: str) -> Combined:
 
 
 def _with_unit(value: Operand, name: str) -> Quantity:
-    """Return a value as a quantity: a number has no unit, a text such as "2 mm" its own, in SI."""
+    """Return a value as a quantity: a number has no unit, a string such as "2 mm" its own, in SI."""
     if isinstance(value, Quantity):
         return value
     if isinstance(value, (str, UnitQuantity)):
@@ -360,7 +360,7 @@ def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
 
 
 def _term(value: Operand, unit: str, name: str) -> Quantity:
-    """Return an operand of a sum as a quantity; a text is converted to the unit of the other operand, as for a limit."""
+    """Return an operand of a sum as a quantity; a string is converted to the unit of the other operand, as for a limit."""
     if isinstance(value, Quantity) or not isinstance(value, (str, UnitQuantity)):
         return _with_unit(value, name)
     return replace(_constant(number_in(value, unit, f"the value combined with {name}"), unit), name=str(value).strip())

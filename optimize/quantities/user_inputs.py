@@ -32,7 +32,7 @@ def same_unit(one: str, other: str) -> bool:
 
 
 def number_in(value: Number, unit: str, name: str) -> float:
-    """Return a number, or a text with a unit, in a unit. **Raises** `InputError` as `jaxvib.units.number` does."""
+    """Return a number, or a string with a unit, in a unit. **Raises** `InputError` as `jaxvib.units.number` does."""
     found = number(value, unit, name)
     require_known(found, name, "a quantity", "make it outside")
     return float(found)

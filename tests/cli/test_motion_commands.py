@@ -119,7 +119,7 @@ def test_motion_commands_give_the_results_of_python(typed, tmp_path):
 def test_numbers_that_stability_commands_vary_are_checked(typed):
     asked = ("--omega", "20", "40", "--points", "8")
     code, _, err = typed("stability-map", "machine.toml", "--vary", "loads.mas", "--value", "0.1", *asked)
-    assert code == 2 and "--vary.loads.mas is not a number of this scene; did you mean 'loads.mass'?" in err
+    assert code == 2 and "--vary.loads.mas is not a parameter of this scene; did you mean 'loads.mass'?" in err
     code, _, err = typed("stability-map", "machine.toml", "--vary", "loads.mass", "--value", "2 m", *asked)
     assert code == 2 and "--value" in err and "not in kg" in err
     words = (

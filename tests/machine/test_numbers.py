@@ -90,12 +90,12 @@ def test_numbers_are_read_and_put():
     [
         ("machine.stiffness[3]", "does not exist; machine.stiffness has 3 entries, counted from 0"),
         ("drive.speed[0]", "does not exist; drive.speed has 1 entries"),
-        ("machine.stifness", "is not a number of this scene; did you mean 'machine.stiffness'"),
-        ("machine.stiffness[-1]", "is not a number of this scene"),
+        ("machine.stifness", "is not a parameter of this scene; did you mean 'machine.stiffness'"),
+        ("machine.stiffness[-1]", "is not a parameter of this scene"),
         ("machine.kind", "is 'three_mass', which is not a continuous number"),
         ("loads.count", "is 4, which is not a continuous number"),
         ("loads.ball_radius", "is not set in this scene; did you mean"),
-        (3, "is not the name of a number"),
+        (3, "is not the name of a parameter"),
     ],
 )
 def test_wrong_names_of_numbers_are_refused(name, says):

@@ -306,7 +306,7 @@ def test_design_files_mean_what_they_say(tmp_path, monkeypatch):
         (("[free]", "[free"), "is not a TOML file"),
         (("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\n[objective]'), "demand[0] has no limit"),
         (("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\nat_most = "3 kg"\n[objective]'), "is not in W"),
-        (("[objective]", "[ties]\nx = 3\n[objective]"), "ties.x is not a number of this scene"),
+        (("[objective]", "[ties]\nx = 3\n[objective]"), "ties.x is not a parameter of this scene"),
         (("[objective]", '[choices]\n"loads.drag" = 3\n[objective]'), "give a list of values"),
         (("# tolerances", "tolerances"), "objective.statistic is 'worts'"),
     ],

@@ -117,8 +117,8 @@ def test_the_figure_that_fits(sampled, tmp_path):
     [
         (lambda grid, sampled: plot_map(grid.store, "wieghted"), "measure is 'wieghted'; did you mean 'weighted'"),
         (lambda grid, sampled: plot_map(grid.store, x="drive.sped"), "x is 'drive.sped'; did you mean 'drive.speed'"),
-        (lambda grid, sampled: plot_map(grid.store, x="loads.drag", y="loads.drag"), "must be two axes"),
-        (lambda grid, sampled: plot_map(sampled.store), "must be two axes; this study has: none"),
+        (lambda grid, sampled: plot_map(grid.store, x="loads.drag", y="loads.drag"), "must be two different axes"),
+        (lambda grid, sampled: plot_map(sampled.store), "must be two different axes; this study has: none"),
         (lambda grid, sampled: plot_shares(grid.store, "machine.mass"), "over is 'machine.mass'"),
         (lambda grid, sampled: plot_shares(sampled.store), "over is None"),
     ],

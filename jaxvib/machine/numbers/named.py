@@ -191,7 +191,7 @@ def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
     """
     there, field = numbers_of(scene), f"{field}.{name}"
     if not isinstance(name, str):
-        raise InputError(field, f"is not the name of a number; {suggest_name(str(name), list(there))}")
+        raise InputError(field, f"is not the name of a parameter; {suggest_name(str(name), list(there))}")
     if name in there:
         return there[name]
     array, index = m.groups() if (m := re.fullmatch(r"(.+)\[(\d+)\]", name)) else (name, None)
@@ -204,11 +204,11 @@ def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
 
 
 def _why_unnamed(scene: Scene, name: str) -> str:
-    """Return the reason why `name` is not the name of a number."""
+    """Return the reason why `name` is not the name of a parameter."""
     part, _, last = name.rpartition(".")
     owner = next((each for prefix, _, each in _parts(scene) if prefix == part), None)
     if last not in getattr(type(owner), "__dataclass_fields__", ()):
-        return "is not a number of this scene"
+        return "is not a parameter of this scene"
     value = getattr(owner, last)
     if value is None or np.size(value) == 0:
         return "is not set in this scene"

@@ -127,7 +127,7 @@ def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
 
         M y'' + b y' + k y = force of the loads
 
-    **Arguments** (one number each, SI or a text with a unit such as "40 N/mm")
+    **Arguments** (one number each, SI, or a string with a unit such as "40 N/mm")
 
     - `mass` M, kg, loads not included; typical: 50 to 5000
     - `stiffness` k of the support, N/m; typical: 1e4 to 1e6

@@ -121,7 +121,7 @@ def test_what_users_give_is_read():
     assert same_unit("N", "kg m/s^2") and same_unit("", "dimensionless") and same_unit("rad/s", "rad/s")
     assert not same_unit("N", "kN") and not same_unit("N", "m") and not same_unit("nonsense", "N")
     for wrong in ("drive.speed", "machine.kind", "machine", "effects.mass", 3):
-        with pytest.raises(jv.InputError, match=r"must name parameters of a scene|must be a text"):
+        with pytest.raises(jv.InputError, match=r"must name parameters of a scene|must be a string"):
             total(wrong)
 
 

@@ -36,7 +36,7 @@ def test_sums_are_named_by_what_they_add():
     assert product("loads.drag").words == "product of drag of all loads" and product("loads.drag").unit == ""
     assert total("machine.link_damping").words == "sum of damping of all links" and total("loads.inertia").unit == "kg m^2"
     for wrong in ("drive.speed", "machine.length", "mass", 3, "machine.drag.x"):
-        with pytest.raises(jv.InputError, match=r"must name parameters of a scene|field is 3; it must be a text"):
+        with pytest.raises(jv.InputError, match=r"must name parameters of a scene|field is 3; it must be a string"):
             total(wrong)
     with pytest.raises(jv.InputError, match="which this scene does not have"):
         total("loads.inertia")(SCENE)

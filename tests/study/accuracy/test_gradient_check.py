@@ -127,7 +127,7 @@ def test_a_jam_has_the_derivatives_that_its_equation_says():
         ({"quantity": lambda s: s.machine.stiffness}, r"quantity gives float64 of shape \(1,\); it must give one real number"),
         (
             {"quantity": closed, "free": ("machine.masses",)},
-            r"free\.machine\.masses is not a number of this scene; did you mean 'machine\.mass'",
+            r"free\.machine\.masses is not a parameter of this scene; did you mean 'machine\.mass'",
         ),
         ({"quantity": closed, "routes": ("sideways",)}, r"routes are \['sideways'\]; name some of forward, reverse"),
         ({"quantity": closed, "routes": ()}, r"routes are \[\]"),
