@@ -1,4 +1,4 @@
-"""JAX primitives with custom rules of differentiation, batching and transposition, for functions that JAX does not lowering."""
+"""JAX primitives with custom rules of differentiation, batching and transposition, for functions that JAX does not trace."""
 
 from __future__ import annotations
 
