@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-
-from jaxvib.runtime.compat import custom_vmap
+from jax.custom_batching import custom_vmap
 
 _WRITTEN = 8
 """Largest number of equations for which `eliminate` is as fast as a library call for each system of a batch."""

@@ -9,10 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 
 from jaxvib.ode.types import Mapped, Tangents
-from jaxvib.runtime.compat import custom_vmap
 
 VECTOR = 8
 """Width of vectors of a processor; the number of tangents is padded to a multiple of it."""

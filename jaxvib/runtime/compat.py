@@ -20,7 +20,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,6 @@ __all__ = [
     "Var",
     "accepted_flags",
     "backend_started",
-    "custom_vmap",
     "enumeration_names",
     "enumeration_of",
     "evaluating",
@@ -103,40 +102,13 @@ def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
     return equation
 
 
-Out = TypeVar("Out")
-Rule = TypeVar("Rule", bound=Callable)
-
-
-class _PlainVmap(Generic[Out]):
-    """Substitute for `jax.custom_batching.custom_vmap` that keeps JAX's own rule, which batches operation by operation."""
-
-    def __init__(self, function: Callable[..., Out]):
-        self.function = function
-
-    def def_vmap(self, rule: Rule) -> Rule:
-        return rule
-
-    def __call__(self, *args: object) -> Out:
-        return self.function(*args)
-
-
-custom_vmap: type[_PlainVmap] = getattr(getattr(jax, "custom_batching", None), "custom_vmap", _PlainVmap)
-"""Decorator of functions with a custom rule for `vmap`. Without it, the results are the same, but take longer to compute."""
-
-
 def traced(value: object) -> bool:
     """Return True if JAX is transforming the computation of `value`, which is then a tracer without a number.
 
     >>> traced(1.0)
     False
     """
-    tracer = getattr(getattr(jax, "core", None), "Tracer", None)
-    if tracer is not None:
-        return isinstance(value, tracer)
-    try:
-        return isinstance(value, jax.Array) and not value.devices()
-    except jax.errors.ConcretizationTypeError:
-        return True
+    return isinstance(value, jax.core.Tracer)
 
 
 def primal_of(tracer: object) -> object | None:
