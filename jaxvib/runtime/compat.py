@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.core import Tracer
 
 if TYPE_CHECKING:
     import equinox as eqx
@@ -108,7 +109,7 @@ def traced(value: object) -> bool:
     >>> traced(1.0)
     False
     """
-    return isinstance(value, jax.core.Tracer)
+    return isinstance(value, Tracer)
 
 
 def primal_of(tracer: object) -> object | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -257,32 +258,12 @@ def swing_states(
     if dry is not None and width is None:
         zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
         width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
-
-    def moving(t: RealScalarLike, y: tuple[Array, Array], args: None, **_: object) -> Array:
-        """Return a number that becomes negative when the pendulum is slow within the dead zone.
-
-        The smoothed sign of dry friction would let it creep there.
-        """
-        assert dry is not None and width is not None
-        f, slip = y
-        slow = jnp.abs(slip) - 3.0 * width
-        return jnp.maximum(slow, frequency * (jnp.abs(jnp.tan(f)) - jnp.tan(pendulum.dead_zone(dry))))
-
+    slowness = None if dry is None or width is None else _slowness(pendulum, frequency, dry, width)
     # There is no change of sign if friction already holds the pendulum at the start.
-    free = None if dry is None else moving(times[0], (angle, rate), None) > 0.0
-
-    def term(t: RealScalarLike, y: tuple[Array, Array], args: None) -> tuple[Array, Array]:
-        f, slip = y
-        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - viscous * slip
-        if free is None:
-            return slip, torque / pendulum.total_inertia
-        assert dry is not None and width is not None
-        torque = torque - dry_lever(dry, _diameter(pendulum), slip, width) * jnp.abs(pendulum.radial_load(f, slip))
-        return jnp.where(free, slip, 0.0), jnp.where(free, torque / pendulum.total_inertia, 0.0)
-
+    free = None if slowness is None else slowness(times[0], (angle, rate), None) > 0.0
     scale = jax.lax.stop_gradient(frequency)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(term),
+        diffrax.ODETerm(_rates(pendulum, viscous, dry, width, free)),
         solver,
         t0=times[0],
         t1=times[-1],
@@ -293,16 +274,15 @@ def swing_states(
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
-        # `flip=True` states that `moving` falls through 0. Without it the search would fail if the last step ends just before
-        # the root and both of its ends have the same sign by rounding.
-        event=None if dry is None else diffrax.Event(moving, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
+        # `flip=True` states that the slowness falls through 0. Without it the search would fail if the last step ends just
+        # before the root and both of its ends have the same sign by rounding.
+        event=None if slowness is None else diffrax.Event(slowness, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
     )
     assert solution.ts is not None and solution.ys is not None
     (f, slip), ((end,), (end_slip,)) = solution.ys
     stopped = solution.result == diffrax.RESULTS.event_occurred
     last = solution.ts[1][0]
-    if free is not None:
-        assert dry is not None
+    if dry is not None and free is not None:
         last, stopped = jnp.where(free, last, times[0]), stopped | ~free
         last, rest = _last_part(pendulum, dry, times, last, (end, end_slip))
         after = stopped & ~jnp.isfinite(f)
@@ -322,9 +302,41 @@ def swing_states(
     )
 
 
-def _last_part(
-    pendulum: BearingPendulum, dry: Array, times: Array, last: Array, y: tuple[Array, Array]
-) -> tuple[Array, tuple[Array, Array]]:
+_Pair: TypeAlias = tuple[Array, Array]
+"""Angle and rate of a pendulum, or their rates."""
+
+
+def _slowness(pendulum: BearingPendulum, frequency: Array, dry: Array, width: Array) -> Callable[..., Array]:
+    """Return a function of the motion that becomes negative when the pendulum is slow within the dead zone.
+
+    The smoothed sign of dry friction would let it creep there.
+    """
+
+    def moving(t: RealScalarLike, y: _Pair, args: None, **_: object) -> Array:
+        f, slip = y
+        slow = jnp.abs(slip) - 3.0 * width
+        return jnp.maximum(slow, frequency * (jnp.abs(jnp.tan(f)) - jnp.tan(pendulum.dead_zone(dry))))
+
+    return moving
+
+
+def _rates(
+    pendulum: BearingPendulum, viscous: Array, dry: Array | None, width: Array | None, free: Array | None
+) -> Callable[[RealScalarLike, _Pair, None], _Pair]:
+    """Return the equations of motion of the pendulum; with dry friction it stays at rest unless it is `free` at the start."""
+
+    def rates(t: RealScalarLike, y: _Pair, args: None) -> _Pair:
+        f, slip = y
+        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - viscous * slip
+        if dry is None or width is None or free is None:
+            return slip, torque / pendulum.total_inertia
+        torque = torque - dry_lever(dry, _diameter(pendulum), slip, width) * jnp.abs(pendulum.radial_load(f, slip))
+        return jnp.where(free, slip, 0.0), jnp.where(free, torque / pendulum.total_inertia, 0.0)
+
+    return rates
+
+
+def _last_part(pendulum: BearingPendulum, dry: Array, times: Array, last: Array, y: _Pair) -> tuple[Array, _Pair]:
     """Return the time at which a slow pendulum comes to rest, and its angles and rates until then.
 
     It starts from the state `y` at the time `last`. With the exact sign of dry friction the motion is harmonic about the end of
