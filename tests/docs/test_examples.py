@@ -15,10 +15,16 @@ PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def examples():
-    """{the text of an example: where it stands first}."""
+    """{text of an example: its first page and number}. A block that does not import jaxvib continues the last one."""
     found = {}
     for page in PAGES:
-        for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)):
+        blocks = []
+        for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S):
+            if blocks and "import jaxvib" not in block:
+                blocks[-1] += block
+            else:
+                blocks.append(block)
+        for number, block in enumerate(blocks):
             found.setdefault(block, f"{page.stem}-{number}")
     return found
 
