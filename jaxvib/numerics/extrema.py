@@ -47,30 +47,35 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
         """Newton step for the zero of the slope."""
         curved = _at(bend, before + share)
         change = _at(slope, before + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
-        return jnp.clip(share - change, 0.0, 1.0)
+        return jax.lax.optimization_barrier(jnp.clip(share - change, 0.0, 1.0))
 
-    share = jax.lax.fori_loop(0, 4, nearer, jnp.clip(-v[:-1] / jnp.where(turns, v[1:] - v[:-1], 1.0), 0.0, 1.0))
-    inner = jnp.where(turns, _at(polynomial, before + share), x[:-1])
-    steps = jnp.arange(n - 1)
+    # Without barriers the compiler computes the polynomials anew for each use of their values.
+    start = jnp.clip(-v[:-1] / jnp.where(turns, v[1:] - v[:-1], 1.0), 0.0, 1.0)
+    share = jax.lax.fori_loop(0, 4, nearer, start, unroll=True)
+    inner = jax.lax.optimization_barrier(jnp.where(turns, _at(polynomial, before + share), x[:-1]))
 
-    def greatest(sign: Array, start: Array, stop: Array) -> tuple[Array, Array, Array]:
-        """Extrema over the samples from `start` to before `stop`; the first of equal ones."""
-        inside = sign * inner > sign * x[:-1]
-        reached = jnp.where(inside, sign * inner, sign * x[:-1])
-        reached = jnp.where((steps >= start) & (steps < stop - 1), reached, -jnp.inf)
-        top, last = jnp.max(reached), sign * x[stop - 1]
-        k = jnp.where(last > top, stop - 2, jnp.min(jnp.where(reached == top, steps, stop - 2)))
+    def greatest(sign: Array) -> tuple[Array, Array, Array]:
+        """Extrema over the first half of the samples, the second half and the step between them; the first of equal ones."""
+        samples, between = sign * x, sign * inner
+        reached = jnp.maximum(between, samples[:-1])
+        spans = (0, half), (half, n), (half - 1, half + 1)
+        top = jnp.stack([jnp.max(reached[start : stop - 1]) for start, stop in spans])
+        steps = np.arange(n - 1)
+        where = [
+            jnp.min(jnp.where(reached[start : stop - 1] == high, steps[start : stop - 1], stop - 2))
+            for (start, stop), high in zip(spans, top, strict=True)
+        ]
+        ends = np.asarray([stop - 1 for _, stop in spans])
+        last = samples[ends]
+        k = jnp.where(last > top, ends - 1, jnp.stack(where))
         begin = jnp.asarray(first)[k]
-        place = (k - begin) + jnp.where(last > top, 1.0, jnp.where(inside, share, 0.0)[k])
+        place = (k - begin) + jnp.where(last > top, 1.0, jnp.where(between[k] > samples[k], share[k], 0.0))
         value = jnp.maximum(top, last)
         place = jnp.where(jnp.isnan(value), jnp.nan, place)  # what is made of it later is not a number either
         return value, begin, place
 
-    half_ways = jax.vmap(greatest, in_axes=(None, 0, 0))
     signs = jnp.asarray([-1.0, 1.0], x.dtype)
-    value, k, place = jax.vmap(half_ways, in_axes=(0, None, None))(
-        signs, jnp.asarray([0, half, half - 1]), jnp.asarray([half, n, half + 1])
-    )
+    value, k, place = jax.vmap(greatest)(signs)
     best = jnp.argmax(value, axis=1)[:, None]
     value, k, place = (
         jnp.concatenate([row[:, :2], jnp.take_along_axis(row, best, 1)], axis=1) for row in (value * signs[:, None], k, place)

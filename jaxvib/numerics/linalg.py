@@ -26,8 +26,10 @@ _Entry: TypeAlias = Array | float
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """Matrix times vector as a sum, since a library call in a time loop prevents fusion."""
-    return jnp.sum(matrix * vector[None, :], axis=-1)
+    """Matrix times vector: for small matrices as a sum, since a product in a time loop prevents fusion."""
+    if min(matrix.shape) <= _WRITTEN:
+        return jnp.sum(matrix * vector[None, :], axis=-1)
+    return jnp.matmul(matrix, vector, precision="highest")
 
 
 def small_inverse(a: Sequence[Sequence[_Entry]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:

@@ -9,7 +9,7 @@ import warnings
 from jaxvib.errors import InputError
 from jaxvib.runtime.cache import use_cache
 from jaxvib.runtime.compat import backend_started
-from jaxvib.runtime.cpu import has_flags, prepare_cpu
+from jaxvib.runtime.cpu import has_flags, limit_blas_threads, prepare_cpu
 
 
 @functools.cache
@@ -21,6 +21,7 @@ def start() -> None:
     """
     if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
         return
+    limit_blas_threads()
     if not has_flags():
         if backend_started():
             warnings.warn(

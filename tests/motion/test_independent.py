@@ -230,3 +230,35 @@ def test_the_energy_balance_closes_over_ten_thousand_turns():
     left = abs(float(jv.energy(s, end) - jv.energy(s, start) - (given - lost)))
     assert left < 10.0 * float(tolerance) * float(jv.energy(s, end))
     assert left < 0.1 * float(tolerance) * float(given)
+
+
+def test_motion_of_a_chain_of_platforms_is_scipys():
+    """Twelve platforms, whose matrices are multiplied as a product, by a method and equations of its own."""
+    n, mass, stiffness, damping = 12, 100.0, 2e5, 30.0
+    machine = jv.network(
+        mass=[mass] * n, stiffness=[2e4] * n, damping=[damping] * n, links=[(k, k + 1) for k in range(1, n)],
+        link_stiffness=[stiffness] * (n - 1), link_damping=[damping] * (n - 1), exciter=n,
+    )  # fmt: skip
+    m, radius, drag, speed = 3.0, 0.1, 0.5, 60.0
+    scene = jv.Scene(machine, jv.balls(count=1, mass=m, radius=radius, drag=drag), jv.ConstantSpeed(speed))
+    start = jv.initial_state(scene)
+    run = jv.simulate(scene, 1.0, start=start, save="window", estimate=False, stepsize_controller=jv.Tolerance(1e-10))
+    joined = np.diff(np.eye(n), axis=0)
+    matrix = joined.T @ joined
+    inertia = 1.4 * m * radius**2
+
+    def rates(_, y):
+        q, v, angle, rate = y[:n], y[n : 2 * n], y[2 * n], y[2 * n + 1]
+        left = np.diag(np.append(np.full(n, mass), inertia))
+        left[n - 1, n - 1] += m
+        left[n - 1, n] = left[n, n - 1] = m * radius * np.cos(angle)
+        right = np.append(-(2e4 * q + stiffness * matrix @ q) - damping * (v + matrix @ v), drag * radius**2 * (speed - rate))
+        right[n - 1] += m * radius * np.sin(angle) * rate**2
+        change = np.linalg.solve(left, right)
+        return np.concatenate([v, change[:n], [rate, change[n]]])
+
+    exact = solve_ivp(rates, (0.0, 1.0), ravel_pytree(start)[0], method="DOP853", rtol=1e-11, atol=1e-14).y[:, -1]
+    state = run.window.state
+    scale = np.max(np.abs(exact[:n]))
+    np.testing.assert_allclose(state.displacement[-1], exact[:n], rtol=0.0, atol=1e-7 * scale)
+    np.testing.assert_allclose(state.angle[0][-1], exact[2 * n : 2 * n + 1], rtol=0.0, atol=1e-7)

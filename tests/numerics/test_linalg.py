@@ -15,6 +15,7 @@ from jaxvib.numerics.linalg import (
     small_inverse,
     small_solve,
     solve_definite,
+    times,
 )
 
 
@@ -25,6 +26,14 @@ def test_small_solve_is_numpys(n):
         a = rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))
         b = rng.normal(size=n) + 1j * rng.normal(size=n)
         np.testing.assert_allclose(small_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-11)
+
+
+@pytest.mark.parametrize("shape", [(1, 17), (3, 3), (17, 17)])
+def test_times_is_numpys_product_of_any_size(shape):
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=shape), rng.normal(size=(5, shape[1]))
+    np.testing.assert_allclose(times(jnp.asarray(a), jnp.asarray(b[0])), a @ b[0], rtol=1e-13)
+    np.testing.assert_allclose(jax.vmap(times, (None, 0))(jnp.asarray(a), jnp.asarray(b)), b @ a.T, rtol=1e-13)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

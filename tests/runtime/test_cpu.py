@@ -55,3 +55,17 @@ assert "XLA_FLAGS" not in os.environ
 assert "loop_byte_threshold" not in jv.prepare_cpu()
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("2", "2")])
+def test_linear_algebra_uses_one_thread_unless_set(given, expected):
+    code = f"""
+import os
+os.environ.pop("OPENBLAS_NUM_THREADS", None)
+if {given!r}:
+    os.environ["OPENBLAS_NUM_THREADS"] = {given!r}
+import jaxvib as jv
+jv.balls
+assert os.environ["OPENBLAS_NUM_THREADS"] == {expected!r}
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
