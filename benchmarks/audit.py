@@ -28,7 +28,7 @@ from parts.common import machine_line  # noqa: E402
 
 from jaxvib.cli.study.audit import audit_text  # noqa: E402
 from jaxvib.study.audit.numbers import gravity_share  # noqa: E402
-from jaxvib.study.capture.capture import thrown_state  # noqa: E402
+from jaxvib.study.capture.capture import moving_state  # noqa: E402
 
 
 def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:
@@ -52,7 +52,7 @@ def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:
     return {
         "published two-mass machine": (published.scene(), {"mode": 3}),
         "rotor with four pendulums": (published_rotor(mu=9.2e-4, variant="uncoupled"), {"until": 12.0}),
-        "torus balancer": (torus, {"start": thrown_state(torus, -0.5), "until": 90.0}),
+        "torus balancer": (torus, {"start": moving_state(torus, -0.5), "until": 90.0}),
         "slow vertical machine": (slow, {"mode": 1}),
     }
 

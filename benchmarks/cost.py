@@ -29,7 +29,7 @@ from machines import published_rotor  # noqa: E402
 from parts.common import machine_line, published  # noqa: E402
 
 from jaxvib.cli.study.cost import cost_document, cost_table  # noqa: E402
-from jaxvib.study.accuracy.cost import WANTED  # noqa: E402
+from jaxvib.study.accuracy.cost import SHOWN_ERRORS  # noqa: E402
 
 COARSE = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 
@@ -72,9 +72,12 @@ SCENES: dict[str, tuple[str, Callable[[], jv.Cost]]] = {
 
 def markdown(costs: dict[str, jv.Cost]) -> str:
     """A line for each scene: the cheapest way to each error."""
-    lines = ["| scene | " + " | ".join(f"error {error:.0e}" for error in WANTED) + " |", "|---" * (len(WANTED) + 1) + "|"]
+    lines = [
+        "| scene | " + " | ".join(f"error {error:.0e}" for error in SHOWN_ERRORS) + " |",
+        "|---" * (len(SHOWN_ERRORS) + 1) + "|",
+    ]
     for title, cost in costs.items():
-        cells = [way(row) for row in map(cost.cheapest, WANTED)]
+        cells = [way(row) for row in map(cost.cheapest, SHOWN_ERRORS)]
         lines.append(f"| {title}: {cost.quantity} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

@@ -31,7 +31,7 @@ from machines import CONTACT, MODELS, published_tables, published_torus  # noqa:
 from parts import native_torus  # noqa: E402
 from parts.common import machine_line  # noqa: E402
 
-from jaxvib.study.capture.capture import thrown_state  # noqa: E402
+from jaxvib.study.capture.capture import moving_state  # noqa: E402
 from jaxvib.study.capture.refinement import DOUBLINGS  # noqa: E402
 
 SCENE = published_torus(2.5)
@@ -39,11 +39,11 @@ TOUCHING = jv.Scene(SCENE.machine, SCENE.loads, SCENE.drive, (*SCENE.all_effects
 
 
 def free(speed: jax.Array) -> tuple[jv.Scene, jv.State]:
-    return SCENE, thrown_state(SCENE, speed)
+    return SCENE, moving_state(SCENE, speed)
 
 
 def touching(speed: jax.Array) -> tuple[jv.Scene, jv.State]:
-    return TOUCHING, thrown_state(TOUCHING, speed)
+    return TOUCHING, moving_state(TOUCHING, speed)
 
 
 def spent(call: Callable[[], Any], rounds: int = 2) -> float:
@@ -73,7 +73,7 @@ def main() -> None:
     assert own is not None
     steps = jv.EqualSteps(4 * math.ceil(end * float(own) / 4))
     values = jnp.asarray(speeds)
-    starts = np.stack([native_torus.flat(thrown_state(SCENE, speed)) for speed in speeds])
+    starts = np.stack([native_torus.flat(moving_state(SCENE, speed)) for speed in speeds])
     numbers, loop = native_torus.numbers(SCENE), native_torus.simd_ensemble()
 
     def ours(make: Callable[..., Any], until: float, steps: jv.EqualSteps) -> jv.Ensemble:

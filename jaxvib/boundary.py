@@ -125,7 +125,7 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
             try:
                 kind = eval(kind, names)  # safe, since annotations are code of this package
             except NameError as error:
-                names[error.name or ""] = _DRAWN.get(error.name or "", Any)
+                names[error.name or ""] = _MATPLOTLIB_CLASSES.get(error.name or "", Any)
             except (TypeError, AttributeError):
                 kind = Any
         kind = Any if isinstance(kind, str) else kind
@@ -140,7 +140,7 @@ class _ByName(type):
         return any(each.__name__ == cls.__name__ for each in type(value).__mro__)
 
 
-_DRAWN = {name: _ByName(name, (), {}) for name in ("Axes", "Figure")}
+_MATPLOTLIB_CLASSES = {name: _ByName(name, (), {}) for name in ("Axes", "Figure")}
 
 
 def is_real(value: object) -> bool:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-_ALIKE = 1e-6
+_SAME_POINT_DIFFERENCE = 1e-6
 """Difference of quantities, relative to the range of the front, below which two machines count as one point."""
 
 _NO_LIMIT = 1e100
@@ -177,6 +177,6 @@ def not_dominated(values: np.ndarray) -> list[int]:
     scaled = values / np.where(span > 0.0, span, 1.0)
     kept: list[int] = []
     for k in np.argsort(np.sum(scaled, axis=1), kind="stable"):  # no row is beaten by one with a larger sum
-        if not any(np.all(scaled[j] <= scaled[k] + _ALIKE) for j in kept):
+        if not any(np.all(scaled[j] <= scaled[k] + _SAME_POINT_DIFFERENCE) for j in kept):
             kept.append(int(k))
     return sorted(kept, key=lambda k: (values[k, 0], -values[k, 1]))

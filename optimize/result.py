@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-_TELLING = 1000.0
+_MAX_SHOWN_PERCENT = 1000.0
 """Largest change that is shown in per cent; larger ones are shown in the unit of the objective."""
 
 
-_LINEAR = 10.0
+_MAX_LINEAR_PERCENT = 10.0
 """Largest change of the objective, per cent, that is predicted from its slope."""
 
-_LEAST_MOVE = 1e-6
+_MIN_LIMIT_CHANGE = 1e-6
 """Smallest change of a limit, per cent, that is shown."""
 
 
@@ -180,7 +180,7 @@ class Synthesis(Result):
         """Return the design before, after and verified, the active limits and the influences as text."""
         counted = f"{self.starts} starts ({self.drawn} drawn), {self.converged} converged, {self.same} to the best machine"
         lines = [f"{objective_text(self.objective)}: {self.message}", counted]
-        lines += [" ".join(line) for line in _aligned([["", "before", "after", "exact", "verified"], *self.rows()])]
+        lines += [" ".join(line) for line in _align_columns([["", "before", "after", "exact", "verified"], *self.rows()])]
         if self.unverified:
             lines.append(f"  not verified: {self.unverified}")
         lines += self.findings()
@@ -203,7 +203,7 @@ class Synthesis(Result):
         best = self.machines[0].value if self.machines else math.nan
 
         def changed(*percent: float) -> str:
-            if math.isnan(best) or not max(map(abs, percent)) > _TELLING:
+            if math.isnan(best) or not max(map(abs, percent)) > _MAX_SHOWN_PERCENT:
                 return " / ".join(f"{each:+.3g} %" for each in percent) + " of the objective"
             moved = [max(abs(best), 1e-300) * each / 100.0 for each in percent]  # for an objective near 0
             unit, factor = shown_unit(self.unit, max(map(abs, moved)))
@@ -215,7 +215,7 @@ class Synthesis(Result):
             if limit.broken > 0.0:
                 lines.append(f"  not met: {limit.what}; {limit.shortfall()}")
             elif limit.active:
-                lines.append(f"  at its limit: {limit.what} ({values}); {_if_moved(limit.gain)}")
+                lines.append(f"  at its limit: {limit.what} ({values}); {_limit_influence(limit.gain)}")
             else:
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
@@ -252,22 +252,22 @@ class Synthesis(Result):
         return convergence(factor * self.history, best=best, label=label, ax=ax)
 
 
-def _aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+def _align_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return [
         ["  " + row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))] for row in rows
     ]
 
 
-def _if_moved(gain: float) -> str:
+def _limit_influence(gain: float) -> str:
     """Return text on the change of the objective by a change of a limit, from the `gain` for 1 %.
 
     The change of the limit is so small that the slope is valid: the objective changes by at most a tenth.
     """
     share = 1.0
-    while abs(gain) * share > _LINEAR:
+    while abs(gain) * share > _MAX_LINEAR_PERCENT:
         share /= 10.0
-    if share < _LEAST_MOVE:
+    if share < _MIN_LIMIT_CHANGE:
         return "the objective is almost zero relative to its slope"
     return f"changed by {share:g} %: about {gain * share:+.3g} % of the objective"
 

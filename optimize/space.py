@@ -150,7 +150,7 @@ class DesignSpace(eqx.Module):
         choices: Mapping[str, Sequence[Number]] | None = None,
     ):
         _require_tables(scene, free, hold, ties, choices)
-        chosen, counts = _chosen(scene, choices or {})
+        chosen, counts = _read_choices(scene, choices or {})
         if not free and not chosen:
             raise InputError("free", "is empty; name at least one number that may change, such as machine.stiffness")
         ranges = [(name, *_bounds(scene, name, bounds)) for name, bounds in free.items()]
@@ -173,7 +173,7 @@ class DesignSpace(eqx.Module):
         self.scene = scene
         self.free, self.logs, self.choices = tuple(numbers), tuple(logs), tuple(choices_)
         self.low, self.high = np.asarray(lows), np.asarray(highs)
-        self.ties = _tied(scene, ties or {}, taken)
+        self.ties = _read_ties(scene, ties or {}, taken)
         self.counts = counts
         for held in hold:
             if not isinstance(held, HeldQuantity):
@@ -294,7 +294,9 @@ def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, float
     return found, low, high, log
 
 
-def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict[str, tuple[float, ...]], tuple[int, ...]]:
+def _read_choices(
+    scene: Scene, choices: Mapping[str, Sequence[Number]]
+) -> tuple[dict[str, tuple[float, ...]], tuple[int, ...]]:
     """Return the catalogues by name, ascending without duplicates, and the numbers of loads."""
     found: dict[str, tuple[float, ...]] = {}
     counts: tuple[int, ...] = ()
@@ -312,7 +314,7 @@ def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict
     return found, counts
 
 
-def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ...]:
+def _read_ties(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ...]:
     found = []
     for name, given in ties.items():
         target = find_number(scene, name, "ties")

@@ -30,20 +30,20 @@ from optimize.quantities.jams import amplitude, between, force_per_amplitude, fo
 from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, require_quantity, walk
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Found, Options, Searcher, choose, require_searcher
-from optimize.search.polish import FEASIBLE
-from optimize.search.problem import Problem, made, problem_of, reported
+from optimize.search.polish import FEASIBILITY_TOLERANCE
+from optimize.search.problem import Problem, evaluate_quantities, made, problem_of
 from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
 from optimize.space import DesignSpace
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
-_CONVERGED = 1e-6
+_CONVERGED_DECREASE = 1e-6
 """Largest decrease of the objective, relative to its value, that a converged design may still allow nearby."""
 
 _SAME_DESIGN_DISTANCE = 1e-3
 """Largest distance of two designs that count as the same machine, relative to the ranges of the free parameters."""
 
-_SPREAD = 1e-3
+_INITIAL_SPREAD = 1e-3
 """Largest initial angle of the loads from the exact motion, rad."""
 
 Tell = Callable[[str, float], None]
@@ -116,16 +116,16 @@ def synthesize(
     Source: the antiphase paper, section 5.1, found there by algebra.
     """
     options = _options(starts, seed, iterations, polishing, rate, searcher)
-    demands = _checked(space, objective, subject_to)
+    demands = _validate_demands(space, objective, subject_to)
     tell: Tell = lambda what, share: None if progress is None else call_user(progress, "progress", what, share)  # noqa: E731
     if begin is not None:
-        options = dataclasses.replace(options, begin=_begun(space, begin), starts=len(begin.designs))
-    space, problem, found = _searched(space, objective, demands, options, tell)
+        options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
+    space, problem, found = _search(space, objective, demands, options, tell)
     best = found.best
     others = made(problem, neighbours(problem, found))
     scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], others)))
-    kept = found.violation < 10.0 * FEASIBLE
-    done = kept & (found.left < _CONVERGED)
+    kept = found.violation < 10.0 * FEASIBILITY_TOLERANCE
+    done = kept & (found.left < _CONVERGED_DECREASE)
     values = np.where(kept, found.point.values[:, 0], np.inf)
     if found.interrupted:
         status = SynthesisStatus.interrupted
@@ -135,10 +135,10 @@ def synthesize(
         status = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged
 
     mode = _mode_of(objective, demands)
-    named = _named(space, scene, objective, demands, mode)
+    named = _named_quantities(space, scene, objective, demands, mode)
     sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
-    reports = reported((*(q for _, q in named), objective, *sides), batch, problem)
+    reports = evaluate_quantities((*(q for _, q in named), objective, *sides), batch, problem)
     limits = limits_of(problem, demands, found, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
         broken = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.broken)
@@ -190,7 +190,7 @@ def _options(starts: int, seed: int, iterations: int, polishing: int, rate: floa
     return Options(starts, seed, iterations, float(rate), polishing, searcher)
 
 
-def _checked(space: DesignSpace, objective: Quantity, subject_to: Demand | Sequence[Demand]) -> tuple[Demand, ...]:
+def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Demand | Sequence[Demand]) -> tuple[Demand, ...]:
     if not isinstance(space, DesignSpace):
         raise InputError("space", f"is {quoted(space)}; it must be a DesignSpace")
     require_quantity(objective, "objective")
@@ -211,7 +211,7 @@ def _checked(space: DesignSpace, objective: Quantity, subject_to: Demand | Seque
     return demands
 
 
-def _begun(space: DesignSpace, begin: Synthesis) -> np.ndarray:
+def _designs_to_continue(space: DesignSpace, begin: Synthesis) -> np.ndarray:
     if not isinstance(begin, Synthesis):
         raise InputError("begin", f"is {quoted(begin)}; it must be the Synthesis of an earlier search of this space")
     if begin.designs.shape[1] != space.size:
@@ -219,7 +219,7 @@ def _begun(space: DesignSpace, begin: Synthesis) -> np.ndarray:
     return np.asarray(begin.designs)
 
 
-def _searched(
+def _search(
     space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options, tell: Tell
 ) -> tuple[DesignSpace, Problem, Found]:
     """Return the best result over all allowed numbers of loads."""
@@ -254,13 +254,13 @@ def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     every = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
     z = np.random.default_rng(options.seed).uniform(size=(options.starts, space.size))
-    values = reported(every, made(problem_of(space, objective, (), options.starts), space.numbers(z)))
+    values = evaluate_quantities(every, made(problem_of(space, objective, (), options.starts), space.numbers(z)))
     absent = [q.words for q, there in zip(every, np.any(np.isfinite(values), axis=0).tolist(), strict=True) if not there]
     return " or ".join(absent) or "all of: " + ", ".join(q.words for q in every)
 
 
 def _rank(found: Found) -> tuple[bool, float]:
-    kept = bool(found.violation[found.best] < 10.0 * FEASIBLE)
+    kept = bool(found.violation[found.best] < 10.0 * FEASIBILITY_TOLERANCE)
     return not kept, float(found.point.values[found.best, 0] if kept else found.violation[found.best])
 
 
@@ -313,7 +313,7 @@ def _beside(orbit: Orbit) -> State:
     From a start on the leading-order motion, a machine with little damping takes thousands of periods to reach the exact one.
     """
     displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
-    spread = _SPREAD * np.linspace(-1.0, 1.0, len(angle)) if len(angle) > 1 else np.zeros(1)
+    spread = _INITIAL_SPREAD * np.linspace(-1.0, 1.0, len(angle)) if len(angle) > 1 else np.zeros(1)
     return State(displacement, velocity, (angle + spread,), rate)
 
 
@@ -327,7 +327,7 @@ def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quant
     return [*rows, ("force per amplitude", force_per_amplitude(mode=mode, of=of))]
 
 
-def _named(
+def _named_quantities(
     space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand], mode: int | None
 ) -> list[tuple[str, Quantity]]:
     """Return the quantities of the table: the standard ones of a jam, then the objective, held quantities and demands."""

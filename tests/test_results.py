@@ -31,7 +31,7 @@ from jaxvib.study.audit.audit import AuditStatus
 from jaxvib.study.audit.compared import EffectRow
 from jaxvib.study.audit.numbers import NumberRow
 from jaxvib.study.audit.tiers import TierRow
-from jaxvib.study.capture.capture import _judged
+from jaxvib.study.capture.capture import _summarize_captures
 from jaxvib.study.capture.curve import ThresholdCurve
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
@@ -135,7 +135,7 @@ RESULTS = {
     "Identified": cached(identified),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "RunUps": run_ups,
-    "Capture": lambda: _judged(
+    "Capture": lambda: _summarize_captures(
         np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150, 7200
     ),
     "ThresholdCurve": lambda: ThresholdCurve(

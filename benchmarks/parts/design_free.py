@@ -22,7 +22,7 @@ import jaxvib as jv
 from optimize import DesignSpace, Quantity, force_per_amplitude
 from optimize.search import descent, find, model, polish
 from optimize.search.evolve import Followed, evolve
-from optimize.search.problem import Point, Problem, looked_up, problem_of
+from optimize.search.problem import Point, Problem, find_speeds, problem_of
 
 __all__ = ["SIZES", "chain", "gradient_cost", "race"]
 
@@ -76,7 +76,7 @@ def gradient_cost(free: int, repeat: int = 200) -> tuple[float, float]:
     space, wish = chain(free)
     problem = problem_of(space, wish, ())
     z = np.asarray(space.where(space.scene))
-    near = tuple(jnp.asarray(w[0]) for w in looked_up(problem, z[None]))
+    near = tuple(jnp.asarray(w[0]) for w in find_speeds(problem, z[None]))
 
     def value(x: jax.Array) -> jax.Array:
         return problem.values(x, near)[0][0]
@@ -116,7 +116,7 @@ def by_gradients(problem: Problem, polishing: int, seconds: float) -> Course:
     starts, begun = 16, time.perf_counter()
     try:
         while not course.seconds or course.seconds[-1] < seconds / 5.0:  # the next round takes four times as long
-            drawn = polish.draw_starts(problem, starts, starts, looked_up)
+            drawn = polish.draw_starts(problem, starts, starts, find_speeds)
             assert drawn.point is not None
             descending[0] = len(drawn.point.z)
             point = descent.descend(problem, drawn.point, 200, 0.05, told).point

@@ -108,7 +108,7 @@ class Output:
         if path is not None:
             path.write_text(body + "\n", encoding="utf-8")
         if self.report is not None:
-            self._reported(self.report, values, text, name, result)
+            self._write_report(self.report, values, text, name, result)
         if self.as_json:
             click.echo(body)
             return
@@ -116,7 +116,7 @@ class Output:
         for written in self.files:
             click.echo(f"wrote {written}")
 
-    def _reported(
+    def _write_report(
         self, path: Path, document: dict[str, Plain], text: Callable[[], str], name: str, result: Result | None
     ) -> None:
         from jaxvib.machine.files import load_scene

@@ -50,7 +50,7 @@ from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.terms import GravityField, LoadPotential
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import eigenvalues_in_turn, magnitude, small_solve, times, written_inverse
+from jaxvib.numerics.linalg import eigenvalues_in_turn, magnitude, small_solve, times, unrolled_inverse
 
 __all__ = [
     "AVERAGED_TERMS",
@@ -281,6 +281,6 @@ def _with_conjugate(a: Array, b: Array, right: Array) -> Array:
         return (jnp.conj(a) * right - b * jnp.conj(right)) / (a.real**2 + a.imag**2 - b.real**2 - b.imag**2)
     top = jnp.concatenate([a.real + b.real, b.imag - a.imag], axis=1)
     bottom = jnp.concatenate([a.imag + b.imag, a.real - b.real], axis=1)
-    x = times(written_inverse(jnp.concatenate([top, bottom])), jnp.concatenate([right.real, right.imag]))
+    x = times(unrolled_inverse(jnp.concatenate([top, bottom])), jnp.concatenate([right.real, right.imag]))
     n = right.shape[0]
     return x[:n] + 1j * x[n:]

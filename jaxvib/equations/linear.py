@@ -29,11 +29,11 @@ from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import (
-    TRUSTED,
+    MAX_EIGENVALUE_ERROR,
     hermitian_error,
     hermitian_modes,
     magnitude,
-    refined,
+    refine_solution,
     relative_to,
     root_or_zero,
     small_solve,
@@ -187,7 +187,7 @@ class JammedModel(LinearModel):
             return elastic - omega**2 * inertia + 1j * omega * viscous
 
         def solve(product: Callable[[Array], Array], right: Array) -> Array:
-            return refined(product, lambda rest: modal.solve(omega, rest), right, modal.norm(omega))
+            return refine_solution(product, lambda rest: modal.solve(omega, rest), right, modal.norm(omega))
 
         return jax.lax.custom_linear_solve(product, self.force(omega), solve, symmetric=True)
 
@@ -267,7 +267,7 @@ def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
     model = linear_model(scene)
     frequencies, shapes = model.modes()
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
-    lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * TRUSTED
+    lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * MAX_EIGENVALUE_ERROR
     # A motion of frequency 0 is free to drift unless a spring to the foundation resists it.
     restoring = jnp.max(jnp.abs(carrier.foundation_stiffness @ x), axis=0)
     resisted = restoring > 1e-3 * jnp.max(jnp.abs(carrier.foundation_stiffness)) * jnp.max(jnp.abs(x), axis=0)

@@ -36,7 +36,7 @@ _EXPONENTS = {8: (1, 0), 11: (1, 0), 12: (1, 0), 9: (0, 1), 13: (0, 1), 15: (-2,
 """Exponents of length and force in the unit of a quantity, by its specific data type."""
 
 _LINES = 2048
-_HIGHEST = 1.5
+_HIGHEST_FREQUENCY_RATIO = 1.5
 """Highest default frequency, relative to the highest natural frequency."""
 
 _DIGITS = 5
@@ -236,7 +236,7 @@ def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_s
 def _even_frequencies(scene: Scene, frequencies: Numbers | None) -> np.ndarray:
     """Return frequencies in Hz. **Raises** `InputError` if they are not evenly spaced."""
     if frequencies is None:
-        step = _HIGHEST * float(np.max(np.asarray(estimated_frequencies(scene)))) / (2.0 * np.pi * _LINES)
+        step = _HIGHEST_FREQUENCY_RATIO * float(np.max(np.asarray(estimated_frequencies(scene)))) / (2.0 * np.pi * _LINES)
         return float(f"{step:.{_DIGITS - 1}e}") * np.arange(1, _LINES + 1)
     x = np.asarray(numbers(frequencies, "Hz", "frequencies", None, low=0.0), float)
     if x.ndim != 1 or x.size < 2:

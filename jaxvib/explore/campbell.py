@@ -15,7 +15,7 @@ from jaxvib.steady.whirl import Whirl
 _FORWARD = {"color": COLORS[0], "lw": 1.5}
 _BACKWARD = {"color": COLORS[1], "lw": 1.5, "ls": "--"}
 _CRITICAL = {"fc": "white", "ec": "black", "lw": 1.2, "zorder": 4.0}
-_DROP = {"color": GUIDE, "lw": 0.7, "zorder": 1.2}
+_DROP_LINE = {"color": GUIDE, "lw": 0.7, "zorder": 1.2}
 _LETTER = 0.11
 """Upper bound of the width of a letter, in units of the drawing."""
 
@@ -60,7 +60,7 @@ def campbell(found: Whirl, at: float) -> str:
     for k in shown:
         w = float(critical[k])
         look = {**_CRITICAL, "ec": COLORS[0] if forward_critical[k] else COLORS[1]}
-        parts += [panel.line([w, w], [0.0, w], _DROP), dot(*panel.at(w, w), look, square=not forward_critical[k])]
+        parts += [panel.line([w, w], [0.0, w], _DROP_LINE), dot(*panel.at(w, w), look, square=not forward_critical[k])]
     ends: list[float] = []  # right end of the texts in each row, from the lowest row upward
     for group, word in groups:
         x, _ = panel.at(float(critical[group[-1]]), 0.0)

@@ -101,7 +101,7 @@ class Mount(eqx.Module):
         """Return the rows of each load's point, (count, np, nd). `count` is the number of loads."""
         if self.at_one_point:
             return jnp.broadcast_to(self.rows[0], (count, *self.rows[0].shape))
-        return jax.vmap(lambda levers: _combined(levers, self.rows))(self.levers)
+        return jax.vmap(lambda levers: _combine(levers, self.rows))(self.levers)
 
     def load_rates(self, rate: Array) -> dict[int, Array]:
         """Return the velocities (or accelerations) of the loads' points by axis, from the rates `rate` (nd,) of the
@@ -113,11 +113,11 @@ class Mount(eqx.Module):
             return dict(zip(self.axes, self.rows[0] @ rate, strict=True))
         levers = [None if lever is None else lever[None, :] for lever in self.levers]
         moved = [(row @ rate)[:, None] for row in self.rows[: len(levers)]]
-        return dict(zip(self.axes, _combined(levers, moved), strict=True))
+        return dict(zip(self.axes, _combine(levers, moved), strict=True))
 
     def rotor_rows(self) -> Array:
         """Return the rows of the rotor's mass centre, (np, nd)."""
-        return _combined(self.rotor_levers, self.rows)
+        return _combine(self.rotor_levers, self.rows)
 
     def distances(self, count: int) -> Array:
         """Return the distance of each of `count` loads from the rotor's mass centre along the axis, (count,) m.
@@ -134,6 +134,6 @@ def scaled(lever: Array | None, value: Array) -> Array:
     return value if lever is None else lever * value
 
 
-def _combined(levers: Sequence[Array | None], values: Sequence[Array]) -> Array:
+def _combine(levers: Sequence[Array | None], values: Sequence[Array]) -> Array:
     terms = [scaled(lever, value) for lever, value in zip(levers, values, strict=False)]
     return sum(terms[1:], terms[0])

@@ -240,7 +240,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     field, start = field_of(equations, scene), state
     if watched:
         pulls = [jnp.zeros_like(own.angle[0]) if own.angle else jnp.zeros(1) for own in state.exciters]
-        field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _joined(pulls))
+        field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _concatenate(pulls))
     motion = pack_batch(field, start, single, has_common_turns, implicit=implicit)
     length = end / ENSEMBLE_PARTS
 
@@ -298,8 +298,8 @@ class _FieldWithDetachment(eqx.Module):
             assert normal_force is not None
             force = normal_force.at(scene.machine.mount(exciter.place).load_rates(change.velocity))
             pulls.append(jnp.maximum(-force, 0.0))
-        return _StateWithDetachment(change, _joined(pulls))
+        return _StateWithDetachment(change, _concatenate(pulls))
 
 
-def _joined(arrays: list[Array]) -> Array:
+def _concatenate(arrays: list[Array]) -> Array:
     return arrays[0] if len(arrays) == 1 else jnp.concatenate(arrays)

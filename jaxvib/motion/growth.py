@@ -38,14 +38,14 @@ _THOUSANDFOLD, _DOUBLED = math.log(1e3), math.log(2.1)
 """Logarithms of growth over the later half of a run: smallest value that is certainly exponential; largest value of growth in
 proportion to time, with a margin."""
 
-_UNSEEN = math.log(1.01)
+_MAX_LOG_GROWTH_OF_ERRORS = math.log(1.01)
 """Largest logarithm of growth over the later half of a run that integration errors can cause."""
 
-_FADING = 0.85
+_MAX_GROWTH_RATIO_OF_QUARTERS = 0.85
 """Largest ratio of growth in the last quarter of a run to that in the quarter before, for growth that is not exponential;
 growth in proportion to time has 0.71, exponential growth 1."""
 
-_RETURNED = 1e-2
+_RETURN_DISTANCE = 1e-2
 """Distance from a previous state at which a motion has returned to it, relative to the largest distance in between."""
 
 _TURNS, _SAMPLES = 3.0, 4096
@@ -189,7 +189,7 @@ def growth(
         other = _at_distance(state, jax.tree.map(jnp.add, state, gone), scale, separation)
     late = np.array(rates[stretches // 2 :])
     exponent, uncertainty = float(np.mean(late)), _sum_error(late) / late.size
-    name = _judged(late * stretch)
+    name = _classify_growth(late * stretch)
     if name == "chaotic" and all(_returns(scene, quarter, steps) for quarter in quarters):
         name = "unstable"
     fastest = {"regular": 0.0, "undecided": exponent + 3.0 * uncertainty}.get(name, exponent)
@@ -198,7 +198,7 @@ def growth(
     return Growth(member(GrowthStatus, name), exponent, uncertainty, horizon, np.array(rates), times)
 
 
-def _judged(late: np.ndarray) -> str:
+def _classify_growth(late: np.ndarray) -> str:
     """Return the name of the `GrowthStatus` from logarithms `late` (n,) of the growth in each stretch of a run's later half.
 
     Periodic motions are not distinguished here: "chaotic" includes "unstable".
@@ -209,8 +209,8 @@ def _judged(late: np.ndarray) -> str:
     if grown > max(3.0 * error, _THOUSANDFOLD):
         spread = math.hypot(*(_sum_error(quarter) / quarter.size for quarter in (first, last)))
         return "chaotic" if abs(rising) < max(3.0 * spread, 0.25 * float(np.mean(late))) else "undecided"
-    fades = grown < _DOUBLED and float(np.mean(last)) < _FADING * float(np.mean(first))
-    seen = grown > max(2.0 * error, _UNSEEN)
+    fades = grown < _DOUBLED and float(np.mean(last)) < _MAX_GROWTH_RATIO_OF_QUARTERS * float(np.mean(first))
+    seen = grown > max(2.0 * error, _MAX_LOG_GROWTH_OF_ERRORS)
     return "regular" if grown + 3.0 * error < _THOUSANDFOLD and (fades or not seen) else "undecided"
 
 
@@ -247,7 +247,7 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
     distance = np.sqrt(sum(jax.tree.leaves(parts)))
     farthest = float(np.max(distance))
     away = int(np.argmax(distance > 0.3 * farthest))
-    return float(np.min(distance[away:])) < _RETURNED * farthest
+    return float(np.min(distance[away:])) < _RETURN_DISTANCE * farthest
 
 
 def _distance(a: State, b: State, scale: State) -> float:

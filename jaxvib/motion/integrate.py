@@ -35,7 +35,7 @@ WINDOW = 4096
 PER_TURN = 16
 """Minimum number of samples in a turn of the rotor; the interpolant between them then has an error of 1e-7."""
 
-_UNBOUNDED = 1e8
+_UNBOUNDED_FACTOR = 1e8
 """Factor on the initial displacement, or on the natural units, beyond which a motion is unbounded."""
 
 
@@ -246,9 +246,10 @@ def _is_coincident(angles: list[Array]) -> Array:
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:
-    """Return True if the displacement of the carrier exceeds its start and its natural units by the factor `_UNBOUNDED`."""
+    """Return True if the displacement of the carrier exceeds its start and its natural units by the factor
+    `_UNBOUNDED_FACTOR`."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
-    beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
+    beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED_FACTOR * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
     return beyond[0] | beyond[1] | ~is_finite(last)
 
 

@@ -291,7 +291,7 @@ def _require_turns(time: np.ndarray, speed: float) -> None:
         raise InputError("run", f"has {turns:.2g} turns in its window; an ellipse needs {_MIN_TURNS}, simulate with more turns")
 
 
-def judged_by_separation(run: Run) -> Run:
+def with_separation_status(run: Run) -> Run:
     """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
     if not (status_name(run.status) in ENDS and would_separate(run.scene, run.window)):
         return run

@@ -20,7 +20,7 @@ from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation
 from jaxvib.motion.integrate import WINDOW, frequency_bounds, whole_turns
 from jaxvib.motion.plan import RunPlan, plan_stretch, start_state
-from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, judged_by_separation
+from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.motion.steps import StepChoice, Tolerance
@@ -31,26 +31,26 @@ from jaxvib.steady.jams.jam import jam_modes, jams_of
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 
-_REMEMBERED = 32
+_MEAN_STRETCHES = 32
 """Number of stretches, of 100 slow periods each, on which the decision about a steady mean is based."""
 
-_SCATTER = 3.6
+_MAX_QUARTER_DIFFERENCE = 3.6
 """Largest difference of the means over the four quarters of these stretches that counts as chance, in standard errors, 95 %."""
 
-_AWAY = 10.0
+_MAX_DISTANCE_IN_DRIFTS = 10.0
 """Largest distance of a settled motion from its steady state, in units of the drift."""
 
-_CREEPS = 4
+_CREEP_STRETCHES = 4
 """Number of stretches on which the decision about creeping loads is based."""
 
-_EVENLY = 0.05
+_MAX_CREEP_DIFFERENCE = 0.05
 """Largest relative difference of the angles by which loads creep in two of these stretches."""
 
-_NEUTRAL = 0.01
+_MAX_UNBALANCE_CHANGE_RATIO = 0.01
 """Largest ratio of the change of the residual unbalance and the change of the angles, in rad, of loads that creep along
 balanced arrangements. In any other direction the ratio is at least 1 divided by the number of loads."""
 
-_FALLS = -3.0
+_DECREASE_SLOPE = -3.0
 """Slope of the logarithm of the drift, in standard errors, beyond which the drift is decreasing."""
 
 
@@ -111,7 +111,7 @@ def settle(
     True
     """
     plan = _plan_settle(scene, start, mode, separation, drift, periods, stretches, stepsize_controller, throw=throw)
-    run, has_settled = _settled(plan, throw=throw)
+    run, has_settled = _integrate_until_settled(plan, throw=throw)
     if throw and not has_settled:
         raise ComputationError(
             "not_settled",
@@ -178,12 +178,12 @@ def _plan_settle(
         stretches=count(stretches, "stretches"),
         drift=usual if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True)),
         usual=usual,
-        remembered=4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
+        remembered=4 * math.ceil(_MEAN_STRETCHES * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
         decay=_slowest_decay(scene),
     )
 
 
-def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
+def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
     """Return the run of the last stretch, and true if the motion has settled or is unstable and continues at one angle."""
     length, state = float(plan.first.end), plan.first.state
     coincident, drifts, measured, regimes = True, [], [], []
@@ -194,29 +194,29 @@ def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
         if status_name(run.status) != "done":
             return run, False
         drifts.append(float(run.drift))
-        if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _AWAY * plan.drift:
-            judged = _judged(run, "done")
+        if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
+            judged = _with_final_status(run, "done")
             # No test is needed for loads that are not at exactly one angle: they leave an unstable motion.
             if is_coincident or status_name(judged.status) == "done":
                 return judged, True
         if plan.remembered is not None:
             measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
             if len(measured) >= plan.remembered and _steady_in_the_mean(np.array(measured[-plan.remembered :])):
-                return _judged(run, "beating"), True
+                return _with_final_status(run, "beating"), True
             is_plain = plan.first.scene.is_plain
             if is_plain and drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.usual):
                 regimes.append(run.regime)
-                if _is_creeping(regimes[-_CREEPS:]):
-                    return _judged(run, "creeping"), True
+                if _is_creeping(regimes[-_CREEP_STRETCHES:]):
+                    return _with_final_status(run, "creeping"), True
         if len(drifts) == plan.stretches:
-            last = _judged(run, "done") if drifts[-1] < SETTLED_DRIFT else run
+            last = _with_final_status(run, "done") if drifts[-1] < SETTLED_DRIFT else run
             return last, status_name(last.status) == "would_separate"
         state = last_state(plan.first.scene, run)
 
 
-def _judged(run: Run, name: str) -> Run:
+def _with_final_status(run: Run, name: str) -> Run:
     """Return the run with the status of that name, or with `would_separate`."""
-    return judged_by_separation(dataclasses.replace(run, status=member(RunStatus, name)))
+    return with_separation_status(dataclasses.replace(run, status=member(RunStatus, name)))
 
 
 @cached
@@ -260,7 +260,7 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
     place = np.arange(len(seen)) - (len(seen) - 1) / 2.0
     fall = place @ np.log(drift) / (place @ place)
     rest = np.log(drift) - np.mean(np.log(drift)) - fall * place
-    if fall < _FALLS * np.sqrt(rest @ rest / (len(seen) - 2) / (place @ place)):
+    if fall < _DECREASE_SLOPE * np.sqrt(rest @ rest / (len(seen) - 2) / (place @ place)):
         return False
     quarters = values.reshape(4, -1, values.shape[1])
     means = quarters.mean(axis=1)
@@ -268,19 +268,19 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
     error = np.sqrt(quarters.var(axis=1, ddof=1).mean(axis=0) / quarters.shape[1])
     size = np.abs(means).mean(axis=0)
     size[2:] = size[2:].max()  # a drift is relative to the largest amplitude
-    return bool(np.all(separation <= np.maximum(_SCATTER * error, 0.5 * np.median(drift) * size)))
+    return bool(np.all(separation <= np.maximum(_MAX_QUARTER_DIFFERENCE * error, 0.5 * np.median(drift) * size)))
 
 
 def _is_creeping(regimes: Sequence[Regime]) -> bool:
     """Return True if loads balance the rotor in each of some stretches and creep evenly along balanced arrangements."""
-    if len(regimes) < _CREEPS or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
+    if len(regimes) < _CREEP_STRETCHES or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
         return False
     phase = np.array([np.asarray(regime.phase) for regime in regimes])
     unbalance = np.array([float(regime.unbalance) for regime in regimes])
     steps = np.angle(np.exp(1j * np.diff(phase, axis=0)))
     size = float(np.max(np.abs(steps)))
-    even = float(np.max(np.ptp(steps, axis=0))) < _EVENLY * size
-    return even and float(np.ptp(unbalance)) < _NEUTRAL * size
+    even = float(np.max(np.ptp(steps, axis=0))) < _MAX_CREEP_DIFFERENCE * size
+    return even and float(np.ptp(unbalance)) < _MAX_UNBALANCE_CHANGE_RATIO * size
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:

@@ -22,7 +22,7 @@ from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
 from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate, whole_turns, wrap_angles
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, plan_run
-from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, judged_by_separation
+from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.start import Start
 from jaxvib.motion.steps import StepChoice
 from jaxvib.motion.stiffness import advice
@@ -134,7 +134,7 @@ def simulate(
         prepare_run(plan_from(start="rest", mode=None, separation=None))
     plan = plan_from(start=start, mode=mode, separation=separation)
     run = run_planned(plan, throw=throw)
-    return judged_by_separation(run) if plan.is_known and float(run.drift) < SETTLED_DRIFT else run
+    return with_separation_status(run) if plan.is_known and float(run.drift) < SETTLED_DRIFT else run
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:
@@ -219,7 +219,7 @@ def _sum(counts: list[Array]) -> Array:
     return on_device(np.sum([np.asarray(each) for each in counts], dtype=counts[0].dtype))
 
 
-_COARSER = 100.0
+_COARSE_TOLERANCE_RATIO = 100.0
 """Ratio of the tolerances of the second run (for the error estimate) and the first."""
 
 
@@ -228,7 +228,7 @@ def _coarser(control: StepControl) -> StepControl:
     if control.steps is not None:
         return StepControl(steps=np.asarray(np.ceil(control.steps / 2.0), control.steps.dtype))
     assert control.tolerance is not None
-    larger = np.minimum(_COARSER * control.tolerance, np.sqrt(control.tolerance))
+    larger = np.minimum(_COARSE_TOLERANCE_RATIO * control.tolerance, np.sqrt(control.tolerance))
     return StepControl(tolerance=np.asarray(larger, control.tolerance.dtype))
 
 
@@ -242,7 +242,7 @@ def _run_with_estimate(plan: RunPlan) -> Run:
         fine, coarse = in_threads(lambda k: both[k](), 2)
     else:
         fine, coarse = (each() for each in both)
-    return _compared(plan, fine, coarse, control, coarser, coarse.evaluations)
+    return _compare_runs(plan, fine, coarse, control, coarser, coarse.evaluations)
 
 
 _ATTEMPTS = 6
@@ -258,7 +258,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
     before = run = _run(plan, coarser)
     for _ in range(_ATTEMPTS - 1):
         latest = _run(plan, control)
-        run = _compared(plan, latest, before, control, coarser, known(run.evaluations))
+        run = _compare_runs(plan, latest, before, control, coarser, known(run.evaluations))
         if status_name(run.status) != "done" or float(run.error) <= accuracy:
             return run
         tolerance = float(cast(Array, control.tolerance))
@@ -273,7 +273,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
     return eqx.tree_at(lambda r: r.status, run, RunStatus.not_accurate)
 
 
-def _compared(
+def _compare_runs(
     plan: RunPlan,
     fine: Run,
     coarse: Run,
@@ -283,7 +283,7 @@ def _compared(
 ) -> Run:
     """Return the run with smaller steps, with its estimated error and the cost of both; `before`: previous evaluations."""
     theirs, counted = (coarse.window.state, coarse.status), (fine.evaluations, before)
-    error, evaluations = _estimated(plan.scene, plan.fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
+    error, evaluations = _estimate_error(plan.scene, plan.fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
 
@@ -300,7 +300,7 @@ def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
 
 
 @cached
-def _estimated(
+def _estimate_error(
     scene: Scene,
     fastest: Array | np.ndarray,
     window: Trajectory,

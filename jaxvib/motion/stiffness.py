@@ -19,16 +19,16 @@ from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.runtime.programs import cached
 
-_RESOLVED = 3.0
+_MAX_DECAY_PER_STEP = 3.0
 """Largest product of decay rate and explicit step for which the method is accurate; above about 6 it diverges."""
 
-_STIFF = 100.0
+_STIFF_RATE_RATIO = 100.0
 """Ratio of the rates of decay and motion beyond which the implicit method costs less than explicit steps."""
 
 IMPLICIT_PER_RADIAN = 32.0
 """Number of equal implicit steps per radian of the fastest motion; the method of order 4 then has an error of about 1e-7."""
 
-_MAX_IMPLICIT = 64
+_MAX_IMPLICIT_SIZE = 64
 """Largest size of a state for which the dense matrices of the implicit method cost less than explicit steps."""
 
 
@@ -70,7 +70,7 @@ def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
 def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:
     """Return the implicit method if the decay of a scene with known numbers is too fast for explicit steps, else None."""
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
-    return Rodas4() if size <= _MAX_IMPLICIT and float(fastest_decay(scene)) > _STIFF * float(fastest) else None
+    return Rodas4() if size <= _MAX_IMPLICIT_SIZE and float(fastest_decay(scene)) > _STIFF_RATE_RATIO * float(fastest) else None
 
 
 def steps_of(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
@@ -80,15 +80,15 @@ def steps_of(fastest: float, decay: float, per_radian: float, step: float | None
     motion; the length of the `step` if it is prescribed.
     """
     if step is not None:
-        return step, decay * step > _RESOLVED
-    if decay > _STIFF * fastest:
+        return step, decay * step > _MAX_DECAY_PER_STEP
+    if decay > _STIFF_RATE_RATIO * fastest:
         return 1.0 / (IMPLICIT_PER_RADIAN * fastest), True
-    return 1.0 / max(per_radian * fastest, decay / _RESOLVED), False
+    return 1.0 / max(per_radian * fastest, decay / _MAX_DECAY_PER_STEP), False
 
 
 def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.ndarray:
     """Return True if explicit steps of that length, s, diverge by the `decay`, 1/s."""
-    return decay * step > 2.0 * _RESOLVED
+    return decay * step > 2.0 * _MAX_DECAY_PER_STEP
 
 
 def advice(scene: Scene) -> str:

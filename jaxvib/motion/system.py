@@ -130,7 +130,7 @@ class PackedSystem(eqx.Module):
         if not self.wrapped:
             return self._state(packed)
         y, turns = packed
-        return self._state(_turned(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
+        return self._state(_add_turns(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
 
     def _wrap(self, packed: IntegratorState) -> IntegratorState:
         """Move whole turns from the angles to their counts."""
@@ -142,7 +142,7 @@ class PackedSystem(eqx.Module):
             return jnp.where(is_angle, jnp.round(x / _TURN), 0.0)
 
         done = jax.tree.map(whole, lead, tuple(is_angle) if self.is_on_scalars else is_angle)
-        return _turned(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
+        return _add_turns(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
 
     def _angles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return a mask of the numbers that are angles, and for each number the index of the angle that defines its turns."""
@@ -188,7 +188,7 @@ class PackedSystem(eqx.Module):
         return tuple(rates) if self.is_on_scalars else jnp.stack(rates)
 
 
-def _turned(y: IntegratorState, turns: IntegratorState, sign: float) -> IntegratorState:
+def _add_turns(y: IntegratorState, turns: IntegratorState, sign: float) -> IntegratorState:
     """Add whole turns to numbers, with 2 pi in two parts, since the rounding of 2 pi would accumulate."""
 
     def turned(x: Array, n: Array) -> Array:

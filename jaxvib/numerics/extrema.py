@@ -39,8 +39,8 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
     before = jnp.asarray(np.arange(n - 1) - first, x.dtype)
     polynomial = _polynomial(jnp.stack([x[first + k] for k in range(NODES)]), jnp.stack([v[first + k] for k in range(NODES)]))
-    slope = _derived(polynomial)
-    bend = _derived(slope)
+    slope = _derivative(polynomial)
+    bend = _derivative(slope)
     turns = v[:-1] * v[1:] < 0.0
 
     def nearer(_: int, share: Array) -> Array:
@@ -89,8 +89,8 @@ def extremum_value(x: Array, v: Array, place: Array) -> Array:
     x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` counts from the first, in steps.
     """
     polynomial = _polynomial(x, v)
-    slope = _derived(polynomial)
-    curved = _at(_derived(slope), place)
+    slope = _derivative(polynomial)
+    curved = _at(_derivative(slope), place)
     inside = (place != jnp.round(place)) & (curved != 0.0)
     move = jnp.where(inside, _at(slope, place), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
     return _at(polynomial, place - move + jax.lax.stop_gradient(move))
@@ -110,7 +110,7 @@ def _polynomial(x: Array, v: Array) -> Array:
     return jnp.concatenate([found[:1] + x[:1], found[1:]])
 
 
-def _derived(polynomial: Array) -> Array:
+def _derivative(polynomial: Array) -> Array:
     powers = jnp.arange(1, len(polynomial), dtype=polynomial.dtype)
     return polynomial[1:] * powers.reshape(-1, *(1,) * (polynomial.ndim - 1))
 

@@ -12,10 +12,10 @@ import numpy as np
 from jax import Array
 from jax.custom_batching import custom_vmap
 
-_WRITTEN = 8
+_MAX_UNROLLED_EQUATIONS = 8
 """Largest number of equations for which `eliminate` is as fast as a library call for each system of a batch."""
 
-TRUSTED = 1e-2
+MAX_EIGENVALUE_ERROR = 1e-2
 """Largest relative error of a valid eigenvalue; beyond it, its digits are lost to rounding."""
 
 _compiled = functools.partial(jax.jit, inline=True)
@@ -186,8 +186,8 @@ def small_solve(a: Array, b: Array) -> Array:
     if n == 1:
         return b / a[0, 0]
     if n <= 3:
-        return _written_solve(a, b)
-    if n <= _WRITTEN:
+        return _unrolled_solve(a, b)
+    if n <= _MAX_UNROLLED_EQUATIONS:
         return eliminate(a, b)
     both = jnp.result_type(a, b)
     a, b = a.astype(both), b.astype(both)
@@ -197,13 +197,13 @@ def small_solve(a: Array, b: Array) -> Array:
 
 
 @jax.custom_jvp
-def _written_solve(a: Array, b: Array) -> Array:
+def _unrolled_solve(a: Array, b: Array) -> Array:
     adjugate, determinant = _adjugate(a)
     return _times(adjugate, b) / determinant
 
 
-@_written_solve.defjvp
-def _written_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+@_unrolled_solve.defjvp
+def _unrolled_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     """a x' = b' - a' x, by the same adjugate: half the operations of differentiating it."""
     (a, b), (da, db) = primals, tangents
     adjugate, determinant = _adjugate(a)
@@ -237,7 +237,7 @@ def solve_in_turn(a: Array, b: Array) -> Array:
 
 
 @solve_in_turn.def_vmap
-def _solved_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tuple[Array, bool]:
+def _solve_one_by_one(size: int, is_mapped: list[bool], a: Array, b: Array) -> tuple[Array, bool]:
     if not is_mapped[0]:  # one system, many right-hand sides
         columns = jnp.moveaxis(b, 0, -1)
         x = solve_in_turn(a, columns.reshape(a.shape[0], -1))
@@ -274,7 +274,7 @@ def _eigenvectors_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tu
     return jax.lax.map(eigenvectors_in_turn, matrix), (True, True)
 
 
-def refined(product: Callable[[Array], Array], nearly: Callable[[Array], Array], b: Array, norm: Array) -> Array:
+def refine_solution(product: Callable[[Array], Array], nearly: Callable[[Array], Array], b: Array, norm: Array) -> Array:
     """x of A x = b, with A x = `product`(x), its approximate inverse `nearly` and its row-sum `norm`.
 
     Corrected by the residual until that is rounding: usually not at all, at most 4 times.
@@ -331,7 +331,7 @@ def eliminate(a: Array, b: Array) -> Array:
 
 
 @jax.custom_jvp
-def written_inverse(matrix: Array) -> Array:
+def unrolled_inverse(matrix: Array) -> Array:
     """Inverse by unrolled Gauss-Jordan elimination, since a library call would prevent fusion in the time loop, and large
     batches of them can deadlock on few cores (jaxlib 0.10).
 
@@ -347,7 +347,7 @@ def written_inverse(matrix: Array) -> Array:
     return matrix
 
 
-@written_inverse.defjvp
+@unrolled_inverse.defjvp
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    inverse = written_inverse(*primals)
+    inverse = unrolled_inverse(*primals)
     return inverse, -inverse @ tangents[0] @ inverse

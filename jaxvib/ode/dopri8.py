@@ -23,7 +23,7 @@ from jaxvib.ode.types import VF, Args, BoolScalarLike, RealScalarLike, StepResul
 Tree = TypeVar("Tree")
 
 _TABLEAU = diffrax.Dopri8.tableau
-_LATE = 5
+_FIRST_LATE_STAGE = 5
 """First stage after stage 0 that contributes to states within a step."""
 
 _POLYNOMIALS = np.array(
@@ -73,7 +73,7 @@ def unravel(flat: Array, like: Tree) -> Tree:
 
 def dense_stages(stages: Array) -> Array:
     """Stages that contribute to states within a step, (10, ...): the first, and all from the sixth on."""
-    return jnp.concatenate([stages[:1], stages[_LATE:]])
+    return jnp.concatenate([stages[:1], stages[_FIRST_LATE_STAGE:]])
 
 
 def linear_combination(weights: Array, stages: Array) -> Array:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxvib.numerics.linalg import written_inverse
+from jaxvib.numerics.linalg import unrolled_inverse
 from jaxvib.ode.batching import VECTOR
 from jaxvib.ode.interpolation import StepInterpolation
 from jaxvib.ode.types import Args, BoolScalarLike, RealScalarLike, StepResult, Terms
@@ -109,7 +109,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         # A padded step has the length 0; its inverse must not divide by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
         jacobian, time_derivative = _jacobian(terms, t0, y0, args)
-        inverse = written_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
+        inverse = unrolled_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
 
         def combine(weights: Array | Sequence[float], stages: Array) -> Array:
             return functools.reduce(operator.add, (weights[i] * stages[i] for i in range(len(_A) - 1)))

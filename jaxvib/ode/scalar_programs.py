@@ -82,7 +82,7 @@ def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
     cost: dict[Var, int] = {}
     one = hidden_one(arguments[0])
     for equation in jaxpr.eqns:
-        results = _computed(equation, [read(atom) for atom in equation.invars])
+        results = _evaluate_equation(equation, [read(atom) for atom in equation.invars])
         spent = _size(equation) + sum(cost.get(atom, 0) for atom in _variables(equation.invars))
         if equation.primitive == _division():
             spent = 0  # its result is not recomputed
@@ -97,7 +97,7 @@ def _size(equation: JaxprEqn) -> int:
     return 1 if inner is None else sum(_size(each) for each in getattr(inner, "jaxpr", inner).eqns)
 
 
-def _computed(equation: JaxprEqn, values: list[Array]) -> Sequence[Array]:
+def _evaluate_equation(equation: JaxprEqn, values: list[Array]) -> Sequence[Array]:
     inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
     if inner is None:
         found = equation.primitive.bind(*values, **equation.params)

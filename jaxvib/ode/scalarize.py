@@ -254,11 +254,11 @@ def _run(jaxpr: Jaxpr, consts: Sequence[ArrayLike], arguments: list[Scalars], si
             results = rules()[equation.primitive](*given, **equation.params)
         results = results if isinstance(results, list) else [results]
         for atom, result in zip(equation.outvars, results, strict=True):
-            known[atom] = _checked(result, atom.aval, equation.primitive.name)
+            known[atom] = _check_result(result, atom.aval, equation.primitive.name)
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _checked(result: Scalars, aval: Any, name: str) -> Scalars:
+def _check_result(result: Scalars, aval: Any, name: str) -> Scalars:
     """Return the result of an operation after a check of shape and dtype against the program on arrays."""
     scalars = (x for x in result.flat if hasattr(x, "dtype"))
     if result.shape != aval.shape or any(x.dtype != aval.dtype for x in scalars):

@@ -16,13 +16,13 @@ from jaxvib.results.fields import Plain
 Units: TypeAlias = Mapping[str, str]
 """Units of numbers by their names."""
 
-WORTH = (
+ACCURACY_FIELDS = (
     "status", "message", "error", "reference_error", "uncertainty", "resolution", "residual", "drift", "ripple", "settled",
     "judged", "unverified", "converged", "starts", "steps", "rejected", "evaluations", "seconds",
 )  # fmt: skip
 """Names of the fields about the accuracy and the cost of a result."""
 
-_HIDDEN = ("scene", "toml")
+_HIDDEN_FIELDS = ("scene", "toml")
 """Names of the fields that the page shows in another way."""
 
 _MAX_INLINE_ENTRIES = 12
@@ -71,14 +71,14 @@ def _scaled(value: Plain | Mapping[str, Plain], name: str, scale: Callable[[str,
 
 def worth(document: Mapping[str, Plain], units: Units) -> str:
     """Return a table of the fields of a document about accuracy and cost: status, error, steps, seconds."""
-    return _pairs([(name, document[name]) for name in WORTH if name in document and _plain(document[name])], units)
+    return _pairs([(name, document[name]) for name in ACCURACY_FIELDS if name in document and _plain(document[name])], units)
 
 
 def results(document: Mapping[str, Plain], units: Units, inner: bool = False) -> str:
     """Return a document as tables: one for all single values, and one below its own heading for each list or mapping."""
     single, below = [], []
     for name, value in document.items():
-        if name in _HIDDEN or (not inner and name in WORTH and _plain(value)):
+        if name in _HIDDEN_FIELDS or (not inner and name in ACCURACY_FIELDS and _plain(value)):
             continue
         if _plain(value):
             single.append((name, value))

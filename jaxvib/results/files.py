@@ -92,11 +92,11 @@ def load(path: str | Path) -> Any:
         return found
     except FileNotFoundError as error:
         raise InputError("path", f"is {quoted(str(path))}; there is no such file") from error
-    except _ODD as error:
+    except _READ_ERRORS as error:
         raise InputError("path", f"is {quoted(str(path))}; it is not a result written by save") from error
 
 
-_ODD = (
+_READ_ERRORS = (
     ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, OSError, RuntimeError,
     TypeError, ValueError, zipfile.BadZipFile,
 )  # fmt: skip
@@ -106,8 +106,8 @@ _ODD = (
 def _arrays(file: Any) -> dict[str, np.ndarray]:
     """Return the arrays of an archive by name.
 
-    **Raises** an error of `_ODD` if an entry is compressed, or if the entries are larger than the file, because a few bytes of
-    such an entry can fill any memory.
+    **Raises** an error of `_READ_ERRORS` if an entry is compressed, or if the entries are larger than the file, because a few
+    bytes of such an entry can fill any memory.
     """
     with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()

@@ -283,7 +283,7 @@ class _Instead:
 _ULPS = 100
 """Distance from the end of diffrax's time loop, in units in the last place, within which a step is extended to the end."""
 
-_REPLACING = threading.RLock()
+_REPLACEMENT_LOCK = threading.RLock()
 
 _ULPS_ONE_BY_ONE = re.compile(rf"for _ in range\({_ULPS}\):\s+t1_clip_floor = eqxi\.prevbefore\(t1_clip_floor\)\n")
 
@@ -313,7 +313,7 @@ def fast_diffrax_loop_end() -> Iterator[None]:
             left -= 1
             return x if left else ulps_below(x, _ULPS)
 
-        with _REPLACING:  # another thread may trace another loop at the same time
+        with _REPLACEMENT_LOCK:  # another thread may trace another loop at the same time
             internals = integrate.eqxi
             setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
             try:

@@ -13,12 +13,12 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import accepted_flags, backend_started, loops_need_a_flag, wide_vectors_are_right
 
-_EXTRA = "--xla_backend_extra_options="
+_EXTRA_OPTIONS_FLAG = "--xla_backend_extra_options="
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
-_COMPILING = "--xla_cpu_use_fusion_emitters=false"
+_CODE_GENERATOR_FLAG = "--xla_cpu_use_fusion_emitters=false"
 """Flag that selects XLA's older code generator: equally fast programs in two thirds of the compile time."""
 
-_WIDTH = "--xla_cpu_prefer_vector_width"
+_VECTOR_WIDTH_FLAG = "--xla_cpu_prefer_vector_width"
 
 
 @validated
@@ -65,17 +65,17 @@ def prepare_cpu(devices: int | None = 1) -> str:
     ours = []
     if loops_need_a_flag():
         for place, flag in enumerate(flags):
-            if flag.startswith(_EXTRA) and _LOOPS not in flag:
+            if flag.startswith(_EXTRA_OPTIONS_FLAG) and _LOOPS not in flag:
                 flags[place] = f"{flag},{_LOOPS}=1000000000"
         if not any(_LOOPS in flag for flag in flags):
-            ours.append(f"{_EXTRA}{_LOOPS}=1000000000")
-    ours.append(_COMPILING)
+            ours.append(f"{_EXTRA_OPTIONS_FLAG}{_LOOPS}=1000000000")
+    ours.append(_CODE_GENERATOR_FLAG)
     if devices > 1:
         ours.append(f"--xla_force_host_platform_device_count={devices}")
     names = [flag.partition("=")[0] for flag in flags]
     flags += accepted_flags([flag for flag in ours if flag.partition("=")[0] not in names])
-    if _has_wide_vectors() and _WIDTH not in names and wide_vectors_are_right(flags):
-        flags += accepted_flags([f"{_WIDTH}=512"])
+    if _has_wide_vectors() and _VECTOR_WIDTH_FLAG not in names and wide_vectors_are_right(flags):
+        flags += accepted_flags([f"{_VECTOR_WIDTH_FLAG}=512"])
     os.environ["XLA_FLAGS"] = " ".join(flags)
     limit_blas_threads()
     return os.environ["XLA_FLAGS"]

@@ -22,10 +22,10 @@ from jaxvib.runtime.compat import traced
 
 __all__ = ["arrays_on_device", "float_dtype", "known", "numpy_of", "on_device", "shared_devices", "take_a_device"]
 
-_VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
+_VISIBILITY_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 """Environment variables that restrict a process to some of the machine's accelerators."""
 
-_TAKING = threading.Lock()
+_DEVICE_LOCK = threading.Lock()
 
 
 def shared_devices() -> list[object]:
@@ -75,7 +75,7 @@ def take_a_device() -> None:
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     devices = jax.local_devices()
     if len(devices) > 1:
-        with _TAKING:
+        with _DEVICE_LOCK:
             place = _place()
         jax.config.update("jax_default_device", devices[place % len(devices)])
 
@@ -89,7 +89,7 @@ def _place() -> int:
     """
     import fcntl  # does not exist on Windows, where JAX has no accelerators
 
-    seen = hashlib.sha256(repr([os.environ.get(name) for name in _VISIBLE]).encode()).hexdigest()[:16]
+    seen = hashlib.sha256(repr([os.environ.get(name) for name in _VISIBILITY_VARIABLES]).encode()).hexdigest()[:16]
     for place in itertools.count():
         path = os.path.join(tempfile.gettempdir(), f"jaxvib-worker-{os.getuid()}-{seen}-{place}")
         file = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)  # stays open until the process ends

@@ -179,10 +179,10 @@ def _differentiable(
         outputs = call.split(call(_replaced(active, arrays, active_arrays)))
         return [x for x in outputs if _is_inexact(x)], outputs
 
-    return function, _selected(active, arrays)
+    return function, _select(active, arrays)
 
 
-def _selected(active: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:
+def _select(active: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:
     return [x for is_active, x in zip(active, arrays, strict=True) if is_active]
 
 
@@ -253,7 +253,7 @@ def _vjp_from_solution(
         whole = call.split(call(present))
         return [whole[k] for k in needed]
 
-    active_arrays = _selected(active, arrays)
+    active_arrays = _select(active, arrays)
     return list(jax.vjp(pruned(function, *active_arrays), *active_arrays)[1](cotangents))
 
 

@@ -27,7 +27,7 @@ from jaxvib.units import Number, number
 _TURN = 0.42
 """Largest rotation between pictures, turns. Near half a turn, the rotor seems to turn at another speed or backward."""
 
-_SMOOTH = 0.09
+_TURNS_PER_PICTURE = 0.09
 """Default rotation between pictures, turns of the rotor."""
 
 _MAX_PICTURES = 600
@@ -36,7 +36,7 @@ _MAX_PICTURES = 600
 _NARROWEST, _WIDEST = 1.0, 50.0
 """Range of the width of a picture, inches."""
 
-_PICTURES_AWAY = 100.0
+_MAX_DRAWN_HEIGHTS = 100.0
 """Largest drawn displacement of the machine, in heights of the picture."""
 
 
@@ -96,7 +96,7 @@ def animate(
     speed = _fastest(motion, owner)
     turns = speed * (last - first) / (2.0 * np.pi)
     lasts = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
-    pictures = int(np.ceil(turns / _SMOOTH)) if lasts is None else lasts * fps
+    pictures = int(np.ceil(turns / _TURNS_PER_PICTURE)) if lasts is None else lasts * fps
     count = round(float(np.clip(pictures, 2, _MAX_PICTURES)))
     if turns / count > _TURN:
         most = first + _TURN * 2.0 * np.pi * count / speed
@@ -167,7 +167,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     chosen = view.magnified(shown.displacement) if given is None else given
     reach = chosen * view.scale
     farthest = float(np.max(np.abs(shown.displacement), initial=0.0)) * view.scale
-    if chosen * farthest > (most_seen := _PICTURES_AWAY * (top - bottom)):
+    if chosen * farthest > (most_seen := _MAX_DRAWN_HEIGHTS * (top - bottom)):
         raise InputError(
             "magnify", f"is {chosen:g}, which moves the machine out of the figure; at most {most_seen / farthest:.3g}"
         )

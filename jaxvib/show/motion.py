@@ -43,7 +43,7 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
     Velocities and forces are interpolated linearly. **Raises** `InputError` for times outside the stored states, and for states
     that are too far apart.
     """
-    kept = _kept(run, time)
+    kept = _stored_states(run, time)
     t = np.asarray(kept.time, float)
     k = np.clip(np.searchsorted(t, time, side="right") - 1, 0, t.size - 2)
     h = t[k + 1] - t[k]
@@ -78,7 +78,7 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
     return Stretch(time, cubic(q, v), velocity, tuple(rotors), between)
 
 
-def _kept(run: Run, time: np.ndarray) -> Trajectory:
+def _stored_states(run: Run, time: np.ndarray) -> Trajectory:
     """Return stored states of a run that cover these times: the dense ones of its window if they do."""
     slack = 1e-9 * max(float(run.window.time[-1]), 1e-300)
     kept = [run.window, *([] if run.trajectory is None else [run.trajectory])]

@@ -25,7 +25,7 @@ _SPRING = 1.6
 
 _TURN: Look = {"color": COLORS[1], "zorder": 3.7}
 
-_STEEP = np.sin(np.radians(40.0))
+_STEEP_SPRING_SINE = np.sin(np.radians(40.0))
 """Sine of the angle above which a spring is drawn downward, otherwise sideways."""
 
 
@@ -72,7 +72,7 @@ class PlaneView(View):
             angle = float(each.angle) + 0.5 * np.pi * j
             along = np.array([np.cos(angle), np.sin(angle)])
             outward = np.sign(self._supports[k][0] - np.mean(points[:, 0])) or 1.0
-            sign = -np.sign(along[1]) if abs(along[1]) > _STEEP else outward * np.sign(along[0])
+            sign = -np.sign(along[1]) if abs(along[1]) > _STEEP_SPRING_SINE else outward * np.sign(along[0])
             values = float(each.stiffness[j]), float(each.damping[j])
             if max(values) > 0.0:
                 found.append(_Strut(k, self.scale * self._supports[k], _SPRING * sign * along, along, *values))

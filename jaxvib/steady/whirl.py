@@ -17,7 +17,7 @@ from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, relative_to
+from jaxvib.numerics.linalg import MAX_EIGENVALUE_ERROR, hermitian_error, hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
@@ -202,7 +202,12 @@ def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
         chosen, oscillates = one_of_each(values, stops[nearest])
         turns = oscillates[chosen]
         forward = turns & (_sense(model.mount, shapes[:, one_of_each(apart, stops)[0]]) > 0.0)
-        return jnp.where(turns, values.imag[chosen], 0.0), -values.real[chosen], forward, error[nearest][chosen] > TRUSTED
+        return (
+            jnp.where(turns, values.imag[chosen], 0.0),
+            -values.real[chosen],
+            forward,
+            error[nearest][chosen] > MAX_EIGENVALUE_ERROR,
+        )
 
     speed, decay, forward, lost = jax.vmap(at)(speeds)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
@@ -274,7 +279,7 @@ def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
     none = 1e-14 * jnp.max(values)
     there, decided = values > none, jnp.abs(values) < none
     error = hermitian_error(jax.lax.stop_gradient((inertia, carrier.stiffness)), values, shapes)
-    lost = ~decided & (error > 2.0 * TRUSTED)
+    lost = ~decided & (error > 2.0 * MAX_EIGENVALUE_ERROR)
     speed = jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.inf)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
     return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), _sense(mount, shapes) > 0.0)
@@ -297,7 +302,7 @@ def _two_directions(scene: Scene) -> LinearModel:
 
 def _require_springs(stiffness: np.ndarray) -> None:
     """**Raises** `InputError` if a motion of the rotor has no spring."""
-    if not _held(stiffness):
+    if not _has_all_springs(stiffness):
         single = stiffness.dtype.itemsize < 8
         problem = "leaves a motion of the rotor without a spring" + (", within single precision" if single else "")
         raise InputError(
@@ -305,7 +310,7 @@ def _require_springs(stiffness: np.ndarray) -> None:
         )
 
 
-def _held(stiffness: np.ndarray) -> bool:
+def _has_all_springs(stiffness: np.ndarray) -> bool:
     """Return True if springs resist every motion, within rounding."""
     size = np.sqrt(np.where(np.diag(stiffness) > 0.0, np.diag(stiffness), 1.0))
     rounding = 4.0 * stiffness.shape[0] * np.finfo(stiffness.dtype).eps

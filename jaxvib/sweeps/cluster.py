@@ -17,7 +17,7 @@ from jaxvib.sweeps.program import Chunk, compute
 from jaxvib.sweeps.store import versions
 from jaxvib.units import Number, number
 
-_AHEAD = 2
+_CHUNKS_PER_WORKER = 2
 """Number of submitted chunks for each worker: one in computation, one waiting."""
 
 _STUDIES: dict[str, Study] = {}
@@ -70,7 +70,7 @@ def on_a_cluster(
                 running.add(future)
                 return
 
-        for _ in range(_AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))):
+        for _ in range(_CHUNKS_PER_WORKER * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))):
             give_out()
         for future in running:
             chunk = numbers.pop(future.key)

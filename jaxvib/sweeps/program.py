@@ -146,7 +146,7 @@ def compute(study: Study, chunk: int) -> Chunk:
     """
     values = study.grid.values(chunk)
     errors: dict[int, str] = {}
-    parts = _computed(study, values, np.arange(len(values)), errors)
+    parts = _compute_cases(study, values, np.arange(len(values)), errors)
     leaves, finite = parts
     whole = np.all([np.all(np.isfinite(leaf.reshape(len(values), -1)), axis=1) for leaf in leaves], axis=0)
     status = np.where(finite, np.where(whole, _CODE["done"], _CODE["absent"]), _CODE["not_finite"]).astype(np.uint8)
@@ -154,7 +154,7 @@ def compute(study: Study, chunk: int) -> Chunk:
     return Chunk(dict(zip(study.names, leaves, strict=True)), status, errors)
 
 
-def _computed(
+def _compute_cases(
     study: Study, values: np.ndarray, which: np.ndarray, errors: dict[int, str]
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the results of the cases `which` of a chunk; NaN (labels: -1) for other cases and cases that raise an error."""
@@ -169,7 +169,7 @@ def _computed(
         if len(which) == 1:
             errors[int(which[0])] = _sentence(error)
             return study.nothing(len(values)), np.ones(len(values), bool)
-        halves = [_computed(study, values, half, errors) for half in np.array_split(which, 2)]
+        halves = [_compute_cases(study, values, half, errors) for half in np.array_split(which, 2)]
     late = np.isin(np.arange(len(values)), np.array_split(which, 2)[1])
     chosen = [np.where(late.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(*(h[0] for h in halves), strict=True)]
     return chosen, np.where(late, halves[1][1], halves[0][1])

@@ -264,15 +264,15 @@ class Store:
         for rows in self.pieces():
             among = finished[rows.start // self.tile[0] : -(-rows.stop // self.tile[0])]
             if np.all(among):
-                total += self._counted(rows)
+                total += self._count_statuses(rows)
                 continue
             for place in np.argwhere(among):
                 place[0] += rows.start // self.tile[0]
-                total += self._counted(self.region(int(np.ravel_multi_index(tuple(place), self.tiles))))
+                total += self._count_statuses(self.region(int(np.ravel_multi_index(tuple(place), self.tiles))))
         total[0] += int(np.prod(self.shape, dtype=np.int64)) - np.sum(total)
         return total
 
-    def _counted(self, region: slice | tuple[slice, ...]) -> np.ndarray:
+    def _count_statuses(self, region: slice | tuple[slice, ...]) -> np.ndarray:
         return np.bincount(self._values("status", region).ravel(), minlength=len(CASE_STATUSES))[: len(CASE_STATUSES)]
 
     def pieces(self) -> list[slice]:

@@ -65,7 +65,7 @@ def study(
         raise InputError(f"axes.{drawn[0]}", "is a range without a count; give samples, or a count")
     if samples and not drawn:
         raise InputError("samples", f"is {samples}, but no axis is sampled; leave out samples, or the count of an axis")
-    names, measures = _named(measure)
+    names, measures = _name_measures(measure)
     taken = [*_RESERVED, *(axis.name for axis in found), "sample"]
     for name in names:
         if name in taken:
@@ -127,7 +127,7 @@ def _plain(spec: AxisSpec) -> Plain:
     return [v if isinstance(v, str) else float(cast(float, v)) for v in spec]
 
 
-def _named(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
+def _name_measures(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
     """Return a unique name for each measure, and the measures.
 
     The mode is appended to the names of quantities that differ only in it.

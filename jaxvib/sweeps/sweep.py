@@ -225,10 +225,10 @@ def run_study(
         Store.create(path, new_study)
     kept = Store(path, writable=True)
     with kept.locked():
-        return _computed(kept, new_study, begun, workers, scheduler, timeout, report)
+        return _summarize_sweep(kept, new_study, begun, workers, scheduler, timeout, report)
 
 
-def _computed(
+def _summarize_sweep(
     kept: Store,
     new_study: Study,
     begun: float,

@@ -88,7 +88,7 @@ _MAX_NUMBERS = 10**7
 """Largest length of a list of numbers; more numbers must be passed as an array."""
 
 
-def _checked(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, place: str = "") -> None:
+def _check_bounds(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, place: str = "") -> None:
     """Check values against bounds. The condition for a traced value is added to the list of `bounds_of_unknowns`."""
     if traced(value):
         collected = _COLLECTED.get()
@@ -211,7 +211,7 @@ def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], 
         if isinstance(value, jax.Array):
             array = jnp.asarray(value, dtype=float)
         else:
-            with np.errstate(over="ignore"):  # too large for single precision: infinite, which `_checked` refuses
+            with np.errstate(over="ignore"):  # too large for single precision: infinite, which `_check_bounds` refuses
                 array = np.asarray(value, dtype=float).astype(jnp.result_type(float))
     except OverflowError as error:
         raise InputError(field, f"is {quoted(value)}, which is too large; give a number below 1e308") from error
@@ -219,7 +219,7 @@ def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], 
         raise InputError(field, f"is {quoted(value)}, which is not a number; write a number in {unit_name(unit)}") from error
     if array.shape != shape:
         raise InputError(field, f"has shape {array.shape}; one number in {unit_name(unit)} is needed")
-    _checked(array, field, unit, bounds, place="each" if shape else "")
+    _check_bounds(array, field, unit, bounds, place="each" if shape else "")
     return array
 
 

@@ -165,7 +165,7 @@ def static_deflection(of: int | None = None) -> Quantity:
 
 def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
     machine = _platforms(evaluation.scene, "the deflection")
-    model, carried = linear_model(evaluation.scene), _carried(machine)
+    model, carried = linear_model(evaluation.scene), _has_support(machine)
     # The stiffness matrix of platforms without supports is singular up to rounding: they are fixed here, with the result NaN.
     held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
     sag = jnp.linalg.solve(model.carrier.stiffness + held, _GRAVITY * jnp.diagonal(model.mass))
@@ -175,7 +175,7 @@ def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
     return jnp.max(sag) if of is None else sag[of - 1]
 
 
-def _carried(machine: Platforms) -> Array:
+def _has_support(machine: Platforms) -> Array:
     """Return True (n,) for each platform that has a support or is connected by links to a platform with one."""
     n = machine.mass.shape[0]
     joined = jnp.eye(n, dtype=bool)

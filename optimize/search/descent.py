@@ -20,10 +20,10 @@ from optimize.search.problem import Point, Problem, derive
 STRETCH = 25
 """Number of steps of the descent in one call of its program."""
 
-_ON_THE_WAY = 0.1
+_DESCENT_VIOLATION = 0.1
 """Allowed violation of held quantities during the descent, in which every step corrects the violation of the previous step."""
 
-_UPDATE = 20
+_STEPS_PER_UPDATE = 20
 """Number of steps between updates of the multipliers of demands."""
 
 
@@ -73,7 +73,7 @@ def _along(vector: Array, held: Array, free: Array) -> Array:
 
 
 @cached
-def _begun(point: Any, multipliers: Array) -> _Lane:
+def _initial_lanes(point: Any, multipliers: Array) -> _Lane:
     lane = jax.vmap(_ADAM.init)(point.z)
     n = point.z.shape[0]
     one = jnp.ones(n)
@@ -103,7 +103,7 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
     near = tuple(_ahead(w, r, z - lane.z) for w, r in zip(lane.known, lane.known_slopes, strict=True))
     values, slopes, known, known_slopes = derive(problem, z, near)
     finite = jnp.all(jnp.isfinite(values)) & jnp.all(jnp.isfinite(slopes))
-    good = finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _ON_THE_WAY) & (rate > 0.0)
+    good = finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _DESCENT_VIOLATION) & (rate > 0.0)
 
     def chosen(new: Array, old: Array) -> Array:
         return jnp.where(good, new, old)
@@ -114,7 +114,7 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
     )
     length = jnp.where(good, jnp.minimum(1.0, 1.2 * lane.length), 0.5 * lane.length)
 
-    update = (lane.taken % _UPDATE == _UPDATE - 1) & (rate > 0.0)
+    update = (lane.taken % _STEPS_PER_UPDATE == _STEPS_PER_UPDATE - 1) & (rate > 0.0)
     excess = values[1 + m :]
     multipliers = jnp.where(update, jnp.maximum(0.0, lane.multipliers + lane.weight * excess), lane.multipliers)
     worst = jnp.max(jnp.maximum(excess, 0.0), initial=0.0)
@@ -153,7 +153,7 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
     schedule = optax.cosine_decay_schedule(rate, steps, alpha=0.01)
     rates = np.asarray(jax.jit(schedule)(np.arange(steps)))
     rates = np.pad(rates, (0, -steps % STRETCH)).reshape(-1, STRETCH)
-    lanes = in_chunks(problem.lanes, _begun, point, np.zeros((len(point.z), len(problem.demands))))
+    lanes = in_chunks(problem.lanes, _initial_lanes, point, np.zeros((len(point.z), len(problem.demands))))
     history: list[np.ndarray] = []
     for k, part in enumerate(rates):
         each = on_device(part)

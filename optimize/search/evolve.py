@@ -14,24 +14,24 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
-from optimize.search.problem import Known, Point, Problem, evaluate, looked_up
+from optimize.search.problem import Known, Point, Problem, evaluate, find_speeds
 
-_PRICE = 10.0
+_VIOLATION_PENALTY = 10.0
 """Penalty of a demand that is violated by its own size, in typical values of the objective."""
 
-_LANES = 8
+_DESIGNS_PER_BATCH = 8
 """Number of designs in a batch. It is small, since populations are small and few designs lose their jam at a time."""
 
-_REMEMBERED = 200
+_MAX_KNOWN_DESIGNS = 200
 """Number of the latest designs whose jams are stored."""
 
-_KEPT = 8
+_POLISHED_DESIGNS = 8
 """Number of designs that are polished."""
 
-_APART = 1e-2
+_MIN_DESIGN_DISTANCE = 1e-2
 """Smallest distance between polished designs in one free parameter, relative to its range."""
 
-_NOWHERE = 1e12
+_MERIT_WITHOUT_OBJECTIVE = 1e12
 """Merit of a design without the objective."""
 
 
@@ -53,7 +53,7 @@ def require_cma() -> None:
 
 
 @cached
-def _valued(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+def _evaluate_designs(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
     return jax.vmap(lambda x, w: problem.values(x, w))(z, near)
 
 
@@ -62,32 +62,32 @@ class Followed:
     last designs, or computed from the whole branch if that fails."""
 
     def __init__(self, problem: Problem):
-        self.problem = replace(problem, lanes=_LANES)
+        self.problem = replace(problem, lanes=_DESIGNS_PER_BATCH)
         self.remembered: tuple[np.ndarray, ...] | None = None
         """Latest designs, and their followed speeds."""
 
     def of(self, z: np.ndarray) -> np.ndarray:
         """Return the values of the designs z (s, d), NaN if a quantity does not exist."""
         if self.remembered is None:
-            values, known = self._at(z, looked_up(self.problem, z))
+            values, known = self._at(z, find_speeds(self.problem, z))
         else:
             designs, *there = self.remembered
             nearest = np.argmin(np.sum((z[:, None] - designs[None]) ** 2, axis=2), axis=1)
             values, known = self._at(z, tuple(each[nearest] for each in there))
             lost = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
             if len(lost):
-                values[lost], again = self._at(z[lost], looked_up(self.problem, z[lost]))
+                values[lost], again = self._at(z[lost], find_speeds(self.problem, z[lost]))
                 for every, some in zip(known, again, strict=True):
                     every[lost] = some
         good = np.all(np.isfinite(values), axis=1)
         if np.any(good):
             new = (z[good], *(each[good] for each in known))
             old = (each[:0] for each in new) if self.remembered is None else self.remembered
-            self.remembered = tuple(np.concatenate(pair)[-_REMEMBERED:] for pair in zip(old, new, strict=True))
+            self.remembered = tuple(np.concatenate(pair)[-_MAX_KNOWN_DESIGNS:] for pair in zip(old, new, strict=True))
         return values
 
     def _at(self, z: np.ndarray, near: Known) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        values, found = in_chunks(self.problem.lanes, lambda x, w: _valued(self.problem, x, w), z, near)
+        values, found = in_chunks(self.problem.lanes, lambda x, w: _evaluate_designs(self.problem, x, w), z, near)
         return np.array(values), tuple(np.array(each) for each in found)
 
 
@@ -121,16 +121,18 @@ def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float,
                 if np.isnan(size) and np.any(there):
                     size = max(float(np.median(np.abs(values[there, 0]))), 1e-300)
                 broken = np.sum(np.abs(values[:, 1 : 1 + m]), axis=1) + np.sum(np.maximum(values[:, 1 + m :], 0.0), axis=1)
-                merit = np.where(there, np.nan_to_num(values[:, 0] / size + _PRICE * broken), _NOWHERE)
+                merit = np.where(
+                    there, np.nan_to_num(values[:, 0] / size + _VIOLATION_PENALTY * broken), _MERIT_WITHOUT_OBJECTIVE
+                )
                 strategy.tell(list(samples), list(merit))
                 merits, designs = _best(np.concatenate([merits, merit]), np.concatenate([designs, z]))
                 history.append(float(values[np.argmin(merit), 0]))
-                tell(drawn / evaluations, merits[0] * size if len(merits) and merits[0] < _NOWHERE else np.nan)
+                tell(drawn / evaluations, merits[0] * size if len(merits) and merits[0] < _MERIT_WITHOUT_OBJECTIVE else np.nan)
             run += 1
     except KeyboardInterrupt:
         interrupted = True
-    designs = designs[merits < _NOWHERE]
-    point = evaluate(problem, designs, looked_up(problem, designs)) if len(designs) else None
+    designs = designs[merits < _MERIT_WITHOUT_OBJECTIVE]
+    point = evaluate(problem, designs, find_speeds(problem, designs)) if len(designs) else None
     return Evolved(point, np.asarray(history).reshape(-1, 1), drawn, existing, interrupted)
 
 
@@ -138,8 +140,8 @@ def _best(merits: np.ndarray, designs: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Return the merits of the best distinct designs, and these designs."""
     kept: list[int] = []
     for k in np.argsort(merits, kind="stable"):
-        if all(np.max(np.abs(designs[k] - designs[j])) > _APART for j in kept):
+        if all(np.max(np.abs(designs[k] - designs[j])) > _MIN_DESIGN_DISTANCE for j in kept):
             kept.append(int(k))
-        if len(kept) == _KEPT:
+        if len(kept) == _POLISHED_DESIGNS:
             break
     return merits[kept], designs[kept]

@@ -15,8 +15,8 @@ from optimize.quantities.cases import Robust
 from optimize.quantities.quantity import walk
 from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
-from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, optimality, polish, violation
-from optimize.search.problem import Point, Problem, evaluate, looked_up
+from optimize.search.polish import FEASIBILITY_TOLERANCE, Optimality, Polished, draw_starts, optimality, polish, violation
+from optimize.search.problem import Point, Problem, evaluate, find_speeds
 from optimize.space import Choice, DesignSpace
 
 _NODES = 400
@@ -62,7 +62,7 @@ class Found(NamedTuple):
     @property
     def best(self) -> int:
         """Index of the best design: least objective of the designs that meet all demands, otherwise least violation."""
-        kept = self.violation < 10.0 * FEASIBLE
+        kept = self.violation < 10.0 * FEASIBILITY_TOLERANCE
         if np.any(kept):
             return int(np.argmin(np.where(kept, self.point.values[:, 0], np.inf)))
         return int(np.argmin(self.violation))
@@ -133,11 +133,11 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         # Its designs are polished without a descent.
         options = replace(options, iterations=0, polishing=0 if interrupted else options.polishing)
     elif begin is not None:
-        point = evaluate(problem, begin, looked_up(problem, begin))
+        point = evaluate(problem, begin, find_speeds(problem, begin))
         point = point.take(np.flatnonzero(point.exists()))
         drawn = existing = len(begin)
     else:
-        starts = draw_starts(problem, options.starts, options.seed, looked_up)
+        starts = draw_starts(problem, options.starts, options.seed, find_speeds)
         point = starts.point if starts.point is not None else starts.nearest
         drawn, existing = starts.drawn, starts.existing
     if point is None or len(point.z) == 0:
@@ -182,7 +182,7 @@ def _of_their_mode(problem: Problem, point: Point) -> Point:
     if not problem.keys:
         return point
     same = np.ones(len(point.z), bool)
-    for key, ours, whole in zip(problem.keys, point.known, looked_up(problem, point.z), strict=True):
+    for key, ours, whole in zip(problem.keys, point.known, find_speeds(problem, point.z), strict=True):
         near = np.abs(ours / whole - 1.0) < 1e-6
         there = near if key[1][0] == "jam" else near | ~np.isfinite(whole)
         same &= np.all(there.reshape(len(same), -1), axis=1)
@@ -202,7 +202,7 @@ def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
         return root
     if root.interrupted:
         return _nearest_choice(problem, root)
-    if root.violation[root.best] > 10.0 * FEASIBLE:
+    if root.violation[root.best] > 10.0 * FEASIBILITY_TOLERANCE:
         return root
     best: tuple[float, Found] | None = None
     order = itertools.count()
@@ -221,8 +221,8 @@ def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
             for low, high in _halves(node, choices[int(np.argmax(off))], where):
                 nodes += 1
                 starts = np.concatenate([where[None], begun])[:_STARTS_PER_BOUND]
-                child = _bounded(problem, low, high, starts, max(options.polishing, 20))
-                if child is None or child.violation[child.best] > 10.0 * FEASIBLE:
+                child = _solve_in_bounds(problem, low, high, starts, max(options.polishing, 20))
+                if child is None or child.violation[child.best] > 10.0 * FEASIBILITY_TOLERANCE:
                     continue
                 value = float(child.point.values[child.best, 0])
                 if best is None or value < best[0]:
@@ -257,7 +257,7 @@ def _nearest_choice(problem: Problem, root: Found) -> Found:
     low, high = (b.copy() for b in root.bounds)
     for choice in problem.space.choices:
         low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - where[choice.start]))
-    found = _bounded(problem, low, high, where[None], 0)
+    found = _solve_in_bounds(problem, low, high, where[None], 0)
     if found is None:
         raise KeyboardInterrupt
     return found._replace(drawn=root.drawn, existing=root.existing, interrupted=True)
@@ -271,7 +271,7 @@ def _away(values: tuple[float, ...], x: float) -> float:
 
 def _few(found: Found) -> np.ndarray:
     """Return the best distinct designs, (at most 7, d)."""
-    order = np.argsort(np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf))
+    order = np.argsort(np.where(found.violation < 10.0 * FEASIBILITY_TOLERANCE, found.point.values[:, 0], np.inf))
     kept: list[np.ndarray] = []
     for k in order:
         z = found.point.z[k]
@@ -280,12 +280,12 @@ def _few(found: Found) -> np.ndarray:
     return np.reshape(kept[: _STARTS_PER_BOUND - 1], (-1, found.point.z.shape[1]))
 
 
-def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, polishing: int) -> Found | None:
+def _solve_in_bounds(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, polishing: int) -> Found | None:
     """Solve the problem with narrower bounds by `polishing` steps from the designs with these `numbers`."""
     space = problem.space.within(low, high)
     narrow = _with_lanes(problem, space)
     z = np.asarray(space.shares(np.clip(numbers, low, high)))
-    point = evaluate(narrow, z, looked_up(narrow, z))
+    point = evaluate(narrow, z, find_speeds(narrow, z))
     point = point.take(np.flatnonzero(point.exists()))
     if not len(point.z):
         return None

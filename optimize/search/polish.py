@@ -21,7 +21,7 @@ from optimize.search.model import (
 )
 from optimize.search.problem import Point, Problem, evaluate
 
-FEASIBLE = 1e-8
+FEASIBILITY_TOLERANCE = 1e-8
 """Largest violation of held quantities and demands of a final design, relative to their values."""
 
 _UNREACHABLE_DECREASE = 1e-10
@@ -154,7 +154,7 @@ def draw_starts(
         if problem.equalities:
             point = _onto_held(problem, point)
         off = np.max(np.abs(point.values[:, 1 : 1 + problem.equalities]), axis=1, initial=0.0)
-        good = point.exists() & (off < FEASIBLE)
+        good = point.exists() & (off < FEASIBILITY_TOLERANCE)
         kept.append(point.take(np.flatnonzero(good)))
         others.append(before.take(np.flatnonzero(~good)))
     found, rest = _concatenated(kept), _concatenated(others)
@@ -251,11 +251,11 @@ def _is_better(
     problem: Problem, here: Point, new: Point, merit: np.ndarray, new_merit: np.ndarray, left: np.ndarray
 ) -> np.ndarray:
     """Return True for designs whose step is accepted; `left` is the decrease of the objective that their models predict."""
-    kept = violation(problem, new) < np.maximum(FEASIBLE, violation(problem, here))
+    kept = violation(problem, new) < np.maximum(FEASIBILITY_TOLERANCE, violation(problem, here))
     better = new_merit < merit
     # The last step converges quadratically: rounding hides the decrease of the objective, but slopes are still exact.
     better |= kept & (left < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
-    better |= kept & (violation(problem, here) > FEASIBLE) & new.exists()
+    better |= kept & (violation(problem, here) > FEASIBILITY_TOLERANCE) & new.exists()
     return better
 
 

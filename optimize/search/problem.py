@@ -29,7 +29,7 @@ from optimize.space import DesignSpace, HeldQuantity
 _CHUNK = 64
 """Number of designs in a batch on a core."""
 
-_NOTHING = 1e-9
+_ROUNDING_SHARE = 1e-9
 """Relative size, compared with other designs, below which a value of a quantity is a rounding error of 0."""
 
 Known = tuple[Any, ...]
@@ -88,7 +88,7 @@ class Problem(eqx.Module):
         kept = [k for k, d in enumerate(demands) if not (_hard(d.quantity) or _hard(d.limit))]
         space = eqx.tree_at(lambda s: s.held, self.space, held)
         forms, index = tuple(demands[k] for k in kept), np.asarray(kept, int)
-        keys, parts = _followed(space, objective, forms)
+        keys, parts = _keys_and_parts(space, objective, forms)
         return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.lanes, parts)
 
     @property
@@ -98,7 +98,7 @@ class Problem(eqx.Module):
         return any(q.forward_only for q in every) or any(h.quantity.forward_only for h in self.space.held)
 
 
-def _followed(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
+def _keys_and_parts(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
     """Return the load speeds that a search follows, and the number of smooth pieces whose maximum is the objective."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     return _targets((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
@@ -163,7 +163,7 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
     The scale is the limit of the demand, or its value at the beginning; it is 1 if both are 0 within rounding.
     """
     forms = tuple(demand.form() for demand in demands)
-    keys, parts = _followed(space, objective, forms)
+    keys, parts = _keys_and_parts(space, objective, forms)
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
     scales = np.abs(constants)
     if np.any(scales == 0.0):
@@ -177,9 +177,9 @@ def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
     z = np.random.default_rng(0).uniform(size=(7, space.size))
     scenes = _made(space, on_device(space.numbers(z)))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, scenes)
-    values = np.abs(reported(quantities, batch))
+    values = np.abs(evaluate_quantities(quantities, batch))
     largest = np.max(values, axis=0, initial=0.0, where=np.isfinite(values))
-    return np.where(values[0] < _NOTHING * largest, 0.0, values[0])
+    return np.where(values[0] < _ROUNDING_SHARE * largest, 0.0, values[0])
 
 
 def derive(
@@ -201,12 +201,14 @@ def derive(
 
 
 @cached
-def _derived(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
+def _derive_all(
+    problem: Problem, z: Array, near: tuple[Array, ...]
+) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
     return jax.vmap(lambda x, w: derive(problem, x, w, problem.parts > 1))(z, near)
 
 
 @cached
-def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
+def _speeds_of_branches(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
     """Return the load speed of each key for a batch of scenes, from whole branches."""
 
     def one(scene: Scene) -> tuple[Array, ...]:
@@ -241,17 +243,17 @@ def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
     """Return values and derivatives of many designs whose jams are near these speeds."""
     if len(z) == 0:
         raise ValueError("no designs")
-    values, slopes, found, known_slopes = in_chunks(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
+    values, slopes, found, known_slopes = in_chunks(problem.lanes, lambda x, w: _derive_all(problem, x, w), z, near)
     rows = 1 + problem.equalities + len(problem.demands)
     return Point(z, values[:, :rows], slopes[:, :rows], found, known_slopes, values[:, rows:], slopes[:, rows:])
 
 
-def looked_up(problem: Problem, z: np.ndarray) -> Known:
+def find_speeds(problem: Problem, z: np.ndarray) -> Known:
     """Return the followed speeds of many designs, from whole branches; NaN without a jam."""
     if not problem.keys:
         return ()
     numbers = problem.space.numbers(np.asarray(z))
-    return in_chunks(problem.lanes, lambda scenes: _looked_up(problem.keys, scenes), made(problem, numbers))
+    return in_chunks(problem.lanes, lambda scenes: _speeds_of_branches(problem.keys, scenes), made(problem, numbers))
 
 
 def made(problem: Problem, numbers: np.ndarray) -> Scene:
@@ -292,7 +294,7 @@ def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]
 
 
 @cached
-def _reported(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: Scene, near: tuple[Array, ...]) -> Array:
+def _evaluate_all(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: Scene, near: tuple[Array, ...]) -> Array:
     def one(scene: Scene, known: tuple[Array, ...]) -> Array:
         evaluation = Evaluation(scene, dict(zip(keys, known, strict=True)))
         return jnp.stack([q.read(evaluation) for q in quantities])
@@ -300,7 +302,7 @@ def _reported(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: S
     return jax.vmap(one)(scenes, near)
 
 
-def reported(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | None = None) -> np.ndarray:
+def evaluate_quantities(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | None = None) -> np.ndarray:
     """Return the values (s, q) of quantities of some scenes (arrays with a leading axis), NaN if one does not exist.
 
     With a `problem` the programs of its search are reused if possible.
@@ -312,7 +314,7 @@ def reported(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | N
     known = keys if problem is None or set(keys) - set(problem.keys) else problem.keys
 
     def part(batch: Scene) -> Array:
-        near = dict(zip(known, _looked_up(known, batch), strict=True)) if known else {}
-        return _reported(quantities, keys, batch, tuple(near[key] for key in keys))
+        near = dict(zip(known, _speeds_of_branches(known, batch), strict=True)) if known else {}
+        return _evaluate_all(quantities, keys, batch, tuple(near[key] for key in keys))
 
     return in_chunks(_lanes(leaves[0].shape[0]) if problem is None else problem.lanes, part, scenes)

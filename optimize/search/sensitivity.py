@@ -10,7 +10,7 @@ from jaxvib.display import shown_unit
 from optimize.quantities.quantity import Demand
 from optimize.result import Influence, Limit, Machine
 from optimize.search.find import Found
-from optimize.search.polish import FEASIBLE
+from optimize.search.polish import FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem
 
 _STEP = 0.01
@@ -34,12 +34,12 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
         at = float(held.value)
         unit, factor = shown_unit(held.quantity.unit, abs(at))
         what = f"{held.quantity.words} held at {at * factor:.5g} {unit}".rstrip()
-        broken = 0.0 if abs(off) <= 10.0 * FEASIBLE else abs(off) if np.isfinite(off) else np.inf
+        broken = 0.0 if abs(off) <= 10.0 * FEASIBILITY_TOLERANCE else abs(off) if np.isfinite(off) else np.inf
         value = float(at * (1.0 + off))
         rows.append(Limit(what, held.quantity.unit, value, at, float(broken), True, float(-dual), gain(-dual)))
     for k, demand in enumerate(demands):
         excess, dual, scale = values[1 + m + k], duals.demands[best, k], float(problem.scales[k])
-        broken = 0.0 if excess <= 10.0 * FEASIBLE else excess if np.isfinite(excess) else np.inf
+        broken = 0.0 if excess <= 10.0 * FEASIBILITY_TOLERANCE else excess if np.isfinite(excess) else np.inf
         active = bool(excess > -1e-6)
         share = -dual * abs(sides[k, 1]) / scale if active else 0.0
         value, limit = float(sides[k, 0]), float(sides[k, 1])
@@ -83,7 +83,7 @@ def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]
 
 def machines_of(problem: Problem, found: Found, same: float) -> tuple[Machine, ...]:
     """Return the distinct machines among the results of the searches, best first."""
-    values = np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf)
+    values = np.where(found.violation < 10.0 * FEASIBILITY_TOLERANCE, found.point.values[:, 0], np.inf)
     left = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
     space, machines = problem.space.within(*found.bounds), []
     while left:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.motion.growth import _judged
+from jaxvib.motion.growth import _classify_growth
 
 
 def forced(cubic, stiffness):
@@ -114,7 +114,7 @@ def test_growth_in_proportion_to_time_is_regular():
     ],
 )
 def test_the_later_half_decides(late, name):
-    assert _judged(late) == name
+    assert _classify_growth(late) == name
 
 
 def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):

@@ -197,7 +197,7 @@ def test_next_tolerance_has_a_safety_margin(monkeypatch):
 
         compared = lambda *_, errors=errors: dataclasses.replace(base, error=jnp.asarray(next(errors)))  # noqa: E731
         monkeypatch.setattr("jaxvib.motion.simulate._run", run)
-        monkeypatch.setattr("jaxvib.motion.simulate._compared", compared)
+        monkeypatch.setattr("jaxvib.motion.simulate._compare_runs", compared)
         found = jv.simulate(base.scene, 20.0, save="window", stepsize_controller=jv.Accuracy(1e-4))
         assert bool(found.finished) and len(asked) == 3 and asked[0] > asked[1] == pytest.approx(1e-6)
         assert low <= asked[2] / asked[1] <= high, times

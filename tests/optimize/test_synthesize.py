@@ -17,7 +17,7 @@ from optimize.search.polish import Optimality
 from optimize.search.problem import Point
 from optimize.synthesize import (
     _mode_of,
-    _named,
+    _named_quantities,
     _options,
     _other_tiers,
     _rank,
@@ -42,9 +42,9 @@ def test_the_table_has_each_quantity_once():
     ]
     assert [name for name, _ in _standard(SCENE, 3, None)] == standard and _standard(SCENE, None, None) == []
     force, mass = foundation_force(mode=3), total_mass()
-    named = _named(SPACE, SCENE, force, [mass < 300.0, force < 9.0, amplitude(mode=3, of=1) < 1.0], 3)
+    named = _named_quantities(SPACE, SCENE, force, [mass < 300.0, force < 9.0, amplitude(mode=3, of=1) < 1.0], 3)
     assert [name for name, _ in named] == [*standard, "sum of stiffness of all supports", "mass of platforms and loads"]
-    largest = _named(SPACE, SCENE, -mass, [], None)  # what is to be large is told as it is
+    largest = _named_quantities(SPACE, SCENE, -mass, [], None)  # what is to be large is told as it is
     assert [q for _, q in largest] == [mass, total("machine.stiffness")]
     values = np.array([[1.0, 2.0], [3.0, 4.0]])
     rows = _table(SPACE, SCENE, largest, values, ([5.0, 6.0], [7.0, 8.0]))
@@ -213,6 +213,6 @@ def test_searches_of_all_numbers_of_loads_count(monkeypatch):
     monkeypatch.setattr(module, "choose", choose)
     space = DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, choices={"loads.count": [2, 3, 4]})
     options = _options(starts=4, seed=0, iterations=1, polishing=0, rate=0.5, searcher="gradients")
-    here, problem, found = module._searched(space, total_mass(), (), options, lambda *_: None)
+    here, problem, found = module._search(space, total_mass(), (), options, lambda *_: None)
     assert here.scene.loads.count == problem.space.scene.loads.count == 3
     assert (found.drawn, found.existing) == (50, 5) and found.point.values[0, 0] == 6.0

@@ -9,7 +9,7 @@ from papers.machines import published_rotor
 from scenes import scene as platforms
 
 import jaxvib as jv
-from jaxvib.steady.whirl import _held
+from jaxvib.steady.whirl import _has_all_springs
 
 
 @pytest.mark.parametrize(
@@ -112,8 +112,8 @@ def test_whirls_of_one_speed_are_distinguished_at_every_size(size):
 
 
 def test_springs_hold_whatever_the_units_of_their_coordinates():
-    assert _held(1e-9 * np.eye(3)) and _held(np.diag([1e12, 1e-12]))
-    assert not _held(1e10 * np.array([[1.0, 1.0], [1.0, 1.0]])) and not _held(np.diag([1e-9, 0.0]))
+    assert _has_all_springs(1e-9 * np.eye(3)) and _has_all_springs(np.diag([1e12, 1e-12]))
+    assert not _has_all_springs(1e10 * np.array([[1.0, 1.0], [1.0, 1.0]])) and not _has_all_springs(np.diag([1e-9, 0.0]))
 
 
 def overdamped(translation, tilt, speed=0.0, polar=0.1):

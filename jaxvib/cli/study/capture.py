@@ -66,12 +66,12 @@ def capture(
 
     def paths() -> Figure:
         from jaxvib.draw.capture import torus_paths
-        from jaxvib.study.capture.capture import thrown_state
+        from jaxvib.study.capture.capture import moving_state
 
         # One run starts just above the threshold, or at the highest speed if no threshold was found.
         speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high
         until = 2.0 * math.pi * min(turns, 400) / float(loaded.drive.speed)
-        run = jv.simulate(loaded, until, start=jv.with_spin(loaded, thrown_state(loaded, speed), turning), estimate=False)
+        run = jv.simulate(loaded, until, start=jv.with_spin(loaded, moving_state(loaded, speed), turning), estimate=False)
         kept = run.trajectory
         assert kept is not None
         around = np.asarray(kept.state.azimuth) - np.asarray(kept.rotor_angle)[:, None]

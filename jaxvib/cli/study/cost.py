@@ -58,17 +58,17 @@ def cost(
 
 def cost_document(cost: Cost) -> dict[str, object]:
     """Return the contents of a `Cost` for JSON."""
-    from jaxvib.study.accuracy.cost import WANTED
+    from jaxvib.study.accuracy.cost import SHOWN_ERRORS
 
     return {
         **fields_of(cost, "quantity", "reference", "reference_error", "rows", "left_out"),
-        "cheapest": {f"{error:.0e}": cost.cheapest(error) for error in WANTED},
+        "cheapest": {f"{error:.0e}": cost.cheapest(error) for error in SHOWN_ERRORS},
     }
 
 
 def cost_table(cost: Cost) -> str:
     """Return a `Cost` as text."""
-    from jaxvib.study.accuracy.cost import WANTED
+    from jaxvib.study.accuracy.cost import SHOWN_ERRORS
 
     head = ["tier", "method", "precision", "setting", "error", "seconds", "first call, s"]
     rows = [
@@ -76,12 +76,12 @@ def cost_table(cost: Cost) -> str:
         for row in cost.rows
     ]
     title = f"{cost.quantity.replace('_', ' ')}; the reference has an error of {cost.reference_error:.1e}"
-    chosen = [[f"{error:.0e}", *_named(cost.cheapest(error))] for error in WANTED]
+    chosen = [[f"{error:.0e}", *_method_columns(cost.cheapest(error))] for error in SHOWN_ERRORS]
     parts = [table(title, head, rows), table("cheapest", ["error", "method", "seconds"], chosen)]
     return "\n".join(parts + [f"left out: {reason}" for reason in cost.left_out])
 
 
-def _named(row: CostRow | None) -> list[str]:
+def _method_columns(row: CostRow | None) -> list[str]:
     if row is None:
         return ["none of these methods, or below the error of the reference", ""]
     return [", ".join(part for part in (row.tier, row.method, row.dtype, row.setting) if part), f"{row.seconds:.2e}"]

@@ -31,7 +31,7 @@ _NAMED = (
 )
 
 
-def _named(command: Command) -> Command:
+def _with_number_options(command: Command) -> Command:
     for name, section, text in reversed(_NAMED):
         command = click.option(f"--{name}", f"{section}__{name.replace('-', '_')}", help=text)(command)
     return command
@@ -39,7 +39,7 @@ def _named(command: Command) -> Command:
 
 @app.command("identify")
 @click.argument("record", type=click.Path(path_type=Path))
-@_named
+@_with_number_options
 @click.option("--columns", "record__columns", help="Names of the columns of time and angle, such as 't,phi'.")
 @click.option("--dry/--no-dry", "identify__dry", default=None, help="Identify mu2 of dry friction as well as mu1.")
 @shared

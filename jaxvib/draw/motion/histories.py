@@ -16,7 +16,7 @@ _BINS = 300
 _MAX_PLAIN_PERIODS = 40
 """Maximum number of periods of a run that is drawn without bands."""
 
-_SHOWN = 3
+_SHOWN_PERIODS = 3
 """Number of periods at the end that are drawn as curves."""
 
 
@@ -55,7 +55,7 @@ def period_of(time: np.ndarray, values: np.ndarray) -> float:
 
 def last_periods(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return a mask (nt,) that is True for the samples in the last periods of signals (nt, k)."""
-    return time >= time[-1] - _SHOWN * period_of(time, values)
+    return time >= time[-1] - _SHOWN_PERIODS * period_of(time, values)
 
 
 def time_histories(
@@ -124,7 +124,7 @@ def time_histories(
     left.set_ylabel("foundation force, N")
     if len(directions) > 1:
         legend_above(left)
-    for axis, text in zip(axes[:2], ("the whole run: bands between peaks", f"its last {_SHOWN} periods"), strict=True):
+    for axis, text in zip(axes[:2], ("the whole run: bands between peaks", f"its last {_SHOWN_PERIODS} periods"), strict=True):
         axis.text(1.0, 1.02, text, transform=axis.transAxes, ha="right", va="bottom", fontsize="small", color="#555555")
     for axis in axes[-2:]:
         axis.set_xlabel("time, s")

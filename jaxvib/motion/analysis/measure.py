@@ -20,7 +20,7 @@ from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 
-LEAST = 1e-4
+MIN_CHANGE_SCALE = 1e-4
 """Smallest scale of changes, as a share of the unbalance radius S/M for amplitudes and of S n^2 for forces. It is needed
 because the amplitude and the force of a balanced rotor are almost zero."""
 
@@ -150,8 +150,8 @@ def measure(model: Model, field: Field, times: Array, states: State, unit: State
 
     speeds, late_speeds = mean_speeds(times, *turning_angles(model.scene, lambda: times, states), (0, half))
     change = jnp.abs(late - early)
-    drift = jnp.max(change[:nd]) / jnp.maximum(jnp.max(whole[:nd]), LEAST * unit.displacement)
-    force_drift = jnp.max(change[nd:]) / jnp.maximum(jnp.max(whole[nd:]), LEAST * model.natural_force(unit))
+    drift = jnp.max(change[:nd]) / jnp.maximum(jnp.max(whole[:nd]), MIN_CHANGE_SCALE * unit.displacement)
+    force_drift = jnp.max(change[nd:]) / jnp.maximum(jnp.max(whole[nd:]), MIN_CHANGE_SCALE * model.natural_force(unit))
     directions = turning_directions(model.scene)
     omega = jnp.mean(speeds if np.all(directions == 1) else directions * speeds)
     speed_drift = jnp.max(jnp.abs(late_speeds - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)

@@ -36,14 +36,14 @@ _SAME_SPEED = 3e-3
 """Relative difference below which two speeds count as equal: of two loads, of a load and the rotor, or of one load in the first
 and the second half."""
 
-_LOCKED = 0.1
+_LOCKED_PHASE_CHANGE = 0.1
 """Change of relative phases between both halves of the window below which they count as fixed, rad."""
 
 _STEADY_SLIP = 0.02
 """Relative difference of the slip of a load in both halves of the window below which the slip is steady. A load with a steady
 slip is jammed, even if the slip is small."""
 
-_BALANCED = 0.02
+_BALANCED_UNBALANCE_SHARE = 0.02
 """Residual unbalance below which loads count as balancing the rotor, relative to the unbalance of all loads at one angle."""
 
 
@@ -196,20 +196,22 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     steady = change < _SAME_SPEED
     swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
     slips = [speeds[:-1] - speeds[-1] for speeds in (early, late)]
-    behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED
+    behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED_PHASE_CHANGE
     behind = behind & (jnp.abs(slips[1] - slips[0]) < _STEADY_SLIP * jnp.abs(slips[1] + slips[0]) / 2.0)
     with_rotor = (jnp.abs(speed - rotor) < _SAME_SPEED * reference) & ~behind
     # Mean of exp(i (phi_j - phi_1)), relative to the first load; the difference of the means of both halves shows if the phase
     # is fixed.
     to_first, moved = _relative(phi - phi[:, :1], half)
     to_rotor, slid = _relative(phi - turn[:, None], half)
-    one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (jnp.max(moved) < _LOCKED)
+    one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (jnp.max(moved) < _LOCKED_PHASE_CHANGE)
 
     unbalance = _unbalance(scene, to_rotor, turn)
     name = RegimeName.where(steady, RegimeName.parted, RegimeName.unsettled)
     name = RegimeName.where(steady & one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
     name = RegimeName.where(
-        steady & jnp.all(with_rotor), RegimeName.where(unbalance < _BALANCED, RegimeName.balanced, RegimeName.unbalanced), name
+        steady & jnp.all(with_rotor),
+        RegimeName.where(unbalance < _BALANCED_UNBALANCE_SHARE, RegimeName.balanced, RegimeName.unbalanced),
+        name,
     )
     name = RegimeName.where(jnp.all(swings), RegimeName.swinging, name)
 
@@ -228,7 +230,7 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
         resonance=nearest + 1,
         resonance_speed=natural[nearest],
         mode=jnp.where(name == RegimeName.jammed, _mode(natural, mean, rotor), 0),
-        caught=_caught(scene, natural, rotor),
+        caught=_is_rotor_stuck(scene, natural, rotor),
         change=jnp.maximum(change, jnp.where(turning, jnp.max(slid), 0.0)),
     )
 
@@ -241,7 +243,7 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
     return jnp.where(rises | (below == 0), 2 * below + 1, 2 * below)
 
 
-def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
+def _is_rotor_stuck(scene: Scene, natural: Array, rotor: Array) -> Array:
     """Return True if the rotor of a motor is caught at a resonance: at most 15 % below it, and more than 5 % below the speed of
     the motor without load."""
     if scene.drive.ideal:

@@ -28,7 +28,7 @@ _ZERO_PADDING_FACTOR = 4
 """Ratio of the frequency resolution of a segment to the spacing of the computed frequencies, by zero padding; heights of peaks
 are then accurate to 2 %."""
 
-_OVER = 1.5
+_MAX_FREQUENCY_RATIO = 1.5
 """Largest frequency of spectra, in units of the largest rotor speed."""
 
 
@@ -137,7 +137,7 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     points = _ZERO_PADDING_FACTOR * 2 ** int(np.ceil(np.log2(size)))
     frequency = 2.0 * np.pi * np.fft.rfftfreq(points, step)
     speed = np.asarray(kept.rotor_speed, float)
-    keep = frequency <= _OVER * max(float(np.max(np.abs(speed))), 1e-300)
+    keep = frequency <= _MAX_FREQUENCY_RATIO * max(float(np.max(np.abs(speed))), 1e-300)
     weight = np.hanning(size)
 
     def amplitudes(values: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import LoadPotential
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.motion.analysis.measure import LEAST, Measured
+from jaxvib.motion.analysis.measure import MIN_CHANGE_SCALE, Measured
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
@@ -208,11 +208,11 @@ def envelope(
         state = None if known else initial_state(scene, start, mode=mode, separation=separation, throw=throw)
     run = _run(scene, end, state, *choices)
     run = outcome(run, asked, end, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps))
-    judged = when_known(lambda *_: _judged_by_separation(run), run.steps, run.status)
+    judged = when_known(lambda *_: _with_separation_status(run), run.steps, run.status)
     return run if judged is None else judged
 
 
-def _judged_by_separation(run: Envelope) -> Envelope:
+def _with_separation_status(run: Envelope) -> Envelope:
     """Return the run with the status `would_separate` if its loads stay at nearly one angle although this motion is
     unstable."""
     if not (float(run.drift) < SETTLED_DRIFT and status_name(run.status) == "done"):
@@ -366,9 +366,9 @@ def _measure(model: Model, window: Envelopes) -> Measured:
     speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
     change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
     unit, omega = natural_units(model.scene), jnp.mean(speeds)
-    drift = jnp.max(change) / jnp.maximum(jnp.max(amplitude), LEAST * unit.displacement)
+    drift = jnp.max(change) / jnp.maximum(jnp.max(amplitude), MIN_CHANGE_SCALE * unit.displacement)
     force_change = jnp.abs(jnp.max(window.foundation_force[half:], axis=0) - jnp.max(window.foundation_force[:half], axis=0))
-    force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), LEAST * model.natural_force(unit))
+    force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), MIN_CHANGE_SCALE * model.natural_force(unit))
     speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
         omega=omega,

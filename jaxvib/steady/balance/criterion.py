@@ -171,11 +171,11 @@ def criterion(scene: Scene) -> Criterion:
     if scene.loads.count < 2:
         raise InputError("loads.count", "is 1; the criterion is about the gathering of loads and needs 2 or more")
     require_terms(scene.all_effects, CRITERION_TERMS, "acts|act on each load separately, which the criterion excludes")
-    return _judged(characteristic_speeds(scene))
+    return _criterion_at_speeds(characteristic_speeds(scene))
 
 
 @cached
-def _judged(speeds: CharacteristicSpeeds) -> Criterion:
+def _criterion_at_speeds(speeds: CharacteristicSpeeds) -> Criterion:
     return Criterion(
         status=speeds.status,
         speeds=speeds,
@@ -218,13 +218,13 @@ def criterion_table(result: Criterion) -> dict[str, Any]:
         for name in ("resonances", "additional", "damped_resonances", "damped_additional")
     }
     intervals = {
-        name: _joined(np.asarray(getattr(result, name)))
+        name: _join_intervals(np.asarray(getattr(result, name)))
         for name in ("balancing", "gathering", "undamped_balancing", "undamped_gathering")
     }
     return {"status": result.message, **lists, **intervals}
 
 
-def _joined(rows: np.ndarray) -> list[list[float | None]]:
+def _join_intervals(rows: np.ndarray) -> list[list[float | None]]:
     """Join rows [from, to] that touch and omit empty ones, within rounding."""
     joined: list[list[float]] = []
     close = np.sqrt(np.finfo(rows.dtype).eps)

@@ -25,7 +25,7 @@ from jaxvib.units import count
 BATCH = 16
 """Number of rotor speeds in a batch of monodromy matrices."""
 
-_FORGOTTEN = 40.0
+_MIN_DECAY_EXPONENT = 40.0
 """Exponent of the decay in a turn, exp(-40), above which a vibration is below the rounding of multipliers."""
 
 _FEWEST, _MOST = 16, 2**17
@@ -111,7 +111,7 @@ def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | N
         return count(steps, "steps", low=2, each=64.0)
     slowest = float(np.min(np.asarray(speeds), initial=np.inf))
     decay, wanted = (float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest)))
-    if wanted >= _MOST and decay * 2.0 * np.pi / slowest < _FORGOTTEN:
+    if wanted >= _MOST and decay * 2.0 * np.pi / slowest < _MIN_DECAY_EXPONENT:
         problem = (
             f"is {slowest:g} rad/s, at which a turn takes more than {_MOST} steps, and the carrier still vibrates at its "
             f"end (it decays at {max(decay, 0.0):.2g} 1/s); use a higher speed, or give machine.damping"

@@ -82,7 +82,7 @@ class BalancedStates(Result):
         **Arguments**: `arrangement`: its number, counted from 0; `steps` of Radau's method over one turn (default: as many as
         the natural frequencies need); the time grows in proportion.
         """
-        return balanced_stability(self.scene, self._arranged(arrangement), steps=steps)
+        return balanced_stability(self.scene, self._angles_of(arrangement), steps=steps)
 
     @validated
     def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
@@ -91,7 +91,7 @@ class BalancedStates(Result):
 
         **Arguments**: `speeds`, rad/s; `arrangement`: its number, counted from 0; `steps` as `stability`.
         """
-        return balanced_growth(self.scene, speeds, self._arranged(arrangement), steps=steps)
+        return balanced_growth(self.scene, speeds, self._angles_of(arrangement), steps=steps)
 
     @validated
     def intervals(
@@ -107,9 +107,9 @@ class BalancedStates(Result):
           can be missed, and the time grows in proportion
         - `steps` as `stability`
         """
-        return balanced_intervals(self.scene, low, high, self._arranged(arrangement), points=points, steps=steps)
+        return balanced_intervals(self.scene, low, high, self._angles_of(arrangement), points=points, steps=steps)
 
-    def _arranged(self, arrangement: int) -> np.ndarray:
+    def _angles_of(self, arrangement: int) -> np.ndarray:
         """Return the angles of an arrangement. **Raises** `ComputationError` if there is none."""
         if not len(self.angles):
             raise failure(self.status)
@@ -188,7 +188,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
         # All loads are on one line, the largest opposite all others.
         one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
     else:
-        one = _inscribed(sides) * np.array([[1.0], [-1.0]])
+        one = _inscribed_polygon(sides) * np.array([[1.0], [-1.0]])
     fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
     angles = np.mod(one - one[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
     neutral = [_neutral(loads, row, turns=free) for row in angles]
@@ -219,7 +219,7 @@ def _imbalance(scene: Scene) -> complex:
     return sum(static, 0j)
 
 
-def _inscribed(sides: np.ndarray) -> np.ndarray:
+def _inscribed_polygon(sides: np.ndarray) -> np.ndarray:
     """Return directions of the sides of the polygon inscribed in a circle, in the order of the loads, the first at 0."""
     largest = int(np.argmax(sides))
     low, high = 0.0, 1.0

@@ -84,7 +84,7 @@ class PhaseJams(AbstractPhaseJam):
         if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
             raise InputError("index", f"is {quoted(index)}; there are {n} jams, counted from 0")
         fields = {name: getattr(self, name) for name in PhaseJam.__dataclass_fields__}
-        return _selected(PhaseJam(**fields), np.asarray(index, np.uint32))
+        return _select_jams(PhaseJam(**fields), np.asarray(index, np.uint32))
 
     @validated
     def follow(self, index: int, omega: Array) -> PhaseBranch:
@@ -248,7 +248,7 @@ def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
 
 
 @cached
-def _selected(jams: PhaseJam, index: Array | np.ndarray) -> PhaseJam:
+def _select_jams(jams: PhaseJam, index: Array | np.ndarray) -> PhaseJam:
     return jax.tree.map(lambda leaf: leaf[index], jams)
 
 

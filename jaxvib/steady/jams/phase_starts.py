@@ -56,7 +56,7 @@ def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
     each = max(number // len(divisions), min(number, _STARTS_OF_CLUSTERS))
     found = []
     for cluster in divisions:
-        merged = _merged(balance, cluster)
+        merged = _cluster_balance(balance, cluster)
         phases = rng.uniform(-np.pi, np.pi, (each, merged.unbalance.shape[0]))
         starts = starts_of(merged, phases)
         if balance.unbalance.size > 2:
@@ -113,7 +113,7 @@ def _divisions(groups: list[np.ndarray]) -> list[np.ndarray]:
     return divisions
 
 
-def _merged(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalance:
+def _cluster_balance(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalance:
     """Return the balance of clusters of equal loads: each cluster is one load with the total unbalance and drag of its
     members."""
     first, many = np.unique(cluster, return_index=True, return_counts=True)[1:]

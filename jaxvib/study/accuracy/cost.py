@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-WANTED = (1e-2, 1e-4, 1e-6)
+SHOWN_ERRORS = (1e-2, 1e-4, 1e-6)
 """Errors for which tables and figures show the cheapest method."""
 
-_PATIENCE = 1.0
+_MAX_TIMING_SECONDS = 1.0
 """Total time after which a timing is not repeated, s."""
 
 
@@ -75,11 +75,11 @@ class Cost(Result):
         return min(able, key=lambda row: row.seconds, default=None)
 
     def summary(self) -> str:
-        """Return the fastest method for each of the errors `WANTED`, and the tiers left out, as text."""
+        """Return the fastest method for each of the errors `SHOWN_ERRORS`, and the tiers left out, as text."""
         lines = [
             f"{self.quantity.replace('_', ' ')}: {len(self.rows)} methods, error of the reference {self.reference_error:.1e}"
         ]
-        for wanted in WANTED:
+        for wanted in SHOWN_ERRORS:
             row = self.cheapest(wanted)
             way = "none here" if row is None else f"{', '.join(x for x in row[:4] if x)}: {row.seconds:.3g} s"
             lines.append(f"  to {wanted:.0e}: {way}")
@@ -97,7 +97,7 @@ class Cost(Result):
 def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
     """Plot error against seconds: a panel for each of `costs` with its title, and the same line for a method in all panels.
 
-    Rings mark the cheapest method for each of the errors `WANTED`.
+    Rings mark the cheapest method for each of the errors `SHOWN_ERRORS`.
 
     **Arguments**: `costs` a `Cost` for each title, which stands above its panel; `ax` as many axes to draw onto. **Returns**
     a matplotlib figure, or the given `ax`.
@@ -119,11 +119,11 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
             ", ".join(part for part in name if part): np.array([row[5:3:-1] for row in cost.rows if row[:3] == name])
             for name in names
         }
-        chosen = [row for row in map(cost.cheapest, WANTED) if row is not None]
+        chosen = [row for row in map(cost.cheapest, SHOWN_ERRORS) if row is not None]
         best = np.reshape(np.array([row[5:3:-1] for row in chosen]), (-1, 2))
         return CostPanel(lines, cost.reference_error, cost.quantity.replace("_", " "), best)
 
-    return cost_chart({title: panel(cost) for title, cost in costs.items()}, WANTED, ax=ax)
+    return cost_chart({title: panel(cost) for title, cost in costs.items()}, SHOWN_ERRORS, ax=ax)
 
 
 def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
@@ -136,7 +136,7 @@ def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
         value = jax.block_until_ready(call())
         took = time.perf_counter() - begun
         best, spent = min(best, took), spent + took
-        if spent > _PATIENCE:
+        if spent > _MAX_TIMING_SECONDS:
             break
     return value, best, max(first - best, 0.0)
 

@@ -241,7 +241,7 @@ def check_gradients(
     away = np.abs(routed - difference)
     parts = any(_parts(row, slopes, float(value)) for row, slopes in zip(sweep, routed.T, strict=True))
     return GradientCheck(
-        status=member(GradientStatus, "chaotic" if parts else _judged(away, noise, scale, tolerance)),
+        status=member(GradientStatus, "chaotic" if parts else _compare_derivatives(away, noise, scale, tolerance)),
         value=float(value),
         numbers=tuple(each.name for each in numbers),
         at=at,
@@ -322,7 +322,7 @@ def _scale(difference: np.ndarray) -> np.ndarray:
     return np.maximum(size, _SMALL_DERIVATIVE_SHARE * most if most > 0.0 else np.finfo(float).tiny)
 
 
-def _judged(away: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: float) -> str:
+def _compare_derivatives(away: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: float) -> str:
     if not (np.all(np.isfinite(away)) and np.all(np.isfinite(noise))):
         return "not_finite"
     if np.any(away > tolerance * scale + _SAFETY * noise):

@@ -25,7 +25,7 @@ from jaxvib.study.accuracy.exact_reference import ExactJam, collocation_points, 
 
 _GRADIENT_TOLERANCE = 1e-8
 
-_MOST_NOTED = 2**17
+_MAX_RECORDED_STEPS = 2**17
 """Maximum number of steps of a run with derivatives, which records the end of each step."""
 
 _supports = operator.attrgetter("machine.stiffness")
@@ -75,7 +75,7 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
 def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
     """Return gradients by runs of the scene `at` some stiffnesses, which start near a stable jam."""
     until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
-    max_steps = min(enough_steps(frequency_bounds(scene)[0], jnp.asarray(until)), _MOST_NOTED)
+    max_steps = min(enough_steps(frequency_bounds(scene)[0], jnp.asarray(until)), _MAX_RECORDED_STEPS)
 
     def full(k: Array, adjoint: diffrax.AbstractAdjoint | None = None) -> Array:
         run = simulate(

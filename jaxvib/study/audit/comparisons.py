@@ -222,7 +222,7 @@ def _read(scene: Scene, run: Run, fold: float) -> MotionValues:
     unit = float(natural_units(scene).displacement)
     magnified = max(1.0, MIN_AMPLITUDE_SHARE * unit / moved) if moved > 0.0 else 1.0
     # The drift was measured relative to a scale with another lower limit.
-    drift *= max(moved, measure.LEAST * unit) / max(moved, MIN_AMPLITUDE_SHARE * unit)
+    drift *= max(moved, measure.MIN_CHANGE_SCALE * unit) / max(moved, MIN_AMPLITUDE_SHARE * unit)
     return MotionValues(
         kind,
         float(run.omega),

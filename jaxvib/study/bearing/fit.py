@@ -19,7 +19,7 @@ from jaxvib.study.bearing.decrement import TurningPoints, period_stretch
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
 
-_MOST_ITERATIONS = 64
+_MAX_ITERATIONS = 64
 
 TOLERANCE = 1e-9
 """Relative error of a step of the integration behind a fit."""
@@ -154,7 +154,7 @@ def _least_squares(
     floor = n * (0.01 * TOLERANCE) ** 2
 
     def goes_on(carry: tuple[Array, ...]) -> Array:
-        return (carry[0] < _MOST_ITERATIONS) & (carry[-1] > 1e-4) & (carry[2] < 1e6)
+        return (carry[0] < _MAX_ITERATIONS) & (carry[-1] > 1e-4) & (carry[2] < 1e6)
 
     def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         count, trial, damping, *best, _ = carry

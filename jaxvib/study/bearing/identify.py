@@ -38,7 +38,7 @@ has at most 1.2."""
 _STRUCTURE = 1e-5
 """Share of records with pure noise about the fit that get the status `patterned`."""
 
-_CONTRADICTS = 0.05
+_MAX_FREQUENCY_DIFFERENCE = 0.05
 """Relative difference of frequencies, in addition to instrument errors, that errors of length and mass cannot explain."""
 
 
@@ -189,7 +189,7 @@ def identify(
         # the samples at rest from distant initial values converges to the wrong half swing.
         start = fit_swing(*given, jnp.asarray(large), start, width, steps).unknowns
     fit = fit_swing(*given, jnp.asarray(swinging), start, width, steps)
-    found = _judged(pendulum, swing, turns, fit, float(width), instrument, until)
+    found = _interpret_fit(pendulum, swing, turns, fit, float(width), instrument, until)
     if throw and bool(found.status == IdentifyStatus.not_converged):
         raise ComputationError("not_converged", f"{record.name}: {found.message}")
     return found
@@ -201,7 +201,7 @@ def _still_large(turns: TurningPoints) -> float:
     return float(turns.time[max(small[0], 4)]) if small.size else math.inf
 
 
-def _judged(
+def _interpret_fit(
     pendulum: BearingPendulum, record: Record, turns: TurningPoints, fit: Fit, width: float, instrument: float, until: float
 ) -> Identified:
     """Return the fit with intervals, a status and notes."""
@@ -260,7 +260,7 @@ def _status(found: Identified, *, has_converged: bool, is_patterned: bool, instr
         return IdentifyStatus.negative
     if viscous.low <= 0.0 and (dry is None or dry.low <= 0.0):
         return IdentifyStatus.undetermined
-    if abs(found.frequency.value / float(found.pendulum.frequency) - 1.0) > _CONTRADICTS + instrument:
+    if abs(found.frequency.value / float(found.pendulum.frequency) - 1.0) > _MAX_FREQUENCY_DIFFERENCE + instrument:
         return IdentifyStatus.contradicted
     return IdentifyStatus.patterned if is_patterned else IdentifyStatus.found
 

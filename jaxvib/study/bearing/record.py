@@ -196,7 +196,7 @@ def _columns(
     below = [unit.strip("()[]{} ") for unit in heads[1]] if len(heads) == 2 else [""] * len(heads[0])
     places, factors = [], []
     for k, (what, known) in enumerate(_NAMES.items()):
-        parts = [_parted(head, what) for head in heads[0]]
+        parts = [_split_head(head, what) for head in heads[0]]
         choice = tuple(name.strip().lower() for name in ((requested[k],) if requested is not None else known))
         found = [i for i, (name, _) in enumerate(parts) if {name.lower(), heads[0][i].lower()} & set(choice)]
         if not found and requested is None and width == 2:
@@ -223,7 +223,7 @@ def _columns(
     return places, factors
 
 
-def _parted(head: str, what: str) -> tuple[str, str]:
+def _split_head(head: str, what: str) -> tuple[str, str]:
     """Return the name and the unit of a column's head: `name (unit)`, `name / unit`; `name_unit` if the unit is known."""
     part = _HEAD.match(head)
     if part is not None:

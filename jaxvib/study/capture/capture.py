@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-CAUGHT = 3e-3
+MAX_CAPTURED_SLIP = 3e-3
 """Relative difference of speeds below which a load turns with the rotor, as in `regime`."""
 
-_SCAN = 32
+_SCAN_SPEEDS = 32
 """Number of initial speeds of a scan for the threshold."""
 
 
@@ -130,7 +130,7 @@ class Capture(Result):
         return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold), ax=ax)
 
 
-def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
+def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
     """Return the state with the carrier at rest and the loads side by side at the bottom of the tube, with one relative speed.
 
     **Arguments**: `speed` psi'/w relative to the rotor, -1 for loads at rest in space; `shift` rad of the loads along the ring,
@@ -139,11 +139,11 @@ def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     **Returns** `State`. **Raises** `InputError` for loads that do not run in a torus.
 
     >>> from jaxvib.machine.files import TEMPLATES, scene_from_toml
-    >>> state = thrown_state(scene_from_toml(TEMPLATES["torus"]), -0.5)
+    >>> state = moving_state(scene_from_toml(TEMPLATES["torus"]), -0.5)
     >>> [round(float(x), 4) for x in (state.angle[0][1], state.rate[0][0])]
     [0.1248, 70.0]
     """
-    loads = in_torus(scene.loads, "thrown_state")
+    loads = in_torus(scene.loads, "moving_state")
     beside = 2.0 * jnp.arctan2(loads.ball_radius, loads.radius)
     zero = jnp.zeros((loads.count,))
     still = jnp.zeros(scene.machine.structure().mass.shape[:1])
@@ -219,7 +219,7 @@ def capture(
     if turning == "still" and not has_term(scene.all_effects, SlipRelease):
         problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
         raise InputError("turning", problem)
-    tried = np.linspace(-1.0, 0.0, _SCAN + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
+    tried = np.linspace(-1.0, 0.0, _SCAN_SPEEDS + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
     allowed = tried.ndim == 1 and tried.size > 0 and np.all(np.isfinite(tried)) and np.all(np.diff(tried) > 0.0)
     if not allowed or tried[0] < -1.0 or tried[-1] > 0.0:
         raise InputError("speeds", f"is {quoted(speeds)}; ascending numbers from -1 to 0 are needed")
@@ -236,11 +236,11 @@ def capture(
         lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
         shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
         values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
-        make = _thrown if turning == "rolling" else _thrown_still
+        make = _rolling_start if turning == "rolling" else _sliding_start
         ran = ensemble(make, values, end, stepsize_controller=EqualSteps(steps), estimate=False, equations=equations)
         slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
         finite = np.asarray(ran.finite)
-        found = (np.all(slip < CAUGHT, axis=1) & finite, finite, np.any(ran.detached, axis=1))
+        found = (np.all(slip < MAX_CAPTURED_SLIP, axis=1) & finite, finite, np.any(ran.detached, axis=1))
         return [each.reshape(which.size, starts) for each in found]
 
     def scan(_: np.ndarray, multiple: int) -> list[Capture]:
@@ -250,12 +250,12 @@ def capture(
             least = _least(parts[0])
             if least in (0, speed.size) or speed[least] - speed[least - 1] <= resolution:
                 break
-            finer = np.linspace(speed[least - 1], speed[least], max(4, _SCAN // starts) + 2)[1:-1]
+            finer = np.linspace(speed[least - 1], speed[least], max(4, _SCAN_SPEEDS // starts) + 2)[1:-1]
             order = np.argsort(np.concatenate([speed, finer]))
             speed = np.concatenate([speed, finer])[order]
             parts = [np.concatenate(pair)[order] for pair in zip(parts, outcomes(finer, steps), strict=True)]
         captured, finite, detached = parts
-        return [_judged(speed, captured, finite, detached, turns, steps)]
+        return [_summarize_captures(speed, captured, finite, detached, turns, steps)]
 
     # A threshold close to one of the speeds may fall into the interval on either side of it.
     tolerance = 1.001 * max(np.max(np.diff(tried), initial=0.0) if resolution is None else resolution, 1e-12)
@@ -266,13 +266,13 @@ def capture(
     return dataclasses.replace(answer, moved=jnp.asarray(moved), uncertainty=uncertainty, status=status)
 
 
-def _thrown(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
+def _rolling_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
     scene, speed, shift = value
-    return scene, thrown_state(scene, speed, shift)
+    return scene, moving_state(scene, speed, shift)
 
 
-def _thrown_still(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
-    scene, state = _thrown(value)
+def _sliding_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
+    scene, state = _rolling_start(value)
     return scene, with_spin(scene, state, "still")
 
 
@@ -282,7 +282,7 @@ def _least(captured: np.ndarray) -> int:
     return 0 if failing.size == 0 else int(failing[-1]) + 1
 
 
-def _judged(
+def _summarize_captures(
     speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, detached: np.ndarray, turns: int, steps: int
 ) -> Capture:
     least = _least(captured)
@@ -323,10 +323,10 @@ def capture_time(run: Run, within: float = 0.05) -> Array:
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
-    >>> from jaxvib.study.capture.capture import capture_time, thrown_state
+    >>> from jaxvib.study.capture.capture import capture_time, moving_state
     >>> from jaxvib.machine.files import TEMPLATES
     >>> scene = jv.scene_from_toml(TEMPLATES["torus"])
-    >>> run = jv.simulate(scene, 2.0, start=thrown_state(scene, -0.1), samples=2000, estimate=False)
+    >>> run = jv.simulate(scene, 2.0, start=moving_state(scene, -0.1), samples=2000, estimate=False)
     >>> bool(0.0 < capture_time(run) < 2.0)
     True
     """

@@ -32,7 +32,7 @@ from optimize import (
     under,
     worst,
 )
-from optimize.search.problem import reported
+from optimize.search.problem import evaluate_quantities
 
 SCENE = scene("two_mass", speed=120.0)
 STIFFNESS = Quantity("sum of stiffnesses", "N/m", lambda s: jnp.sum(s.machine.stiffness))
@@ -53,7 +53,7 @@ def test_arithmetic_is_that_of_the_numbers():
         "least": least(force, 0.5 * force),
         "two arguments": Quantity("w", "rad/s", lambda s, modes: modes.omega[2]),
     }
-    f, a, *rest = reported([force, whose, *built.values(), force_per_amplitude(mode=3)], jax.tree.map(one, SCENE))[0]
+    f, a, *rest = evaluate_quantities([force, whose, *built.values(), force_per_amplitude(mode=3)], jax.tree.map(one, SCENE))[0]
     jam = jv.jam_modes(SCENE).select(3)
     np.testing.assert_allclose([f, a], [jam.foundation_force, abs(jam.displacement[0] - jam.displacement[1])], rtol=1e-9)
     awaited = [f / a, 0.3 * a / 1e-3 + f / 10.0, -3.0 * f, 1.0 - f / 1e3, 2.0 * f, 0.5 * f, float(jam.omega), f / a]
@@ -67,7 +67,7 @@ def test_quantities_of_a_jam_and_of_the_machine():
     prices = spring_cost([(1e4, 20.0), (1e5, 56.0)])
     asked = [power(mode=3), phase(mode=3), jam_frequency(mode=3), total_mass(), static_deflection(1), prices]
     asked += [product("machine.mass"), total("machine.stiffness"), fold_margin(mode=3), fold_margin(mode=4)]
-    found = reported(asked, jax.tree.map(one, SCENE))[0]
+    found = evaluate_quantities(asked, jax.tree.map(one, SCENE))[0]
     first, second = np.asarray(jam.displacement)
     assembled, weight = np.asarray(machine.carrier().stiffness), 9.80665 * np.asarray([120.0, 95.0 + 2.4])
     each = np.interp([5e4, 3e4], [1e4, 1e5], [20.0, 56.0]).sum() + 56.0 + 36.0 / 9e4 * 1e5  # the link, beyond the list's end
@@ -135,7 +135,7 @@ def test_tiers_agree_with_the_functions_they_stand_for():
 def test_cases_are_other_scenes():
     heavy = under(jam_frequency(mode=3), "heavy", {"machine.mass[0]": "150 kg", "drive.speed": 130.0})
     there = eqx.tree_at(lambda s: (s.machine.mass, s.drive.speed), SCENE, (jnp.array([150.0, 95.0]), jnp.asarray(130.0)))
-    found = reported([heavy, jam_frequency(mode=3)], jax.tree.map(one, SCENE))[0]
+    found = evaluate_quantities([heavy, jam_frequency(mode=3)], jax.tree.map(one, SCENE))[0]
     np.testing.assert_allclose(found, [float(jv.jam_modes(s).select(3).omega) for s in (there, SCENE)], rtol=1e-9)
     with pytest.raises(jv.InputError, match="is not set in this scene"):
         under(STIFFNESS, "x", {"loads.inertia": 1.0})(SCENE)
@@ -151,7 +151,7 @@ def test_tolerances_are_kept_by_95_of_100():
     assert 5e4 * 1.05 < most < 5e4 * 1.08 and abs(low + most - 1e5) < 1e-6
     # The mean force over machines that are off by so much is larger than the force: it is convex about its least value.
     force = foundation_force(mode=3)
-    nominal, spread = reported([force, expected(force, off, samples=16)], jax.tree.map(one, SCENE))[0]
+    nominal, spread = evaluate_quantities([force, expected(force, off, samples=16)], jax.tree.map(one, SCENE))[0]
     assert np.isfinite(spread) and abs(spread / nominal - 1.0) < 0.2
 
 

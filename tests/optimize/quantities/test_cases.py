@@ -11,7 +11,7 @@ from scipy.stats import norm
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, expected, jam_frequency, largest, quantile, under, worst
 from optimize.quantities.evaluation import Evaluation
-from optimize.search.problem import evaluate, looked_up, problem_of
+from optimize.search.problem import evaluate, find_speeds, problem_of
 
 SCENE = scene("two_mass")
 FIRST = Quantity("first", "N/m", lambda s: s.machine.stiffness[0])
@@ -90,7 +90,7 @@ def test_jams_are_followed_in_every_case():
     problem = problem_of(space, frequency, [spread < 200.0], 1)
     assert sorted(len(path) for path, _ in problem.keys) == [0, 2]
     z = np.array([[0.5, 0.3]])
-    point = evaluate(problem, z, looked_up(problem, z))
+    point = evaluate(problem, z, find_speeds(problem, z))
 
     def of(s):
         return float(jv.jam_modes(s).select(3).omega)

@@ -89,8 +89,8 @@ def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
     """Values are those of whole branches, which are looked at for the first designs, and where following leads nowhere."""
     problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [])
     looked = []
-    look = evolve_module.looked_up
-    monkeypatch.setattr(evolve_module, "looked_up", lambda problem, z: looked.append(len(z)) or look(problem, z))
+    look = evolve_module.find_speeds
+    monkeypatch.setattr(evolve_module, "find_speeds", lambda problem, z: looked.append(len(z)) or look(problem, z))
     followed = Followed(problem)
     first = np.array([[0.2, 0.3], [0.8, 0.7], [0.5, 0.9]])
     second = first[::-1] + 0.01
@@ -106,7 +106,7 @@ def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
     for _ in range(40):
         followed.of(second)
     assert len(followed.remembered[0]) == len(followed.remembered[1]) <= 200
-    monkeypatch.setattr(evolve_module, "_REMEMBERED", 4)  # the last ones
+    monkeypatch.setattr(evolve_module, "_MAX_KNOWN_DESIGNS", 4)  # the last ones
     followed.of(first)
     np.testing.assert_array_equal(followed.remembered[0], [second[2], *first])
 

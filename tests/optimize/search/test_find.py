@@ -10,7 +10,7 @@ from optimize import DesignSpace, expected, hold, jam_frequency, largest, suppor
 from optimize.search import find as find_module
 from optimize.search.find import Found, Options, _away, _few, _of_their_mode, _spread, choose, find
 from optimize.search.polish import Optimality
-from optimize.search.problem import evaluate, looked_up, problem_of
+from optimize.search.problem import evaluate, find_speeds, problem_of
 
 BOUNDS = np.array([1e4, 1e4]), np.array([9e4, 9e4])
 NEAR = plain("near", lambda x, y: (x - 6.0) ** 2 + (y - 5.0) ** 2 + 2.0)
@@ -47,7 +47,7 @@ def test_how_far_a_number_is_from_its_catalogue():
 def test_a_jam_of_another_number_is_no_answer():
     problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [], 2)
     z = np.array([[0.5, 0.5], [0.4, 0.3]])
-    point = evaluate(problem, z, looked_up(problem, z))
+    point = evaluate(problem, z, find_speeds(problem, z))
     np.testing.assert_array_equal(_of_their_mode(problem, point).values, point.values)
     other = point._replace(known=(point.known[0] * np.array([1.0, 1.001]),))
     kept = _of_their_mode(problem, other)
@@ -189,7 +189,7 @@ def test_choices_keep_demands_or_there_are_none(monkeypatch):
 def test_between_narrower_bounds_the_best_is_at_them(bounds):
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], 4)
     low, high = (np.array(each) for each in bounds)
-    found = find_module._bounded(problem, low, high, np.array([[3e4, 3e4], [8e4, 1e4]]), OPTIONS.polishing)
+    found = find_module._solve_in_bounds(problem, low, high, np.array([[3e4, 3e4], [8e4, 1e4]]), OPTIONS.polishing)
     numbers = problem.space.within(low, high).numbers(found.point.z)
     np.testing.assert_allclose(numbers, np.clip([[6e4, 5e4]] * 2, low, high), rtol=1e-9)
     np.testing.assert_array_equal(found.bounds, [low, high])

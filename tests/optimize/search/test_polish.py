@@ -7,7 +7,7 @@ from two_springs import FREE, SCENE, plain, point_of
 
 from optimize import DesignSpace, hold, largest
 from optimize.search.polish import _merit, draw_starts, optimality, polish, restore, violation
-from optimize.search.problem import evaluate, looked_up, problem_of
+from optimize.search.problem import evaluate, find_speeds, problem_of
 
 SUM = plain("sum", lambda x, y: x + y)
 FIRST = plain("first", lambda x, y: x)
@@ -124,29 +124,29 @@ def test_at_a_kink_the_slopes_of_its_pieces_balance():
 
 def test_starts_are_the_random_designs_that_have_the_objective():
     problem = problem_of(DesignSpace(SCENE, FREE), plain("half", lambda x, y: jnp.where(x > 5.0, x * y, jnp.nan)), [], starts=8)
-    found = draw_starts(problem, 8, 3, looked_up)
+    found = draw_starts(problem, 8, 3, find_speeds)
     random = np.random.default_rng(3)
     drawn = np.concatenate([random.uniform(size=(8, 2)) for _ in range(found.drawn // 8)])
     there = drawn[drawn[:, 0] > 0.5]
     np.testing.assert_array_equal(found.point.z, there[:8])
     assert found.existing == len(there) >= 8 > np.sum(drawn[:-8, 0] > 0.5) and found.nearest is None
     nowhere = problem_of(DesignSpace(SCENE, FREE), plain("no", lambda x, y: x * jnp.nan), [], starts=4)
-    assert draw_starts(nowhere, 4, 0, looked_up, rounds=2) == (None, 8, 0, None)
+    assert draw_starts(nowhere, 4, 0, find_speeds, rounds=2) == (None, 8, 0, None)
 
 
 def test_starts_are_moved_onto_what_is_held():
     product = plain("product", lambda x, y: x * y)
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(product, 40.0)]), NEAR, [], starts=8)
-    found = draw_starts(problem, 8, 0, looked_up)
+    found = draw_starts(problem, 8, 0, find_speeds)
     np.testing.assert_allclose(np.prod(xy(found.point), axis=1), 40.0, rtol=1e-8)
     assert found.existing == found.drawn and len(found.point.z) == 8
     assert np.all((found.point.z >= 0.0) & (found.point.z <= 1.0))
     corner = problem_of(DesignSpace(SCENE, FREE, [hold(product, 80.9)]), NEAR, [], starts=8)  # of 81 at most
-    there = draw_starts(corner, 8, 0, looked_up)
+    there = draw_starts(corner, 8, 0, find_speeds)
     np.testing.assert_allclose(np.prod(xy(there.point), axis=1), 80.9, rtol=1e-8)
     # Where none can keep it, the designs that were drawn are the nearest known.
     far = problem_of(DesignSpace(SCENE, FREE, [hold(product, 500.0)]), NEAR, [], starts=8)
-    none = draw_starts(far, 8, 0, looked_up, rounds=2)
+    none = draw_starts(far, 8, 0, find_speeds, rounds=2)
     assert none.point is None and none.drawn == none.existing == 16
     np.testing.assert_array_equal(none.nearest.z, np.random.default_rng(0).uniform(size=(8, 2)))
 

@@ -11,7 +11,7 @@ import jaxvib as jv
 from jaxvib.steady.jams.jam import jam_modes
 from optimize import DesignSpace, Quantity, amplitude, expected, foundation_force, hold, jam_frequency, largest, total
 from optimize.quantities.quantity import BuiltinQuantity
-from optimize.search.problem import Point, derive, evaluate, looked_up, made, problem_of, report_keys, reported
+from optimize.search.problem import Point, derive, evaluate, evaluate_quantities, find_speeds, made, problem_of, report_keys
 
 SUM, FIRST = plain("sum", lambda x, y: x + y), plain("first", lambda x, y: x)
 
@@ -87,7 +87,7 @@ def test_followed_speeds_and_how_they_change():
     problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [], 4)
     assert [asked for _, asked in problem.keys] == [("jam", 3)]
     z = np.array([[0.4, 0.3], [0.5, 0.6]])
-    near = looked_up(problem, z)
+    near = find_speeds(problem, z)
     omega = [float(jam_modes(problem.space.at(jnp.asarray(each))).select(3).omega) for each in z]
     np.testing.assert_allclose(near[0], omega, rtol=1e-10)
     point = evaluate(problem, z, near)
@@ -182,15 +182,15 @@ def test_reports_are_those_of_each_scene():
     batch = made(problem_of(DesignSpace(SCENE, FREE), NEAREST, [], 4), np.array([[3e4, 4e4], [5e4, 6e4], [7e4, 8e4]]))
     np.testing.assert_array_equal(batch.machine.stiffness, [[3e4, 4e4], [5e4, 6e4], [7e4, 8e4]])
     frequency = jam_frequency(mode=3)
-    told = reported([SUM, frequency], batch)
+    told = evaluate_quantities([SUM, frequency], batch)
     np.testing.assert_allclose(told[:, 0], [7.0, 11.0, 15.0])
     each = [jam_modes(scene_of(batch, k)).select(3).omega for k in range(3)]
     np.testing.assert_allclose(told[:, 1], each, rtol=1e-10)
     searched = problem_of(DesignSpace(SCENE, FREE), foundation_force(mode=3) / "1 N", [amplitude(mode=4) > "1 mm"], 4)
-    np.testing.assert_allclose(reported([SUM, frequency], batch, searched), told, rtol=1e-12)
+    np.testing.assert_allclose(evaluate_quantities([SUM, frequency], batch, searched), told, rtol=1e-12)
     other = problem_of(DesignSpace(SCENE, FREE), NEAREST, [], 4)
-    np.testing.assert_allclose(reported([SUM, frequency], batch, other), told, rtol=1e-12)
-    assert reported([], batch).shape == (3, 0)
+    np.testing.assert_allclose(evaluate_quantities([SUM, frequency], batch, other), told, rtol=1e-12)
+    assert evaluate_quantities([], batch).shape == (3, 0)
     assert report_keys([SUM, frequency, foundation_force(mode=3)], SCENE) == (((), ("jam", 3)),)
 
 
@@ -198,7 +198,7 @@ def test_modes_of_cases_are_looked_up_in_their_scenes():
     wish = expected(jam_frequency(mode=3), {"machine.stiffness": 0.05}, samples=4)
     problem = problem_of(DesignSpace(SCENE, FREE), wish, [jam_frequency(mode=3) < "120 rad/s"], 1)
     z = np.array([[0.5, 0.25]])
-    found = dict(zip((len(path) for path, _ in problem.keys), looked_up(problem, z), strict=True))
+    found = dict(zip((len(path) for path, _ in problem.keys), find_speeds(problem, z), strict=True))
     at = problem.space.at(jnp.asarray(z[0]))
     np.testing.assert_allclose(found[0], [float(jv.jam_modes(at).select(3).omega)], rtol=1e-10)
     several = wish.case.scenes(at)

@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 import jaxvib as jv
-from jaxvib.steady.balance.criterion import _joined
+from jaxvib.steady.balance.criterion import _join_intervals
 from jaxvib.steady.balance.speeds import _free_and_held_modes, _inverse_root, characteristic_speeds
 
 
@@ -32,10 +32,10 @@ def test_intervals_that_touch_are_one_and_empty_ones_none():
     rows = np.array(
         [[0.0, 2.0], [2.0, 3.0], [5.0, 5.0], [100.0, 100.0 + 1e-7], [200.0, 300.0], [np.nan, np.nan], [400.0, np.inf]]
     )
-    assert _joined(rows) == [[0.0, 3.0], [200.0, 300.0], [400.0, None]]
-    assert _joined(np.array([[100.0, 200.0], [200.0 + 1e-7, 300.0]])) == [[100.0, 300.0]]
-    assert _joined(np.array([[100.0, 200.0], [200.01, 300.0]])) == [[100.0, 200.0], [200.01, 300.0]]
-    assert _joined(np.array([[0.01, 0.02], [0.0200001, 0.03]])) == [[0.01, 0.02], [0.0200001, 0.03]]
+    assert _join_intervals(rows) == [[0.0, 3.0], [200.0, 300.0], [400.0, None]]
+    assert _join_intervals(np.array([[100.0, 200.0], [200.0 + 1e-7, 300.0]])) == [[100.0, 300.0]]
+    assert _join_intervals(np.array([[100.0, 200.0], [200.01, 300.0]])) == [[100.0, 200.0], [200.01, 300.0]]
+    assert _join_intervals(np.array([[0.01, 0.02], [0.0200001, 0.03]])) == [[0.01, 0.02], [0.0200001, 0.03]]
 
 
 @pytest.mark.parametrize(

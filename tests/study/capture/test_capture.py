@@ -14,7 +14,7 @@ from papers.printed_torus import printed_torus
 import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.draw.capture import torus_paths
-from jaxvib.study.capture.capture import capture_time, thrown_state
+from jaxvib.study.capture.capture import capture_time, moving_state
 from jaxvib.study.capture.refinement import refine, steps_per_second
 
 
@@ -31,7 +31,7 @@ def test_a_threshold_is_bracketed_ever_finer():
     # A run of its own says the same on both sides.
     for speed, caught in ((float(fine.threshold) + 0.15, True), (float(fine.threshold) - 0.15, False)):
         until = 150.0 * 2.0 * np.pi / float(scene.drive.speed)
-        run = jv.simulate(scene, until, start=thrown_state(scene, speed), save="window", estimate=False)
+        run = jv.simulate(scene, until, start=moving_state(scene, speed), save="window", estimate=False)
         assert bool(np.all(np.abs(run.load_speed / scene.drive.speed - 1.0) < 3e-3)) == caught
 
 
@@ -47,7 +47,7 @@ def test_fractions_are_of_perturbed_starts_and_say_their_error():
 def test_thrown_balls_lie_side_by_side_from_their_shift_on():
     scene = published_torus(3.5)
     beside = 2.0 * np.arctan(float(scene.loads.ball_radius) / float(scene.loads.radius))
-    state = thrown_state(scene, -0.4, shift=0.3)
+    state = moving_state(scene, -0.4, shift=0.3)
     np.testing.assert_allclose(state.angle[0], 0.3 + beside * np.arange(scene.loads.count), rtol=1e-12)
     np.testing.assert_allclose(state.rate[0], 0.6 * float(scene.drive.speed), rtol=1e-12)
 
@@ -69,7 +69,7 @@ def test_captures_of_balls_that_are_thrown_without_turning():
     scene = jv.Scene(base.machine, base.loads, base.drive, (*base.all_effects, jv.Sliding(0.1)))
     rolled, slid = (jv.capture(scene, [-0.7, -0.1], turns=20, turning=how) for how in ("rolling", "still"))
     assert np.all(rolled.finite) and np.all(slid.finite) and not np.any(rolled.captured[0])
-    start = jv.with_spin(scene, thrown_state(scene, -0.7), "still")
+    start = jv.with_spin(scene, moving_state(scene, -0.7), "still")
     np.testing.assert_allclose(start.spin.slip[0], -0.7 * 140.0 * 0.2)
     for scene_, how, says in ((base, "still", "term SlipRelease"), (scene, "asleep", "it must be 'rolling' or 'still'")):
         with pytest.raises(jv.InputError, match=says):
@@ -154,7 +154,7 @@ def outcome(change, adjoint=None):
     leaves = [x * (1.0 + share) if np.asarray(x) else x + share for x, share in zip(leaves, change[:-1], strict=True)]
     scene = jax.tree.unflatten(rest, leaves)
     steps = dict(stepsize_controller=jv.EqualSteps(1500), estimate=False, adjoint=adjoint)
-    run = jv.simulate(scene, 1.0, start=thrown_state(scene, change[-1] - 0.2), samples=2000, **steps)
+    run = jv.simulate(scene, 1.0, start=moving_state(scene, change[-1] - 0.2), samples=2000, **steps)
     return jnp.stack([capture_time(run), jv.regime(scene, run.window).unbalance])
 
 
@@ -191,7 +191,7 @@ def test_reverse_derivatives_are_the_forward_ones():
             "drive.kind is 'dc_motor'; capture needs a prescribed speed",
         ),
         (
-            lambda s: capture_time(jv.simulate(s, 0.1, start=thrown_state(s, -0.1), save="window", estimate=False)),
+            lambda s: capture_time(jv.simulate(s, 0.1, start=moving_state(s, -0.1), save="window", estimate=False)),
             "run kept its window only",
         ),
     ],
@@ -217,7 +217,7 @@ def test_the_command_prints_shares_and_writes_pictures(tmp_path, capsys, monkeyp
     assert -1.0 < document["threshold"] < -0.1
     assert all((tmp_path / "o" / name).stat().st_size > 10_000 for name in ("capture.png", "paths.png"))
     around, in_the_tube, speed, _ = drawn  # of the run just above the threshold
-    np.testing.assert_allclose(around[0], thrown_state(published_torus(3.5), 0.0).angle[0], atol=1e-12)
+    np.testing.assert_allclose(around[0], moving_state(published_torus(3.5), 0.0).angle[0], atol=1e-12)
     np.testing.assert_allclose(in_the_tube[0], 0.0, atol=1e-12)
     np.testing.assert_allclose(speed[0], document["threshold"] + 2.0 * document["uncertainty"], rtol=1e-9)
     assert command(["capture", str(tmp_path / "torus.toml"), "--from", "0", "--to", "-1"]) == 2

@@ -20,7 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import in_torus
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.steps import EqualSteps
-from jaxvib.study.capture.capture import CAUGHT, thrown_state
+from jaxvib.study.capture.capture import MAX_CAPTURED_SLIP, moving_state
 from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
 from papers.machines import TORUS_SPEED, published_torus
 from papers.printed_torus import TABLES, PublishedRow, cosine_torus, gap_torus, printed_torus
@@ -51,7 +51,7 @@ class _Runs(NamedTuple):
 
 def _alone(run: _Runs) -> tuple[Scene, State]:
     scene = published_torus(run.gap, damping=run.damping, stiffness=run.stiffness, friction=run.friction)
-    return scene, thrown_state(scene, run.speed, run.shift)
+    return scene, moving_state(scene, run.speed, run.shift)
 
 
 def _touching(run: _Runs) -> tuple[Scene, State]:
@@ -312,7 +312,7 @@ def _outcomes(model: _Model, runs: _Runs, needed: np.ndarray, turns: int) -> np.
             model.make, values, end, stepsize_controller=steps, estimate=False, batch=_LANES, equations=model.equations
         )
         slip = np.abs(np.asarray(ran.load_speed) / TORUS_SPEED - 1.0)
-        captured[block] = (np.all(slip < CAUGHT, axis=1) & np.asarray(ran.finite))[: block.size]
+        captured[block] = (np.all(slip < MAX_CAPTURED_SLIP, axis=1) & np.asarray(ran.finite))[: block.size]
     return captured
 
 
