@@ -45,7 +45,7 @@ BATCH_SIZE, STEP = 64, 0.2
 
 NONE = contextlib.nullcontext
 OFF: dict[str, Callable[[], Any]] = {
-    "unrolled step: always looped": lambda: mock.patch.object(system, "_MOST_WRITTEN", 0),
+    "unrolled step: always looped": lambda: mock.patch.object(system, "_MAX_UNROLLED_SIZE", 0),
     "scalarize: on arrays": lambda: mock.patch.object(system, "MAX_SCALARS", 0),
     "polynomial sine and cosine: jnp.sin, jnp.cos": lambda: mock.patch.object(
         scalarize, "sine_and_cosine", lambda x: (jnp.sin(x), jnp.cos(x))

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 import jaxvib as jv
 from jaxvib.steady.orbits.diagram import SpecialPoint
 from jaxvib.steady.orbits.plan import _is_stiff
-from jaxvib.steady.orbits.stability import _deflate, _small_solve
+from jaxvib.steady.orbits.stability import _small_solve, deflate
 from jaxvib.study.maps.stability_onset import StabilityMap, stability_onset
 
 
@@ -191,7 +191,7 @@ def test_a_known_eigenvalue_is_taken_out(sign):
     vectors, values = rng.normal(size=(4, 4)), np.array([1.0, -2.0, 3.0, 0.5])
     vectors[:, 0] = [sign, 0.0, 0.0, 0.0]  # along the first axis, where the wrong one of two reflections is none
     matrix = vectors @ np.diag(values) @ np.linalg.inv(vectors)
-    known, left = _deflate(jnp.asarray(matrix), jnp.asarray(vectors[:, 0]))
+    known, left = deflate(jnp.asarray(matrix), jnp.asarray(vectors[:, 0]))
     np.testing.assert_allclose(known, 1.0, rtol=1e-12)
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(left).real), [-2.0, 0.5, 3.0], rtol=1e-9)
 
