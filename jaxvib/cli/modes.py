@@ -41,12 +41,6 @@ def modes(
     For a rotor, or with --phases, the list has the jams of light loads at any phases, and --out plots them over the drag of the
     loads. --exact is available for platforms and for rotors without tilt, if no load has its own station and the rotor is
     balanced."""
-    import jax  # slow imports, which --help does not need
-    import numpy as np
-
-    from jaxvib.steady.jams.jam import STABILITY_CRITERION
-    from jaxvib.steady.jams.phases import growth_of_free_loads
-
     loaded = loaded_scene(scene, without, speed)
     if exact and phases:
         raise InputError(
@@ -62,15 +56,26 @@ def modes(
             )
         _phases(loaded, output)
         return
-    found = jax.device_get(jv.jam_modes(loaded))  # NumPy arrays, because indexing JAX arrays would compile programs
-    output.picture("branches.png", lambda: jv.branches(loaded).plot())
+    _light(loaded, csv, output)
+
+
+def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
+    """Print the jams of light loads that stay together, and their folds."""
+    import jax  # slow imports, which --help does not need
+    import numpy as np
+
+    from jaxvib.steady.jams.jam import STABILITY_CRITERION
+    from jaxvib.steady.jams.phases import growth_of_free_loads
+
+    found = jax.device_get(jv.jam_modes(scene))  # NumPy arrays, because indexing JAX arrays would compile programs
+    output.picture("branches.png", lambda: jv.branches(scene).plot())
     if csv is not None:
-        output.csv(csv, jv.branches(loaded), "point")
+        output.csv(csv, jv.branches(scene), "point")
     jams = [found.select(k) for k in found.mode_numbers()]
-    growth = dict(zip(found.mode.tolist(), growth_of_free_loads(loaded, found.omega).tolist(), strict=True))
+    growth = dict(zip(found.mode.tolist(), growth_of_free_loads(scene, found.omega).tolist(), strict=True))
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
     document = {
-        "rotor_speed": loaded.drive.speed,
+        "rotor_speed": scene.drive.speed,
         "resonances": found.resonances,
         "judged": STABILITY_CRITERION,
         "modes": [
@@ -105,11 +110,11 @@ def modes(
             unit,
             "by slope",
             "loads free",
-            *(f"{name}, mm" for name in loaded.machine.structure().coordinates),
+            *(f"{name}, mm" for name in scene.machine.structure().coordinates),
             "force",
         ]
         lines = [
-            f"rotor {speed_text(loaded.drive.speed)}; resonances {speed_text(found.resonances)}",
+            f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(found.resonances)}",
             table("jam modes (light loads); amplitudes are zero to peak, the foundation force is in N", head, rows)
             if rows
             else "no jam mode at this speed",
@@ -121,7 +126,7 @@ def modes(
         if folds:
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
-        return "\n".join([*lines, *_left_out(loaded)])
+        return "\n".join([*lines, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
 

@@ -13,9 +13,10 @@ from jaxvib.errors import ComputationError, InputError, quoted, require_one_of
 from jaxvib.machine.files import load_scene, misplaced_name, read_toml, suggest_name
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
+from jaxvib.motion.batch import BatchPlan
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
-from jaxvib.sweeps.axes import SAMPLINGS, AxisSpec, Grid, axis_of, corners, require_disjoint, tile_of
+from jaxvib.sweeps.axes import SAMPLINGS, Axis, AxisSpec, Grid, axis_of, corners, require_disjoint, tile_of
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
 from jaxvib.sweeps.program import planned, traced_program
@@ -52,6 +53,22 @@ def study(
 ) -> Study:
     """Return a validated study; for the arguments see `sweep`. **Raises** `InputError` for values that are not allowed."""
     scene = validate_scene(scene)
+    grid = _grid(scene, axes, samples, sampling, seed)
+    names, measures = _name_measures(measure)
+    _require_free_names(names, [axis.name for axis in grid.axes])
+    has_runs = any(isinstance(m, RunMeasure) for m in measures)
+    chosen = tier or ("time" if has_runs else "leading")
+    require_one_of(chosen, TIERS, "tier")
+    measures = tuple(m.at_tier(tier) if tier and isinstance(m, Quantity) else m for m in measures)
+    plan = _run_plan(scene, grid.axes, measures, until, start, mode, steps)
+    most = count(_CHUNK["time" if has_runs else chosen] if chunk is None else chunk, "chunk")
+    grid = grid._replace(tile=tile_of(grid.shape, most))
+    specs = {name: _plain(spec) for name, spec in axes.items()}
+    return _traced(Study(scene, grid, names, measures, plan, start, mode, chosen, specs))
+
+
+def _grid(scene: Scene, axes: Mapping[str, AxisSpec], samples: int, sampling: str, seed: int) -> Grid:
+    """Return the cases of a study, without the size of its chunks."""
     if not isinstance(axes, Mapping) or not axes:
         raise InputError("axes", "is empty; name at least one number that varies, such as drive.speed")
     found = tuple(axis_of(scene, name, spec) for name, spec in axes.items())
@@ -65,54 +82,62 @@ def study(
         raise InputError(f"axes.{drawn[0]}", "is a range without a count; give samples, or a count")
     if samples and not drawn:
         raise InputError("samples", f"is {samples}, but no axis is sampled; leave out samples, or the count of an axis")
-    names, measures = _name_measures(measure)
-    taken = [*_RESERVED, *(axis.name for axis in found), "sample"]
-    for name in names:
-        if name in taken:
-            raise InputError(f"measure.{name}", "is a name that is used already; choose another one")
-        if not _is_name(name):
-            problem = (
-                "is not a valid name of an array: up to 200 printable characters without /, \\ and "
-                "$, not beginning with . or __"
-            )
-            raise InputError(f"measure.{name}", f"{problem}; give it another one")
-    runs = [m for m in measures if isinstance(m, RunMeasure)]
-    chosen = tier or ("time" if runs else "leading")
-    require_one_of(chosen, TIERS, "tier")
-    measures = tuple(m.at_tier(tier) if tier and isinstance(m, Quantity) else m for m in measures)
-    targets = tuple(axis.target for axis in found)
-    plan = None
-    if runs:
-        if until is None:
-            raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
-        end = float(number(until, "s", "until", low=0.0, open_low=True))
-        initial_state(scene, start, mode=mode, throw=False)
-        plan = planned(scene, corners(found), targets, end, None if steps is None else count(steps, "steps"))
-    elif until is not None or any(target.number is None for target in targets):
-        what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.target.number is None)
-        raise InputError(what, "is an option of runs, but no quantity is measured in a run; measure for example run.regime")
     grid = Grid(found, samples, seed, sampling, ())
     if math.prod(grid.shape) > _MAX_CASES:
         problem = f"make {math.prod(grid.shape):.3g} cases; a study has {_MAX_CASES:.0e} at most"
         raise InputError("axes", f"{problem}: take fewer values, or samples")
-    most = count(_CHUNK["time" if runs else chosen] if chunk is None else chunk, "chunk")
-    grid = grid._replace(tile=tile_of(grid.shape, most))
-    specs = {name: _plain(spec) for name, spec in axes.items()}
-    made = Study(scene, grid, names, measures, plan, start, mode, chosen, specs)
+    return grid
+
+
+def _require_free_names(names: Sequence[str], axes: Sequence[str]) -> None:
+    """Require names of measures that can be names of arrays in a store beside those of the axes."""
+    for name in names:
+        if name in (*_RESERVED, *axes, "sample"):
+            raise InputError(f"measure.{name}", "is a name that is used already; choose another one")
+        if not _is_name(name):
+            problem = "is not a valid name of an array: up to 200 printable characters without /, \\ and $"
+            raise InputError(f"measure.{name}", f"{problem}, not beginning with . or __; give it another one")
+
+
+def _run_plan(
+    scene: Scene,
+    axes: Sequence[Axis],
+    measures: Sequence[Measure],
+    until: Number | None,
+    start: Start,
+    mode: int | None,
+    steps: int | None,
+) -> BatchPlan | None:
+    """Return the plan of the runs of all cases, or None if no measure needs a run."""
+    runs, targets = [m for m in measures if isinstance(m, RunMeasure)], tuple(axis.target for axis in axes)
+    if not runs:
+        if until is not None or any(target.number is None for target in targets):
+            what = "until" if until is not None else next(f"axes.{a.name}" for a in axes if a.target.number is None)
+            problem = "is an option of runs, but no quantity is measured in a run; measure for example run.regime"
+            raise InputError(what, problem)
+        return None
+    if until is None:
+        raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
+    end = float(number(until, "s", "until", low=0.0, open_low=True))
+    initial_state(scene, start, mode=mode, throw=False)  # raises an error for a start that the scene cannot have
+    return planned(scene, corners(axes), targets, end, None if steps is None else count(steps, "steps"))
+
+
+def _traced(study: Study) -> Study:
+    """Return the study with the digest of its program and the shapes of its measures, which are validated."""
     try:
-        forms, program = traced_program(made)
+        forms, program = traced_program(study)
     except (InputError, ComputationError):
         raise
     except Exception as error:  # any error of a user's function
         problem = f"cannot be computed ({type(error).__name__}: {error}); it must take a Scene and return a number of JAX"
         raise InputError("measure", problem) from error
-    for name, m, form in zip(names, measures, forms, strict=True):
+    for name, m, form in zip(study.names, study.measures, forms, strict=True):
         axes_count = 1 if isinstance(m, RunMeasure) and m.axis else 0
         if len(form.shape) != axes_count:
-            raise InputError(
-                f"measure.{name}", f"has shape {form.shape}; a scalar is needed" + (", with one axis" * axes_count)
-            )
-    return dataclasses.replace(made, forms=tuple(forms), program=program)
+            needed = "a scalar is needed" + (", with one axis" * axes_count)
+            raise InputError(f"measure.{name}", f"has shape {form.shape}; {needed}")
+    return dataclasses.replace(study, forms=tuple(forms), program=program)
 
 
 def _is_name(name: str) -> bool:
