@@ -111,7 +111,8 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
 
 
 def require_path(value: object, field: str) -> Path:
-    """Return a path. **Raises** `InputError` for a value that is no path, for an empty path and for one with the character NUL.
+    """Return a path. **Raises** `InputError` for a value that is not a path, for an empty path and for one with the character
+    NUL.
 
     >>> require_path(3, "path")
     Traceback (most recent call last):

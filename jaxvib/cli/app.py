@@ -29,7 +29,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     **Arguments**: `path` of the file; `without`, kinds of effects to leave out; `speed`, constant rotor speed in place of the
     drive; `constant`: True to replace a run-up by its final speed, with a message on stderr.
 
-    **Raises** `InputError` for an effect that the scene does not have, and for a text that is not a speed.
+    **Raises** `InputError` for an effect that the scene does not have, and for a string that is not a speed.
     """
     from jaxvib.display import speed_text  # slow imports, which --help does not need
     from jaxvib.machine.drive import ConstantSpeed
@@ -51,7 +51,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
 
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
-"""Option of commands whose theories do not include every effect."""
+"""Option of commands that do not include every effect."""
 
 
 SPEED = click.option("--speed", help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")

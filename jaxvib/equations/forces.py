@@ -41,7 +41,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
 
     **Arguments**
 
-    - `scene`: supports of the machine and its effects (`CubicSupport`, `Stop`) count
+    - `scene`: supports of the machine and effects that are supports (`CubicSupport`, `Stop`) are included
     - `state` of the scene; typical: displacements of 0.1 to 10 mm
 
     **Returns** an array (nb,), N, nb = 1 (up) for platforms, 2 (across, up) for rotors.

@@ -65,14 +65,14 @@ __all__ = [
 
 
 TURNING_TERMS = (GravityField, LoadPotential, LoadInteraction, RotorImbalance)
-"""Terms that theories of turning loads include.
+"""Terms that analyses of turning loads include.
 
 With them the carrier stays linear, and their mean torque over a turn on loads that turn together is 0 to leading order of the
 loads' mass.
 """
 
 JAM_TERMS = (*TURNING_TERMS, ContactFriction)
-"""Terms that theories of jams include."""
+"""Terms that analyses of jams include."""
 
 
 _DIRECT = 3
@@ -80,7 +80,7 @@ _DIRECT = 3
 
 
 class FrequencyStatus(eqx.Enumeration):
-    """Outcome of a computation of natural frequencies; each member is the sentence that a user reads."""
+    """Outcomes of a computation of natural frequencies. The value of each member is the message shown to the user."""
 
     done = "the result was computed"
     lost_digits = "rounding errors hide a natural frequency: use double precision, or stiffnesses and masses that differ less"
@@ -347,7 +347,7 @@ def _require_one_point(mount: Mount) -> None:
 
 
 def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS) -> CircularLoads:
-    """Return the loads of a scene, for a theory of loads on circles in a rotor of prescribed speed.
+    """Return the loads of a scene, for an analysis of loads on circles in a rotor of prescribed speed.
 
     **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`, and names the property; for
     effects with terms that are not `included`, and names these terms.
@@ -385,9 +385,9 @@ def require_terms(
     problem: str = "is|are not included in this function",
     advice: str = "here, or simulate",
 ) -> None:
-    """Require that a theory includes every term of the `effects`.
+    """Require that an analysis includes every term of the `effects`.
 
-    **Arguments**: `problem`, the sentence about other effects. It begins with the verb for one effect, then | and the verb
+    **Arguments**: `problem`, the message about other effects. It begins with the verb for one effect, then | and the verb
     for several effects. `advice`: end of the sentence that advises to leave the effects out.
 
     **Raises** `InputError` that names all effects with other terms, and the types of these terms.

@@ -139,8 +139,8 @@ def diagram(scene: Scene, most: float) -> str:
 
     **Arguments**: `most`, the highest rotor speed in the diagram, rad/s; it is at least 1.15 times the scene's rotor speed.
 
-    **Returns** the text of an SVG file. **Raises** `InputError` for scenes that the theory does not include; the message names
-    the part.
+    **Returns** the text of an SVG file. **Raises** `InputError` for scenes that the diagram does not include; the message
+    names the part.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES

@@ -163,7 +163,7 @@ class IdealDrive(Drive):
         return self.acceleration_at(t)
 
     def torque_and_inertia(self, t: Array, speed: Array) -> None:
-        """Return None: no torque changes the speed."""
+        """Return None, because no torque changes the speed."""
 
 
 class Motor(Drive):
@@ -205,7 +205,7 @@ class Motor(Drive):
         return rotor[0]
 
     def rotor_acceleration(self, t: Array) -> None:
-        """Return None: the acceleration follows from the torques."""
+        """Return None, because the acceleration follows from the torques."""
 
     def torque_and_inertia(self, t: Array, speed: Array) -> tuple[Array, Array]:
         """Return `torque_at` and `inertia`."""

@@ -29,7 +29,7 @@ of a body in a plane, m; None is the default place of the machine."""
 def read_place(at: int | Number | Sequence[Number] | None, name: str) -> int | Array | None:
     """Return a place from a user's argument `name`: the number of a platform, or a distance or a point in m.
 
-    **Raises** `InputError` for values that are no number, no list of two numbers, or not in m.
+    **Raises** `InputError` for values that are neither a number nor a list of two numbers, or not in m.
 
     >>> read_place(["100 mm", 0.2], "at").tolist()
     [0.1, 0.2]

@@ -256,14 +256,14 @@ class Scene(Part):
 
     @property
     def is_plain(self) -> bool:
-        """True for one exciter with loads on a balanced rotor that turns anticlockwise. All theories include such scenes."""
+        """True for one exciter with loads on a balanced rotor that turns anticlockwise. All analyses include such scenes."""
         return len(self.exciters) == 1 and self.exciters[0].is_plain
 
     @property
     def loads(self) -> Loads:
         """Loads of a scene with one exciter that turns anticlockwise and has no `unbalance`.
 
-        **Raises** `InputError` for other scenes, which the theories that read this property do not include.
+        **Raises** `InputError` for other scenes, which the analyses that read this property do not include.
         """
         exciter = _require_anticlockwise(self.exciter)
         if exciter.loads is None or not exciter.is_plain:

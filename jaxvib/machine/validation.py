@@ -22,7 +22,7 @@ from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
 
 _VALID_SCENES: weakref.WeakValueDictionary[tuple[int, np.dtype], Scene] = weakref.WeakValueDictionary()
-"""Validated scenes by their `id` and the precision of their numbers. Scenes are immutable, therefore they stay valid."""
+"""Validated scenes by their `id` and the precision of their numbers. Scenes are immutable and therefore stay valid."""
 
 
 def validate_scene(scene: Scene) -> Scene:

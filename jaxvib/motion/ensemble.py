@@ -59,7 +59,7 @@ def field_of(equations: Equations, scene: Scene) -> Callable[[Array, State], Sta
 
 
 class EnsembleStatus(eqx.Enumeration):
-    """Outcomes of a run of an ensemble; the members are the sentences a user reads."""
+    """Outcomes of a run of an ensemble. The value of each member is the message shown to the user."""
 
     done = "the run reached its end"
     detached = "the run reached its end, but a load lost contact with its track, on which the equations hold it"

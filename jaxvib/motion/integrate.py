@@ -1,4 +1,4 @@
-"""One time integration of the full equations of motion, compiled: the program behind `simulate`."""
+"""Compiled time integration of the full equations of motion, as used by `simulate`."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def integrate(
     scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
     """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured`."""
-    # A start that does not exist (a jam mode that is absent in one run of a batch) must not delay the other runs.
+    # A start that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)

@@ -299,7 +299,7 @@ def plan_ensemble(
     coarse = -(-each // 2)
 
     leaves, structure = jax.tree.flatten((scenes, states))
-    # A number that all runs share stays a single number; at least one number is an array that defines the number of runs.
+    # A number that all runs share stays a scalar; at least one number is an array, which defines the number of runs.
     is_shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in leaves]
     is_shared[0] = is_shared[0] and not all(is_shared)
     return EnsemblePlan(

@@ -202,9 +202,10 @@ class Run(AbstractMeasured, PointAnswers, Result):
         **Arguments**
 
         - `unit` of speeds, "rad/s", "rpm" or "Hz"
-        - `ax`: axes to draw onto, as many as there are panels, by rows
+        - `ax`: axes to draw onto, one for each panel, by rows
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an unknown unit or a wrong number of
+        axes.
         """
         from jaxvib.draw.motion.histories import time_histories  # slow import
 
@@ -215,10 +216,10 @@ class Run(AbstractMeasured, PointAnswers, Result):
 
     @validated
     def spectrum(self, parts: int = 1) -> Spectrum:
-        """Return the frequencies of the motion over the window, or over `parts` pieces of the whole run.
+        """Return the frequencies of the motion over the window, or over `parts` segments of the whole run.
 
-        **Arguments**: `parts`: number of pieces, each of which shares its halves with its neighbours; typical: 10 to 60 for a
-        run-up. More pieces resolve time better and frequency worse.
+        **Arguments**: `parts`: number of segments; neighbouring segments overlap by one half; typical: 10 to 60 for a run-up.
+        More segments resolve time better and frequency worse.
 
         **Returns** `Spectrum`; of several parts its figure is a waterfall, with resonances marked.
 
@@ -292,7 +293,8 @@ def _require_turns(time: np.ndarray, speed: float) -> None:
 
 
 def with_separation_status(run: Run) -> Run:
-    """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
+    """Return the run with the status `would_separate` if its loads stay at nearly one angle although this motion is
+    unstable."""
     if not (status_name(run.status) in ENDS and would_separate(run.scene, run.window)):
         return run
     return dataclasses.replace(run, status=member(RunStatus, "would_separate"))

@@ -29,7 +29,7 @@ from jaxvib.units import Number, Numbers, known_number, numbers
 from jaxvib.units.known import when_known
 
 Start = Literal["rest", "jam", "spin_up"]
-"""Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
+"""Names of initial states: at rest; near a jam mode; at rest with a smooth spin-up of the rotor."""
 
 START_SEPARATION = math.radians(1.0)
 """Angle between neighbouring loads at the start, rad, if they are not side by side. Loads at exactly one angle would stay at

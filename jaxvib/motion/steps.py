@@ -22,7 +22,7 @@ class Tolerance:
     **Arguments**: `tolerance`; typical: 1e-6 to 1e-10 in double precision, 1e-5 in single. The methods of order 8 need about
     1.8 times the steps for a hundredth of the tolerance.
 
-    **Raises** `InputError` for a value that is no real number.
+    **Raises** `InputError` for a value that is not a real number.
 
     >>> import jaxvib as jv
     >>> jv.Tolerance(1e-6)
@@ -41,7 +41,7 @@ class Accuracy:
 
     **Arguments**: `error`, relative; typical: 1e-3 to 1e-8. An error of 1e-8 takes about twice the time of an error of 1e-4.
 
-    **Raises** `InputError` for a value that is no real number.
+    **Raises** `InputError` for a value that is not a real number.
 
     >>> import jaxvib as jv
     >>> jv.Accuracy(1e-4)
@@ -61,7 +61,7 @@ class EqualSteps:
     **Arguments**: `number` of steps; typical: 4 for each radian of the fastest motion, 25 for each turn. The time grows in
     proportion to it.
 
-    **Raises** `InputError` for a value that is no real number.
+    **Raises** `InputError` for a value that is not a real number.
 
     >>> import jaxvib as jv
     >>> jv.EqualSteps(2000)

@@ -71,7 +71,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
         begin = jnp.asarray(first)[k]
         place = (k - begin) + jnp.where(last > top, 1.0, jnp.where(between[k] > samples[k], share[k], 0.0))
         value = jnp.maximum(top, last)
-        place = jnp.where(jnp.isnan(value), jnp.nan, place)  # what is made of it later is not a number either
+        place = jnp.where(jnp.isnan(value), jnp.nan, place)  # later results that depend on it are NaN as well
         return value, begin, place
 
     signs = jnp.asarray([-1.0, 1.0], x.dtype)
@@ -84,7 +84,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def extremum_value(x: Array, v: Array, place: Array) -> Array:
-    """Value at an extremum, whose place between samples has derivatives, too.
+    """Return the value at an extremum, whose place between samples is differentiated as well.
 
     x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` counts from the first, in steps.
     """
@@ -97,13 +97,13 @@ def extremum_value(x: Array, v: Array, place: Array) -> Array:
 
 
 def greatest(values: Array) -> Array:
-    """Maximum of numbers (n,) with derivatives. Those of `jnp.max` are 0/0 if the compiler recomputes equal numbers with other
-    rounding."""
+    """Return the maximum of numbers (n,) with derivatives. Those of `jnp.max` are 0/0 if the compiler recomputes equal numbers
+    with other rounding."""
     return values[jnp.argmax(values)]
 
 
 def _polynomial(x: Array, v: Array) -> Array:
-    """Coefficients (8, ...) of the polynomial through values and slopes (4, ...) at 0, 1, 2, 3."""
+    """Return the coefficients (8, ...) of the polynomial through values and slopes (4, ...) at 0, 1, 2, 3."""
     # Relative to the first sample, so that a common offset causes no rounding.
     changes = jnp.concatenate([x - x[:1], v])
     found = jnp.tensordot(jnp.asarray(_COEFFICIENTS, x.dtype), changes, 1, precision="highest")

@@ -37,8 +37,8 @@ def hidden_one(value: Array) -> Array:
 
 
 def through_memory(values: Sequence[Array], one: Array) -> list[Array]:
-    """Fence several scalars at once: one piece of code computes, stores and reads them, which takes less time than one
-    fence for each if they are used together.
+    """Fence several scalars at once: one piece of code computes, stores and reads them. This takes less time than one fence
+    for each if they are used together.
 
     >>> [float(x) for x in through_memory([jnp.asarray(2.0), jnp.asarray(3.0)], hidden_one(jnp.asarray(3.0)))]
     [2.0, 3.0]

@@ -19,21 +19,21 @@ MAX_EIGENVALUE_ERROR = 1e-2
 """Largest relative error of a valid eigenvalue; beyond it, its digits are lost to rounding."""
 
 _compiled = functools.partial(jax.jit, inline=True)
-"""Compilation of loops, which JAX traces and compiles at every call outside a program; within one, nothing changes."""
+"""Compilation of functions with loops, which JAX would otherwise trace and compile at every call outside a program."""
 
 _Entry: TypeAlias = Array | float
-"""Entry of a matrix: a number, or an array of those of many matrices."""
+"""Entry of a matrix: a number, or an array of the entries of many matrices."""
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """Matrix times vector: for small matrices as a sum, since a product in a time loop prevents fusion."""
+    """Return a matrix times a vector: for small matrices as a sum, since a product in a time loop prevents fusion."""
     if min(matrix.shape) <= _WRITTEN:
         return jnp.sum(matrix * vector[None, :], axis=-1)
     return jnp.matmul(matrix, vector, precision="highest")
 
 
 def small_inverse(a: Sequence[Sequence[_Entry]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
-    """x of a x = b for a few equations, written out; the entries may be arrays of many such systems."""
+    """Return x of a x = b for a few equations, unrolled; the entries may be arrays of many such systems."""
     n = len(a)
     if n == 1:
         return lambda b: (b[0] / a[0][0],)
@@ -173,15 +173,15 @@ def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple
 
 
 def magnitude(value: Array) -> Array:
-    """Modulus of complex numbers, with derivative 0 instead of NaN if the value is exactly 0."""
+    """Return the modulus of complex numbers, with derivative 0 instead of NaN if the value is exactly 0."""
     square = value.real**2 + value.imag**2
     zero = square == 0.0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
 
 
 def small_solve(a: Array, b: Array) -> Array:
-    """x of a x = b; written out for 1, 2 and 3 equations (many times faster than a library call under `vmap`), by `eliminate`
-    up to 8, by the library beyond: for a batch one system after the other, see `solve_in_turn`."""
+    """Return x of a x = b; unrolled for 1, 2 and 3 equations (many times faster than a library call under `vmap`), by
+    `eliminate` up to 8, by the library beyond: for a batch one system after the other, see `solve_in_turn`."""
     n = b.shape[0]
     if n == 1:
         return b / a[0, 0]
@@ -228,10 +228,11 @@ def _times(a: Array, b: Array) -> Array:
 
 @custom_vmap
 def solve_in_turn(a: Array, b: Array) -> Array:
-    """x of a x = b by the library; values alone. On a processor it is called for one system of a batch after the other.
+    """Return x of a x = b by the library, without derivatives. On a processor it is called for one system of a batch after the
+    other.
 
-    A batched call can deadlock there: it gives its systems to the threads that run such calls, and if all of them wait, no
-    thread is left to work (jaxlib before 0.11.2). From about 20 equations on, one after the other is also faster.
+    A batched call can deadlock there: its systems are computed by the threads that run such calls, and if all these threads
+    wait, none can compute (jaxlib before 0.11.2). From about 20 equations on, one after the other is also faster.
     """
     return jnp.linalg.solve(a, b)
 
@@ -277,7 +278,7 @@ def _eigenvectors_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tu
 def refine_solution(product: Callable[[Array], Array], nearly: Callable[[Array], Array], b: Array, norm: Array) -> Array:
     """x of A x = b, with A x = `product`(x), its approximate inverse `nearly` and its row-sum `norm`.
 
-    Corrected by the residual until that is rounding: usually not at all, at most 4 times.
+    It is corrected by the residual until this is a rounding error: usually not at all, at most 4 times.
     """
     eps = jnp.finfo(norm.dtype).eps
 

@@ -23,12 +23,12 @@ def bracketed_root(
     fast: Callable[[Array], Array] | None = None,
     polish: Array | None = None,
 ) -> Array:
-    """The root of `f` between `low` and `high` (scalars), where f changes sign once, to the last digits.
+    """Return the root of `f` between `low` and `high` (scalars), between which f changes sign once, to rounding error.
 
-    **Arguments**: `ends`, f(low) and f(high) if they are known already; `fast`, the same function at less cost, which the
-    search evaluates: f then serves derivatives, and if `polish` is True (scalar) the last steps, by Newton's method.
+    **Arguments**: `ends`: f(low) and f(high) if they are known; `fast`: the same function at lower cost, which the search
+    evaluates. f is then used for derivatives and, if `polish` is True (scalar), for final steps of Newton's method.
 
-    Inverse quadratic interpolation where it is safe, halving elsewhere (Chandrupatla, Adv. Eng. Software 28, 1997).
+    Inverse quadratic interpolation if it is safe, otherwise bisection (Chandrupatla, Adv. Eng. Software 28, 1997).
     Derivatives of any order by the implicit function theorem.
     """
 
@@ -82,13 +82,13 @@ def bracketed_root(
 
 
 def known_root(f: Callable[[Array], Array], root: Array) -> Array:
-    """The `root` of `f` (scalar), which is known, with the derivatives that `bracketed_root` gives it."""
+    """Return the known `root` of `f` (scalar) with the derivatives of `bracketed_root`."""
     root = jax.lax.stop_gradient(root)
     return jax.lax.custom_root(f, root, lambda *_: root, _by_slope)
 
 
 def _by_slope(g: Callable[[Array], Array], y: Array) -> Array:
-    """Solution of g(x) = y for a linear function `g`."""
+    """Return the solution of g(x) = y for a linear function `g`."""
     return y / _nonzero(g(jnp.ones_like(y)))
 
 
@@ -99,8 +99,8 @@ def next_share(
     before: tuple[Numbers, Numbers],
     tolerance: float | np.floating,
 ) -> Numbers:
-    """Next point of the search for a root between `newest` and `other`, as a fraction of the way; `before` is the point before
-    these.
+    """Return the next point of the search for a root between `newest` and `other`, as a fraction of the way; `before` is the
+    point before these.
 
     Points are (x, f(x)), numbers or arrays of the library `xp`, numpy or jax.numpy; `tolerance` relative.
     """
@@ -113,6 +113,6 @@ def next_share(
 
 
 def _nonzero(slope: Array) -> Array:
-    """At a fold the slope is 0 and there is no derivative; the status says so, and nothing overflows."""
+    """At a fold the slope is 0 and the derivative does not exist; the status states this, and no number overflows."""
     tiny = jnp.finfo(slope.dtype).tiny ** 0.5
     return jnp.where(jnp.abs(slope) < tiny, tiny, slope)

@@ -89,8 +89,8 @@ def _sine(x: Array, ahead: float) -> Array:
     constant, *others = _polynomial(_TERMS[dtype])
     # The largest term is added last, which keeps the roundings of the others as small as in Horner's form.
     total = constant + z * _summed(z, others)
-    # An odd number of half turns changes the sign: the last bit of the number, beside one that leaves it no fraction, is
-    # shifted to where the sign is. Operations on bits take no time beside those on numbers.
+    # An odd number of half turns changes the sign: the last bit of the number, added to a number so large that it has no
+    # fraction, is shifted to the position of the sign. Operations on bits take almost no time.
     bits = np.dtype(f"uint{8 * dtype.itemsize}")
     beside = whole + 1.5 * 2.0 ** np.finfo(dtype).nmant
     sign = jax.lax.bitcast_convert_type(beside, bits) << bits.type(8 * dtype.itemsize - 1)
@@ -114,7 +114,7 @@ def sine_and_cosine(x: Array) -> tuple[Array, Array]:
 
 @jax.custom_jvp
 def unfenced_sine_and_cosine(x: Array) -> tuple[Array, Array]:
-    """`sine_and_cosine` for a program that fences them itself."""
+    """Return `sine_and_cosine` without fences, for a program that adds its own."""
     return _sine(x, 0.0), _sine(x, 0.5)
 
 

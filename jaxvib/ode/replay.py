@@ -201,7 +201,7 @@ class _WayBack:
         return jnp.where(i == 0, 0.0, starts), _end_before(self.controller, self.notes.starts[i])
 
     def step(self, y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
-        """State after a step, and the data of the interpolation within it."""
+        """Return the state after a step, and the data of the interpolation within it."""
         args, term = eqx.combine(numbers, self.others)
         # As after a jump, without values of the previous step.
         y1, _, dense, _, _ = self.solver.step(term, t0, t1, y, args, self.solver.init(term, t0, t1, y, args), True)
@@ -288,7 +288,7 @@ def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, 
 
 
 def _end_before(controller: diffrax.AbstractStepSizeController, start: Array) -> Array:
-    """When the step before the one that begins at `start` ended: there, unless the field jumps between them."""
+    """Return the end of the step before the one that begins at `start`: the same time, unless the field jumps between them."""
     jumps = getattr(controller, "jump_ts", None)
     if jumps is None:
         return start

@@ -30,7 +30,7 @@ _Function: TypeAlias = Callable[..., PyTree[Array]]
 
 
 class NotScalarizable(Exception):
-    """The program has an operation that has no rule on scalars, or one that its rule does not fit."""
+    """Raised for a program with an operation that has no rule on scalars, or to which its rule does not apply."""
 
 
 def to_scalars(value: ArrayLike) -> Scalars:

@@ -17,16 +17,16 @@ IntScalarLike: TypeAlias = int | Array | np.ndarray
 """A direction, a whole number."""
 
 BoolScalarLike: TypeAlias = bool | Array | np.ndarray
-"""Yes or no: a truth value, or an array ()."""
+"""Boolean: a Python value, or an array ()."""
 
 Y: TypeAlias = PyTree[Array]
-"""The state that is integrated, in any form; errors and changes of it are trees like it."""
+"""State of the integration, as any tree of arrays; its errors and changes are trees of the same structure."""
 
 VF: TypeAlias = PyTree[Array]
 """The rates of a state: a tree like it."""
 
 Args: TypeAlias = PyTree
-"""Arguments of a vector field beside the time and the state."""
+"""Arguments of a vector field in addition to the time and the state."""
 
 Terms: TypeAlias = PyTree[diffrax.AbstractTerm]
 """The equations; all methods here take a single term."""

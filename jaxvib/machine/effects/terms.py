@@ -1,4 +1,4 @@
-"""Terms that effects add to the equations of a scene. Each theory states the types of terms that it includes.
+"""Terms that effects add to the equations of a scene. Each analysis states the types of terms that it includes.
 
 Terms are created during a computation and contain functions (methods of their effect) or numbers. Energies are in J, forces in
 N; the generalised force of a load's angle is a torque in N m. A load's coordinates `u` and their rates are tuples of (count,)

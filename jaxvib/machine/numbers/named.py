@@ -31,7 +31,7 @@ _SECTIONS: dict[str, type[eqx.Module]] = {"machine": Machine, "loads": Loads, "d
 
 
 class NamedNumber(NamedTuple):
-    """Number of a scene, or array of numbers with one unit.
+    """Parameter of a scene, or array of parameters with one unit.
 
     **Attributes**
 

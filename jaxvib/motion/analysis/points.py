@@ -15,7 +15,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.points import rows_in_plane
 
 _HARMONICS = 3
-"""Number of fitted harmonics. The second and the third take their share of the motion out of the first."""
+"""Number of fitted harmonics. The second and the third remove their contribution from the first."""
 
 
 class PointMotion(eqx.Module):
@@ -43,7 +43,7 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
     """Return the first harmonic of evenly sampled displacements (nt, nd), and the mean square of everything else.
 
     The means and the harmonics of `speed` are fitted by least squares. Weights that vanish at both ends (Hann's window) make
-    the result insensitive to frequencies that are no multiple of `speed`.
+    the result insensitive to frequencies that are not a multiple of `speed`.
 
     **Returns** the complex amplitudes (nd,), with phase 0 in the middle of the time, and (nd, nd), see `Harmonic.rest`.
     """

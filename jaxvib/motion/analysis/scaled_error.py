@@ -21,7 +21,7 @@ from jaxvib.runtime.programs import cached
 def natural_units(scene: Scene) -> State:
     """Return the natural units of the state.
 
-    They are the unbalance radius S/M for displacements, that times the rotor's speed for velocities, 1 rad for angles, the
+    They are the unbalance radius S/M for displacements, S/M times the rotor's speed for velocities, 1 rad for angles, the
     rotor's speed for their rates, and for a slip the rotor's speed times the loads' distance from the axis. S is the unbalance
     of the loads, or that of the rotor if it is larger.
     """

@@ -50,7 +50,7 @@ from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known
 
 _WINDOW = 512
-"""Number of samples in the measuring window at the end: 25 in a beat of the slowest resonance."""
+"""Number of samples in the measuring window at the end: 25 in a period of the slowest resonance."""
 
 _MAX_WINDOW_TURNS = 256
 """Largest length of the window in turns of the rotor, as in `simulate`."""
