@@ -390,7 +390,7 @@ def main() -> None:
             for question in given.questions if given.scenes else ():
                 rng = np.random.default_rng([seed, 1])
                 note(question, seed, ended(lambda: QUESTIONS[question](drawn(rng), rng)))  # noqa: B023
-            if k % 50 == 49:
+            if k % 5 == 4:
                 write()
     for question, found in counts.items():
         print(f"{question}: " + ", ".join(f"{number} {name}" for name, number in found.most_common()))
