@@ -48,9 +48,8 @@ def optimize(
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
-        console=Console(stderr=True),
+        console=Console(stderr=True, quiet=not sys.stderr.isatty()),
         transient=True,
-        disable=not sys.stderr.isatty(),
     ) as bar:
         task = bar.add_task("", total=1.0)
         best = synthesize(
