@@ -113,7 +113,7 @@ def test_wrong_questions_are_said_in_one_sentence():
         (3.0, [], None, "must be a DesignSpace"),
         (SPACE, [3.0], None, "must be a Demand, for example"),
         (SPACE, [], 3.0, "must be a Synthesis"),
-        (running, [], None, "use a ConstantSpeed"),
+        (running, [], None, "use ConstantSpeed"),
     ):
         with pytest.raises(jv.InputError, match=says):
             synthesize(space, wish, subject_to=subject_to, begin=begin)

@@ -54,7 +54,7 @@ def test_a_wrong_derivative_is_named():
         SCENE, lambda s: turned(s.loads.mass) + closed(s) * 1e-12, free=("loads.mass", "machine.damping")
     )
     assert check.status_name == "differ"
-    assert check.summary().splitlines()[1].startswith("  loads.mass: 0.375; forward off by 2.0e+00")
+    assert check.summary().splitlines()[1].startswith("  loads.mass: 0.375; forward differs by 2.0e+00")
     with pytest.raises(jv.ComputationError, match=r"differ: derivatives differ .*\n  loads\.mass"):
         check.require()
 
