@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -83,14 +83,3 @@ def is_zero(tangent: object) -> bool:
 def zero_of(x: Array) -> object:
     """Return the symbolic zero tangent of `x`, for rules of a `primitive`."""
     return ad.Zero(jax.typeof(x).to_tangent_aval())
-
-
-def apply_pullback(pullback: Callable[[list], Sequence[Array]], cotangents: list) -> list[Array]:
-    """Apply a pullback of `jax.vjp` to cotangents, some of which may be symbolic zeros from `zero_of`.
-
-    JAX 0.10.0 does not accept symbolic zeros as cotangents; arrays of zeros replace them.
-    """
-    try:
-        return list(pullback(cotangents))
-    except ValueError:
-        return list(pullback([ad.instantiate_zeros(x) for x in cotangents]))

@@ -23,7 +23,7 @@ from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import primal_of, traced
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.operations import pruned
-from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, apply_pullback, is_zero, primitive, zero_of
+from jaxvib.runtime.primitive import CAN_DEFINE_PRIMITIVES, is_zero, primitive, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
 from jaxvib.runtime.structure import Skeleton, Undescribable, describe
@@ -225,10 +225,8 @@ def _vjp_backward(
     """Return the cotangents of the active arrays; `types` are the types of all arrays."""
     pullback, zeros = _traced_pullback(call, active, types)
     nonzero = iter(cotangents)
-    return apply_pullback(
-        pullback.filled(residuals),
-        [next(nonzero) if is_wanted else zero for is_wanted, zero in zip(wanted, zeros, strict=True)],
-    )
+    given = [next(nonzero) if is_wanted else zero for is_wanted, zero in zip(wanted, zeros, strict=True)]
+    return list(pullback.filled(residuals)(given))
 
 
 @cached
