@@ -152,7 +152,7 @@ def linear_model(scene: Scene) -> LinearModel:
 class JammedModel(LinearModel):
     """Linear model of a scene with jammed loads.
 
-    The scene is validated, and the quantities that are the same at all load speeds are computed, once for each analysis.
+    It contains the quantities that are equal at all load speeds, so that an analysis computes them once.
 
     **Attributes**, in addition to those of `LinearModel`: `unbalance` S of the coincident loads, kg m; `drag` sum b_W R^2,
     N m s; `force_direction` (nd,) complex, the `direction` of the loads' force.
@@ -324,7 +324,7 @@ def jammed_loads(scene: Scene) -> CircularLoads:
 
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
-    """**Raises** `InputError` if no load has drag or, with `each`, if one load has none. Traced numbers are not checked."""
+    """**Raises** `InputError` if no load has drag or, with `each`, if any load has none. Traced numbers are not checked."""
 
     def check(drag: np.ndarray | float) -> None:
         if not (np.all if each else np.any)(np.asarray(drag) > 0.0):
