@@ -89,8 +89,10 @@ def export_fmu(
       classical Runge-Kutta method of order 4
     - Outputs are the states (`displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`), `acceleration.y1`,
       `foundation_force.up`, `rotor.angle` and `rotor.speed`
-    - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m), which is added to
-      the torque of the motor
+    - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m, anticlockwise), which
+      is added to the torque of the motor
+    - In a scene with several exciters, their signals have the place of the exciter before their names, such as
+      `exciters[1].rotor.torque`
     - Event indicators are comparisons in nonsmooth forces (stops, contacts, dry friction) and in a drive whose acceleration
       jumps; a solver ends a step at the time at which an indicator changes its sign
     - Directional derivatives of rates and outputs with respect to states and inputs are exact
@@ -153,7 +155,7 @@ def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) ->
     files = {f"sources/{each}": (own / each).read_bytes() for each in ("machine.h", f"fmi{fmi[0]}.c")}
 
     def described(token: str) -> str:
-        tool, about = f"jaxvib {version('jaxvib')}", f"{scene.machine.kind} with {scene.loads.count} {scene.loads.kind}"
+        tool, about = f"jaxvib {version('jaxvib')}", _described(scene)
         return describe_model(fmi, name, identifier, token, tool, about, variables, _text(step), "10.0")
 
     content = "".join([described(""), body, *(text.decode() for text in files.values())])
@@ -169,6 +171,18 @@ def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) ->
     return files, len(rates.body), identifier
 
 
+def _described(scene: Scene) -> str:
+    """Return the machine and its exciters in words."""
+    carried = [
+        " and ".join(
+            ([] if each.loads is None else [f"{each.loads.count} {each.loads.kind}"])
+            + ["an unbalance"] * (each.unbalance is not None)
+        )
+        for each in scene.exciters
+    ]
+    return f"{scene.machine.kind} with {', '.join(carried)}"
+
+
 def _step(scene: Scene) -> float:
     """Return the longest step of co-simulation, s."""
     fastest, decay = float(frequency_bounds(scene)[0]), float(fastest_decay(scene))
@@ -180,7 +194,7 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
     """Return C programs for the rates and for their derivatives in a direction of states and inputs."""
     if not HAS_JAXPRS:
         raise InputError("scene", "cannot be written as C, since this version of JAX does not give access to its programs")
-    time = jnp.zeros((), scene.drive.speed.dtype)
+    time = jnp.zeros((), scene.top_speed.dtype)
     given = (scene, time, equations.states, equations.inputs)
 
     def tangent(scene: Scene, t: Array, states: object, inputs: object, *direction: object) -> object:
@@ -214,8 +228,10 @@ def _flat(tree: object) -> list[str]:
 def _variables(scene: Scene, equations: Equations, branches: int, step: float) -> list[Variable]:
     """Return all variables in the order of their value references."""
     signals, state = equations.state_signals, equations.states.machine
-    scales = jax.tree.map(lambda size, leaf: np.full(np.shape(leaf), size), error_scale(state, natural_units(scene)), state)
-    nominals = [*_flat(scales), *["1.0"] * (equations.states.rotor_angle is not None)]
+    scales = _flat(
+        jax.tree.map(lambda size, leaf: np.full(np.shape(leaf), size), error_scale(state, natural_units(scene)), state)
+    )
+    nominals = [*scales, *["1.0"] * (len(signals) - len(scales))]
     states = [
         Variable(each.name, each.unit, "output", start, nominal=nominal)
         for each, start, nominal in zip(signals, _flat(equations.states), nominals, strict=True)

@@ -17,11 +17,11 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import Drive, IdealDrive, Motor
+from jaxvib.machine.drive import IdealDrive, Motor
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import SupportForce, Term
 from jaxvib.machine.numbers.named import NamedNumber, numbers_of
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.linalg import solve_definite
 
 DriveBy = Literal["scene", "input"]
@@ -83,32 +83,39 @@ class _TorqueInput(Motor):
         return self.extra if self.motor is None else self.motor.torque_at(t, speed) + self.extra
 
 
-class Inputs(NamedTuple):
-    """Inputs of the equations.
+class RotorInputs(NamedTuple):
+    """Inputs of one rotor, anticlockwise.
 
-    **Attributes**: `force` on the coordinates (nd,), N, for angles N m; `torque` on the rotor of a motor, N m; `speed` and
-    `acceleration` of a rotor whose motion is an input, rad/s and rad/s^2. An input that the scene does not have is None.
+    **Attributes**: `torque` on the rotor of a motor, N m; `speed` and `acceleration` of a rotor whose motion is an input, rad/s
+    and rad/s^2. An input that the rotor does not have is None.
     """
 
-    force: Any
     torque: Any = None
     speed: Any = None
     acceleration: Any = None
 
 
+class Inputs(NamedTuple):
+    """Inputs of the equations: `force` on the coordinates (nd,), N, for angles N m; `rotors`, those of each exciter."""
+
+    force: Any
+    rotors: tuple[RotorInputs, ...]
+
+
 class States(NamedTuple):
-    """State of the equations: `machine`; `rotor_angle`, rad, if the rotor speed is an input, otherwise None."""
+    """State of the equations: `machine`; `rotor_angles`, for each exciter the angle, rad, of a rotor whose speed is an input,
+    otherwise None."""
 
     machine: State
-    rotor_angle: Any = None
+    rotor_angles: tuple[Any, ...]
 
 
 class Outputs(NamedTuple):
-    """Outputs that are not states or rates: `foundation_force` (nb,) N; `rotor`, its angle and speed, None if they are states
-    or inputs."""
+    """Outputs that are not states or rates: `foundation_force` (nb,) N; `rotors`, for each exciter the angle and the speed of
+    the rotor, None if they are states or inputs."""
 
     foundation_force: Any
-    rotor: Any = None
+    rotors: tuple[Any, ...]
 
 
 class Equations(NamedTuple):
@@ -130,47 +137,65 @@ class Equations(NamedTuple):
 
 def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
     """Return the equations of a scene that starts in a state."""
-    carrier, ideal, by_input = scene.machine.structure(), scene.drive.ideal, drive == "input"
-    zero = np.zeros((), scene.drive.speed.dtype)
-    inputs = Inputs(np.zeros(carrier.mass.shape[0], zero.dtype))
-    input_signals = list(force_inputs(carrier))
-    output_signals = list(foundation_forces(carrier))
-    rotor = [Signal("rotor.angle", "rad"), Signal("rotor.speed", "rad/s")]
-    if not ideal:
-        inputs = inputs._replace(torque=zero)
-        input_signals.append(Signal("rotor.torque", "N m"))
-    elif by_input:
-        inputs = inputs._replace(speed=np.asarray(scene.drive.speed), acceleration=zero)
-        input_signals += [rotor[1], Signal("rotor.acceleration", "rad/s^2")]
-    else:
-        output_signals += rotor
-    states = States(start, zero if ideal and by_input else None)
+    carrier = scene.machine.structure()
+    zero = np.zeros((), carrier.mass.dtype)
+    by_input = drive == "input"
+    rotors, angles = [], []
+    input_signals, output_signals = list(force_inputs(carrier)), list(foundation_forces(carrier))
+    angle_signals = []
+    for k, exciter in enumerate(scene.exciters):
+        angle, speed, acceleration, torque = _rotor_signals(scene.place_of(k))
+        is_prescribed = exciter.drive.ideal and by_input
+        angles.append(zero if is_prescribed else None)
+        if not exciter.drive.ideal:
+            rotors.append(RotorInputs(torque=zero))
+            input_signals.append(torque)
+        elif is_prescribed:
+            rotors.append(RotorInputs(speed=exciter.direction * np.asarray(exciter.drive.speed), acceleration=zero))
+            input_signals += [speed, acceleration]
+            angle_signals.append(angle)
+        else:
+            rotors.append(RotorInputs())
+            output_signals += [angle, speed]
 
     def rates(scene: Scene, t: Array, states: States, given: Inputs) -> tuple[States, Outputs]:
-        state, angle = states
-        turned = _driven(scene.drive, angle, given, by_input)
-        effects = (*scene.all_effects, _AppliedForce(given.force))
-        field = dynamics_of(assemble(scene.replace(drive=turned, effects=effects)), solve_definite)
+        state = states.machine
+        cases = zip(scene.exciters, states.rotor_angles, given.rotors, strict=True)
+        driven = [_driven(exciter, angle, inputs, by_input) for exciter, angle, inputs in cases]
+        forced = Scene(scene.machine, exciters=driven, effects=(*scene.effects, _AppliedForce(given.force)))
+        rate = dynamics_of(assemble(forced), solve_definite)(t, state)
         force = assemble(scene).foundation_force(state.displacement, state.velocity)
-        known = (turned.rotor_angle(t, None), turned.rotor_speed(t, None)) if ideal and not by_input else None
-        return States(field(t, state), given.speed if angle is not None else None), Outputs(force, known)
+        is_known = [exciter.drive.ideal and not by_input for exciter in scene.exciters]
+        turning = [exciter.turning_drive for exciter in scene.exciters]
+        known = [
+            (each.rotor_angle(t, None), each.rotor_speed(t, None)) if is_output else None
+            for each, is_output in zip(turning, is_known, strict=True)
+        ]
+        return States(rate, tuple(inputs.speed for inputs in given.rotors)), Outputs(force, tuple(known))
 
-    signals = state_signals(scene, start)
+    signals = [*state_signals(scene, start), *angle_signals]
     acceleration = iter(coordinate_signals(carrier, "acceleration", 2))
     own = [next(acceleration) if each.name.startswith("velocity.") else None for each in signals]
-    if states.rotor_angle is not None:
-        signals, own = [*signals, rotor[0]], [*own, None]
+    inputs, states = Inputs(np.zeros(carrier.mass.shape[0], zero.dtype), tuple(rotors)), States(start, tuple(angles))
     return Equations(rates, states, inputs, signals, own, input_signals, output_signals)
 
 
-def _driven(drive: Drive, angle: Array | None, given: Inputs, by_input: bool) -> Drive:
-    """Return the drive to which the inputs are applied."""
+def _rotor_signals(place: str) -> list[Signal]:
+    """Return the signals of a rotor's angle, speed and acceleration, and of a torque on it."""
+    named = {"angle": "rad", "speed": "rad/s", "acceleration": "rad/s^2", "torque": "N m"}
+    return [Signal(f"{place}rotor.{name}", unit) for name, unit in named.items()]
+
+
+def _driven(exciter: Exciter, angle: Array | None, given: RotorInputs, by_input: bool) -> Exciter:
+    """Return the exciter with a drive to which the inputs are applied."""
+    drive, sign = exciter.drive, float(exciter.direction)
     if isinstance(drive, Motor):
-        return _TorqueInput(drive.speed, drive.inertia, given.torque, None if by_input else drive)
-    if by_input:
-        assert angle is not None
-        return _SpeedInput(given.speed, angle, given.acceleration)
-    return drive
+        turned = _TorqueInput(drive.speed, drive.inertia, sign * given.torque, None if by_input else drive)
+    elif angle is not None:
+        turned = _SpeedInput(sign * given.speed, sign * angle, sign * given.acceleration)
+    else:
+        return exciter
+    return eqx.tree_at(lambda e: e.drive, exciter, turned)
 
 
 def state_signals(scene: Scene, state: State) -> list[Signal]:
@@ -192,21 +217,23 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
 
     put(places.displacement, coordinate_signals(carrier, "displacement", 0))
     put(places.velocity, coordinate_signals(carrier, "velocity", 1))
-    put_loads("angle", "rad", places.angle)
-    put_loads("rate", "rad/s", places.rate)
-    if places.rotor is not None:
-        put(np.asarray(places.rotor), [Signal("rotor.angle", "rad"), Signal("rotor.speed", "rad/s")])
-    if places.spin is not None and places.spin.drilling is not None:
-        put_loads("drilling_spin", "rad/s", (places.spin.drilling,))
-    if places.spin is not None and places.spin.slip is not None:
-        put_loads("slip", "m/s", places.spin.slip)
+    for k, own in enumerate(places.exciters):
+        place = scene.place_of(k)
+        put_loads(f"{place}angle", "rad", own.angle)
+        put_loads(f"{place}rate", "rad/s", own.rate)
+        if own.rotor is not None:
+            put(np.asarray(own.rotor), _rotor_signals(place)[:2])
+        if own.spin is not None and own.spin.drilling is not None:
+            put_loads(f"{place}drilling_spin", "rad/s", (own.spin.drilling,))
+        if own.spin is not None and own.spin.slip is not None:
+            put_loads(f"{place}slip", "m/s", own.spin.slip)
     return [found[k] for k in range(len(found))]
 
 
 def has_events(scene: Scene) -> bool:
     """True if the equations have branches: nonsmooth forces, or a drive whose acceleration jumps."""
     smooth = all(term.is_smooth for effect in scene.all_effects for term in effect.terms())
-    return not smooth or bool(scene.drive.jump_ts())
+    return not smooth or any(exciter.drive.jump_ts() for exciter in scene.exciters)
 
 
 def named_entries(scene: Scene) -> list[NamedNumber]:

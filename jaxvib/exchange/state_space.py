@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -87,12 +88,13 @@ class StateSpace(NamedTuple):
         return optional_module("scipy.signal", "mat").StateSpace(self.A, self.B, self.C, self.D)
 
     def control(self) -> control.StateSpace:
-        """Return the model for python-control, with the names of its signals; a dot in a name becomes "_".
+        """Return the model for python-control, with the names of its signals; dots and brackets in a name become "_".
 
         **Raises** `InputError` if python-control is not installed (extra `control`).
         """
         names = {
-            name: [each.name.replace(".", "_") for each in getattr(self, name)] for name in ("states", "inputs", "outputs")
+            name: [re.sub(r"[.\[\]]+", "_", each.name) for each in getattr(self, name)]
+            for name in ("states", "inputs", "outputs")
         }
         return optional_module("control", "control").ss(self.A, self.B, self.C, self.D, **names)
 
@@ -141,9 +143,10 @@ def state_space(
 
     **Arguments**
 
-    - `scene`; a model at rest depends only on its machine, loads and nonlinear supports
+    - `scene`; a model at rest depends only on its machine, loads and nonlinear supports, and may have several exciters
     - `at`: "rest" (the default), or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`
-    - `rotor_speed` n, rad/s, for a machine at rest with a gyroscopic matrix (default: the drive's speed); typical: 0 to 500
+    - `rotor_speed` n, rad/s, for a machine at rest with a gyroscopic matrix (default: the mean speed of the drives); typical:
+      0 to 500
 
     **Returns** `StateSpace`.
 
@@ -164,17 +167,27 @@ def state_space(
         return _in_jam(scene, at)
     if at != "rest":
         raise InputError("at", f"is {quoted(at)}; it must be 'rest' or a jam, for example jam_modes(scene).select(3)")
-    speed = scene.drive.speed if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed", low=0.0)
+    speed = _mean_speed(scene) if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed", low=0.0)
     return _at_rest(scene, speed)
+
+
+def _mean_speed(scene: Scene) -> Array:
+    """Return the mean speed of all rotors, rad/s, anticlockwise."""
+    speeds = [exciter.direction * exciter.drive.speed for exciter in scene.exciters]
+    return sum(speeds[1:], speeds[0]) / len(speeds)
 
 
 def _at_rest(scene: Scene, speed: Array) -> StateSpace:
     a, b, c, d = map(np.asarray, _rest_matrices(scene, speed))
-    carrier, mounting = scene.machine.structure(), scene.mounting
+    carrier = scene.machine.structure()
     states = (*coordinate_signals(carrier, "displacement", 0), *coordinate_signals(carrier, "velocity", 1))
-    at_exciter = signals_of([f"exciter.{('across', 'up')[axis]}" for axis in mounting.axes], "N")
+    places = [
+        f"{scene.place_of(k) or 'exciter.'}{('across', 'up')[axis]}"
+        for k, exciter in enumerate(scene.exciters)
+        for axis in scene.machine.mounting(exciter.at).axes
+    ]
     outputs = (*states, *coordinate_signals(carrier, "acceleration", 2), *foundation_forces(carrier))
-    inputs = (*force_inputs(carrier), *at_exciter)
+    inputs = (*force_inputs(carrier), *signals_of(places, "N"))
     x0, u0, y0 = (np.zeros(len(signals)) for signals in (states, inputs, outputs))
     return StateSpace(a, b, c, d, states, inputs, outputs, x0, u0, y0, _AT_REST.format(speed=float(speed)))
 
@@ -190,7 +203,7 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
         slopes = [slope @ rows for slope in jax.jacfwd(term.force, (0, 1))(rows @ rest, rows @ rest)]
         stiffness, damping = stiffness + rows.T @ slopes[0], damping + rows.T @ slopes[1]
         foundation = [whole + slope for whole, slope in zip(foundation, slopes, strict=True)]
-    forces = jnp.concatenate([jnp.eye(nd, dtype=model.mass.dtype), model.mount.rows[0].T], axis=1)
+    forces = jnp.concatenate([jnp.eye(nd, dtype=model.mass.dtype), *(mount.rows[0].T for mount in model.mounts)], axis=1)
     solved = jnp.linalg.solve(model.mass, jnp.concatenate([-stiffness, -damping, forces], axis=1))
     zero, one = jnp.zeros_like(model.mass), jnp.eye(nd, dtype=model.mass.dtype)
     still = jnp.zeros_like(forces)

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
-from programs.golden import scenes, state_of
+from programs.golden import scenes, scenes_of_exciters, state_of
+from scenes import BALLS, machines
 
 import jaxvib as jv
 from jaxvib.exchange import fmu as module
@@ -29,8 +30,23 @@ from jaxvib.machine.files import TEMPLATES
 from jaxvib.ode.scalarize import scalar_program
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-SCENES = scenes()
+OFF = jv.SwitchedOff(jv.DCMotor(120.0, stall_torque=8.0, inertia=0.2), at=0.4, bearing=0.01)
+SPRING = dict(stiffness=(2e5, 4e5), damping=(2e3, 4e3))
+SUPPORTS = [jv.support(at=(x, -0.2), **SPRING) for x in (-1.2, 1.2)]
+MORE = {
+    "motor that is switched off": jv.Scene(machines()["two_mass"], jv.balls(**BALLS), OFF),
+    "body with loads and an unbalance": jv.Scene(
+        jv.plane_body(mass=900.0, inertia=300.0, supports=SUPPORTS),
+        exciters=[
+            jv.Exciter(jv.balls(**BALLS), jv.ConstantSpeed(110.0), at=(-0.3, 0.4), direction=-1),
+            jv.Exciter(drive=jv.DCMotor(90.0, stall_torque=40.0, inertia=0.5), unbalance=0.8, at=(0.3, 0.4)),
+        ],
+        effects=(jv.Gravity(),),
+    ),
+}
+SCENES = scenes() | scenes_of_exciters() | MORE
 CHECKED = ["two masses", "stop", "imbalance and a motor", "rotor with stations", "torus, balls spin and slide"]
+CHECKED += ["two exciters on platforms", "body with loads and an unbalance"]
 """Scenes that are checked by default; `make test-slow` checks all."""
 
 
@@ -118,7 +134,7 @@ def test_unit_is_valid_and_has_the_rates_of_the_field(name, fmi, opened):
 
 
 @needs_compiler
-@each_scene("stop", "imbalance and a motor")
+@each_scene("stop", "imbalance and a motor", *MORE)
 def test_cvode_agrees_with_simulate_over_two_seconds(name):
     found = exported(name)
     # Balls that spin and slide are chaotic: as long as they agree. The published machine is dimensionless.
@@ -206,7 +222,9 @@ def test_changed_parameters_equal_the_changed_scene_file(opened):
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["two masses", "imbalance and a motor", "stop", "rotor with stations"])
+@pytest.mark.parametrize(
+    "name", ["two masses", "imbalance and a motor", "stop", "rotor with stations", "body with loads and an unbalance"]
+)
 def test_directional_derivatives_equal_jvp(name, opened):
     found = exported(name)
     state, machine = state_of(found.scene), opened(found)
@@ -282,6 +300,60 @@ def test_speed_input_replaces_an_ideal_drive(opened):
 
 
 @needs_compiler
+def test_inputs_of_each_exciter_reach_its_rotor(opened):
+    """Inputs are anticlockwise, whatever the direction of the exciter."""
+    found = exported("body with loads and an unbalance", drive="input")
+    assert validate_fmu(found.path) == []
+    first, second = found.scene.exciters
+    drive = jv.SpinUp(110.0, 5.0)
+    turned = jv.Exciter(first.loads, drive, at=(-0.3, 0.4), direction=-1)
+    scene = jv.Scene(found.scene.machine, exciters=[turned, second], effects=found.scene.effects)
+    state, t = state_of(scene), jnp.asarray(1.7)
+    values = {"angle": drive.angle_at(t), "speed": drive.speed_at(t), "acceleration": drive.acceleration_at(t)}
+    given = {f"exciters[0].rotor.{name}": -float(value) for name, value in values.items()}
+    relative = float(state.exciters[1].rotor[1] - state.velocity[2])
+    given["exciters[1].rotor.torque"] = float(second.drive.torque(relative))
+    machine = opened(found)
+    assert machine.value("exciters[0].rotor.speed")[0] == -110.0
+    put_all(machine, found, {**of_state(scene, state), **given})
+    expected = [*of_state(scene, jv.vector_field(scene)(t, state)).values(), -float(drive.speed_at(t))]
+    np.testing.assert_allclose(machine.value(*rates_of(found)), expected, rtol=1e-10, atol=1e-9)
+
+
+@needs_compiler
+def test_forces_on_a_body_replace_those_of_its_supports(opened):
+    """A force -K q on a body at q = 0 accelerates everything as its displacement q does."""
+    found = exported("body with loads and an unbalance")
+    machine, q = opened(found), np.array([1e-3, -2e-3, 3e-3])
+    state = of_state(found.scene, jv.initial_state(found.scene))
+    force = -np.asarray(found.scene.machine.carrier().stiffness) @ q
+    names = ["x", "y", "psi"]
+    put_all(machine, found, {**state, **{f"force.{n}": f for n, f in zip(names, force, strict=True)}})
+    forced = machine.value(*rates_of(found))
+    put_all(
+        machine, found, {f"force.{n}": 0.0 for n in names} | {f"displacement.{n}": x for n, x in zip(names, q, strict=True)}
+    )
+    displaced = machine.value(*rates_of(found))
+    np.testing.assert_allclose(forced[3:], displaced[3:], rtol=1e-9, atol=1e-9)
+    assert np.all(np.abs(forced[3:6]) > 0.1)
+
+
+@needs_compiler
+def test_changed_places_equal_the_changed_scene(opened):
+    found = exported("body with loads and an unbalance")
+    changed = {"exciters[1].position[0]": 0.5, "exciters[1].unbalance": 0.6, "machine.supports[0].at[0]": -0.9}
+    first, second = found.scene.exciters
+    moved = jv.Exciter(drive=second.drive, unbalance=0.6, at=(0.5, 0.4))
+    body = jv.plane_body(mass=900.0, inertia=300.0, supports=[jv.support(at=(-0.9, -0.2), **SPRING), SUPPORTS[1]])
+    scene = jv.Scene(body, exciters=[first, moved], effects=found.scene.effects)
+    state, machine = state_of(found.scene), opened(found)
+    expected = of_state(found.scene, jv.vector_field(scene)(jnp.asarray(0.0), state))
+    machine.exitInitializationMode()
+    put_all(machine, found, {**of_state(found.scene, state), **changed})
+    np.testing.assert_allclose(machine.value(*rates_of(found)), list(expected.values()), rtol=1e-10, atol=1e-9)
+
+
+@needs_compiler
 @pytest.mark.parametrize("fmi", ["2.0", "3.0"])
 def test_states_of_instances_are_kept_and_restored(fmi, opened):
     found = exported("two masses", fmi)
@@ -352,9 +424,10 @@ def test_same_scene_gives_the_same_bytes(tmp_path):
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
+@pytest.mark.parametrize("fmi", ["2.0", "3.0"])
 @pytest.mark.parametrize("kind", TEMPLATES)
-def test_templates_are_valid_units(kind, tmp_path):
-    unit = jv.export_fmu(jv.scene_from_toml(TEMPLATES[kind]), tmp_path / kind, fmi="3.0", binary=False)
+def test_templates_are_valid_units(kind, fmi, tmp_path):
+    unit = jv.export_fmu(jv.scene_from_toml(TEMPLATES[kind]), tmp_path / kind, fmi=fmi, binary=False)
     assert validate_fmu(str(unit.path)) == [] and unit.path.name == f"{kind}.fmu"
 
 

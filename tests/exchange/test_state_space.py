@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.signal
-from scenes import ROTOR, scene
+from scenes import BALLS, ROTOR, machines, scene
 
 import jaxvib as jv
 from jaxvib.equations.averaged import Amplitudes, averaged_field
@@ -36,6 +36,33 @@ def test_force_at_exciter_equals_force_on_its_platform():
     model = jv.state_space(scene("three_mass"))
     assert [each.name for each in model.inputs] == ["force.y1", "force.y2", "force.y3", "exciter.up"]
     assert np.array_equal(model.B[:, 2], model.B[:, 3]) and np.array_equal(model.D[:, 2], model.D[:, 3])
+
+
+def test_two_exciters_give_the_responses_of_each():
+    """A force at an exciter is a force on its platform, whose mass includes the loads of that exciter."""
+    two = machines()["two_mass"]
+    placed = [
+        jv.Exciter(jv.balls(**BALLS), jv.ConstantSpeed(n), at=k, direction=d) for k, n, d in ((1, 100.0, 1), (2, 60.0, -1))
+    ]
+    model = jv.state_space(jv.Scene(two, exciters=placed))
+    assert [each.name for each in model.inputs] == ["force.y1", "force.y2", "exciters[0].up", "exciters[1].up"]
+    assert np.array_equal(model.B[:, :2], model.B[:, 2:]) and np.array_equal(model.D[:, :2], model.D[:, 2:])
+    mass = np.asarray(two.mass) + 3 * 0.8
+    np.testing.assert_allclose(model.B[2:, :2], np.diag(1.0 / mass), rtol=1e-12)
+    assert "at the rotor speed 20 rad/s" in model.about
+    assert model.control().input_labels[2] == "exciters_0_up"
+
+
+def test_force_on_a_body_turns_it_by_its_lever():
+    """M = diag(m, m, J) with loads as masses at their place; a force F at (x, y) has the moment x F_y - y F_x."""
+    supports = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.2, 1.2)]
+    body = jv.plane_body(mass=900.0, inertia=300.0, supports=supports)
+    exciter = jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=0.5, at=(0.3, 0.4))
+    model = jv.state_space(jv.Scene(body, exciters=[exciter]))
+    assert [each.name for each in model.inputs][3:] == ["exciter.across", "exciter.up"]
+    expected = np.array([[1 / 900, 0.0], [0.0, 1 / 900], [-0.4 / 300, 0.3 / 300]])
+    np.testing.assert_allclose(model.B[3:, 3:], expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(model.C[-2:, :3], [[4e5, 0.0, 2 * 0.2 * 2e5], [0.0, 8e5, 0.0]], rtol=1e-9, atol=1e-6)
 
 
 def test_poles_equal_whirl():
