@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -73,6 +73,10 @@ class Drive(Part):
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times at which the acceleration jumps, which must be ends of steps."""
         return ()
+
+    def settled(self) -> Drive:
+        """Return the drive as it is when it no longer changes: an ideal drive at its working speed, a motor that is off."""
+        return self
 
 
 class Clockwise(Drive):
@@ -164,6 +168,10 @@ class IdealDrive(Drive):
 
     def torque_and_inertia(self, t: Array, speed: Array) -> None:
         """Return None, because no torque changes the speed."""
+
+    def settled(self) -> Drive:
+        """Return `ConstantSpeed`."""
+        return self if self.constant else ConstantSpeed(cast(Array, self.speed))
 
 
 class Motor(Drive):
@@ -488,3 +496,7 @@ class SwitchedOff(Motor):
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the time at which the motor is switched off."""
         return (self.at,)
+
+    def settled(self) -> Drive:
+        """Return the motor that is off throughout."""
+        return eqx.tree_at(lambda drive: drive.at, self, jnp.zeros_like(self.at))

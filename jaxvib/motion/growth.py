@@ -13,12 +13,12 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.equations.state import State
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
 from jaxvib.motion.integrate import whole_turns, wrap_angles
-from jaxvib.motion.plan import plan_stretch, start_state
+from jaxvib.motion.plan import plan_stretch, start_state, with_settled_drives
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import last_state, run_planned, simulate
 from jaxvib.motion.start import Start
@@ -131,7 +131,7 @@ def growth(
 
     **Arguments**
 
-    - `scene` with a drive of constant speed
+    - `scene` with a drive of constant speed, or with several exciters, whose drives may be motors
     - `until`, s or text: approximate length of all stretches together; each is a whole number of turns of the rotor; typical:
       20 to 200
     - `start`, `mode`, `separation` as `simulate`
@@ -151,10 +151,7 @@ def growth(
     """
     require_known(scene, "scene", "growth", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
-    if not scene.drive.constant:
-        raise InputError(
-            "drive", f"is {quoted(scene.drive.kind)}; the growth of disturbances needs a constant speed, use ConstantSpeed"
-        )
+    scene = with_settled_drives(scene, "the growth of disturbances needs a constant speed, use ConstantSpeed")
     if count(stretches, "stretches") < 8:
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to estimate the scatter of the rate")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
@@ -193,7 +190,7 @@ def growth(
     if name == "chaotic" and all(_returns(scene, quarter, steps) for quarter in quarters):
         name = "unstable"
     fastest = {"regular": 0.0, "undecided": exponent + 3.0 * uncertainty}.get(name, exponent)
-    horizon = math.log(1.0 / float(jnp.finfo(scene.drive.speed.dtype).eps)) / fastest if fastest > 0.0 else math.inf
+    horizon = math.log(1.0 / float(jnp.finfo(scene.top_speed.dtype).eps)) / fastest if fastest > 0.0 else math.inf
     times = stretch * np.arange(1, stretches + 1)
     return Growth(member(GrowthStatus, name), exponent, uncertainty, horizon, np.array(rates), times)
 
@@ -229,8 +226,9 @@ def _sum_error(values: np.ndarray) -> float:
 
 def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
     """Return True if the motion from `state` comes back to it within a few turns of rotor and loads."""
-    speed = float(scene.drive.speed)
-    turning = np.abs(np.asarray(state.azimuth_rate))
+    speed, turning = float(scene.top_speed), []
+    for own in state.exciters:
+        turning += [*np.abs(np.ravel(own.rate[0]))] if own.rate else [] if own.rotor is None else [abs(own.rotor[1])]
     slowest = min([speed, *(float(w) for w in turning if w > 1e-2 * speed)])
     run = simulate(
         scene, _TURNS * 2.0 * math.pi / slowest, start=state, samples=_SAMPLES, stepsize_controller=steps, estimate=False,

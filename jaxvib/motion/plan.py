@@ -343,3 +343,17 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
 def _rates(scenes: Scene) -> tuple[Array, Array]:
     """Return the fastest rates of the motion, rad/s, and of the decay, 1/s, of each scene."""
     return jax.vmap(lambda scene: (frequency_bounds(scene)[0], fastest_decay(scene)))(scenes)
+
+
+def with_settled_drives(scene: Scene, problem: str) -> Scene:
+    """Return the scene with motors that are off from the start if they are switched off later.
+
+    **Raises** `InputError` with the `problem` for an ideal drive whose speed changes, and for the motor of a single exciter
+    with loads.
+    """
+    for k, exciter in enumerate(scene.exciters):
+        drive = exciter.drive
+        if not drive.constant and (drive.ideal or scene.is_plain):
+            raise InputError(f"{scene.place_of(k)}drive", f"is {quoted(drive.kind)}; {problem}")
+        scene = scene if drive.constant else eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, drive.settled())
+    return scene

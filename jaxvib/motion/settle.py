@@ -13,13 +13,13 @@ from jaxvib.boundary import validated
 from jaxvib.display import speed_text
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.state import State
-from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation
 from jaxvib.motion.integrate import WINDOW, frequency_bounds, whole_turns
-from jaxvib.motion.plan import RunPlan, plan_stretch, start_state
+from jaxvib.motion.plan import RunPlan, plan_stretch, start_state, with_settled_drives
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
@@ -155,10 +155,7 @@ def _plan_settle(
     """Validate the arguments of `settle` and choose its stretches. **Raises** `InputError`."""
     require_known(scene, "scene", "settle", "use jam_orbit or simulate in it")
     scene = validate_scene(scene)
-    for k, exciter in enumerate(scene.exciters):
-        if not exciter.drive.constant and (exciter.drive.ideal or scene.is_plain):
-            problem = "settle needs a constant speed: use ConstantSpeed"
-            raise InputError(f"{scene.place_of(k)}drive", f"is {quoted(exciter.drive.kind)}; {problem}")
+    scene = with_settled_drives(scene, "a motion settles under a constant speed: use ConstantSpeed")
     count(periods, "periods")
     double = scene.top_speed.dtype.itemsize >= 8
     usual = 1e-6 if double else 1e-3

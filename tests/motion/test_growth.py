@@ -178,3 +178,19 @@ def test_growth_starts_as_far_apart_as_asked(monkeypatch):
     np.testing.assert_allclose(np.degrees(starts), [1.0, 10.0, 0.0], atol=1e-12)
     with pytest.raises(jv.InputError, match="which is only for named starts"):
         jv.growth(s, 10.0, start=jv.initial_state(s), separation=0.0)
+
+
+@pytest.mark.parametrize(("phase", "name"), [(0.0, "unstable"), (np.pi, "regular")])
+def test_growth_of_two_motors_is_that_of_their_multiplier(phase, name):
+    supports = [jv.support(at=(x, 0.0), stiffness=(4e5, 4e5), damping=(4e3, 4e3)) for x in (-1.0, 1.0)]
+    machine = jv.plane_body(mass=2000.0, inertia=600.0, supports=supports)
+    drive = jv.SwitchedOff(jv.DCMotor(100.0, stall_torque=300.0, inertia=0.5), at=1e9)
+    drives = (drive.motor, eqx.tree_at(lambda d: d.at, drive, 1e-3))
+    exciters = [jv.Exciter(drive=d, unbalance=1.0, at=(x, 0.0)) for d, x in zip(drives, (-0.4, 0.4), strict=True)]
+    scene = jv.Scene(machine, exciters=exciters)
+    orbit = jv.synchronous_orbit(scene, phases=[0.0, phase])
+    growth = jv.growth(scene, 5.0 if name == "unstable" else 20.0, start=orbit.at(0.0), stretches=16)
+    assert growth.status_name == name and bool(orbit.stable) == (name == "regular")
+    if name == "unstable":
+        exponent = np.log(float(orbit.multiplier)) * float(orbit.speed) / (2.0 * np.pi)
+        assert growth.exponent == pytest.approx(exponent, rel=1e-2)

@@ -15,7 +15,6 @@ from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, linear_model
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics import radau
 from jaxvib.runtime.devices import float_dtype
@@ -40,7 +39,7 @@ def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
 
 def at_constant_speed(scene: Scene) -> Scene:
     """Return the scene with a rotor that has its working speed from the start."""
-    return scene.replace(drive=ConstantSpeed(scene.drive.speed))
+    return scene.replace(drive=scene.drive.settled())
 
 
 def _steps_for(scene: Scene) -> Array:

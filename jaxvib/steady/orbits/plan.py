@@ -6,7 +6,7 @@ Only this module tests which numbers are known. Under a JAX transformation the n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jax import Array
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag, require_terms
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drive import ConstantSpeed, SwitchedOff
+from jaxvib.machine.drive import SwitchedOff
 from jaxvib.machine.effects.base import has_half_turn, has_term
 from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadPotential, RotorImbalance, SupportForce
 from jaxvib.machine.loads import CircularLoads
@@ -196,11 +196,7 @@ def plan_synchronous(
     require_terms(scene.all_effects, _SYNCHRONOUS_TERMS, "is|are not part of a synchronous motion")
     for k, exciter in enumerate(scene.exciters):
         _require_one_body(exciter, scene.place_of(k))
-        drive = exciter.drive
-        if drive.ideal and not drive.constant:
-            scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, ConstantSpeed(cast(Array, drive.speed)))
-        if isinstance(drive, SwitchedOff):
-            scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive.at, scene, jnp.zeros_like(drive.at))
+        scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, exciter.drive.settled())
     shaken = [e for e in scene.exciters if e.drive.ideal and e.loads is None]
     motors = [e.drive.speed for e in scene.exciters if not e.drive.ideal and not isinstance(e.drive, SwitchedOff)]
     if shaken:

@@ -34,6 +34,7 @@ from jaxvib.steady.orbits.whole import (
     state_of,
 )
 from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.steady.points import Harmonic, PointAnswers
 from jaxvib.units import Number, Numbers, known_number
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ class _HasSpeedAndPhases(Protocol):
         ...
 
 
-class SynchronousOrbit(Result):
+class SynchronousOrbit(PointAnswers, Result):
     """Exact synchronous motion: th_k = sigma_k (theta + alpha_k + psi_k(theta)), theta = Omega t, psi_k of mean 0.
 
     th_k is the angle of the rotor of exciter k, or of its loads if its rotor is balanced; sigma_k is the direction of the
@@ -129,6 +130,13 @@ class SynchronousOrbit(Result):
         """
         angle = known_number(theta, "rad", "theta")
         return _at(self.scene, self.speed, self.displacement_harmonics, self.deviation_harmonics, angle)
+
+    def harmonic(self) -> Harmonic:
+        """Return the vibration of the coordinates at Omega, and the mean square of their other harmonics."""
+        higher = self.displacement_harmonics[:, 2:]
+        return Harmonic(
+            self.scene.machine, self.speed, self.displacement_harmonics[:, 1], 0.5 * (higher @ higher.conj().T).real
+        )
 
     def summary(self) -> str:
         """Return the result as a few lines of text; amplitudes zero to peak."""

@@ -108,6 +108,18 @@ def test_multipliers_equal_differences_of_runs_by_scipy(orbit):
     assert np.max([np.min(np.abs(expected - e)) for e in found]) < 1e-6
 
 
+def test_ellipse_of_a_point_is_that_of_the_path(orbit):
+    theta = 2.0 * np.pi * np.arange(64) / 64.0
+    q = np.asarray(jax.vmap(orbit.at)(theta).displacement)
+    path = q[:, :2] + q[:, 2:] * np.array([[-0.5, 1.5]])
+    first = 2.0 * np.mean(path * np.exp(-1j * theta)[:, None], axis=0)
+    rest = path - path.mean(axis=0) - np.real(first * np.exp(1j * theta)[:, None])
+    found = orbit.ellipse(at=(1.5, 0.5))
+    assert float(found.semi_major**2 + found.semi_minor**2) == pytest.approx(np.sum(np.abs(first) ** 2), rel=1e-10)
+    remainder = np.sqrt(np.mean(np.sum(rest**2, axis=1)) / (0.5 * np.sum(np.abs(first) ** 2)))
+    assert float(found.remainder) == pytest.approx(remainder, rel=1e-8)
+
+
 def test_mean_powers_of_motors_equal_the_dissipation(general, orbit):
     theta = 2.0 * np.pi * np.arange(64) / 64.0
     states = jax.vmap(orbit.at)(theta)
