@@ -20,7 +20,7 @@ from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.scene import Exciter, Scene, unbalance
-from jaxvib.machine.structures.plane_body import plane_body, support
+from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import TEMPLATES as ROTORS
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
@@ -51,6 +51,7 @@ _MACHINES = {
     "three_mass": three_mass,
     "network": network,
     "plane_body": plane_body,
+    "plane_network": plane_network,
     "planar_rotor": planar_rotor,
     "rotor": rotor,
 }
@@ -65,7 +66,7 @@ DRIVES = {
 }
 SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
 
-_ENTRIES: Mapping[str, Callable[..., Any]] = {"supports": support}
+_ENTRIES: Mapping[str, Callable[..., Any]] = {"supports": support, "bodies": body}
 """Constructors of the entries of arguments that are lists of parts, by the name of the argument."""
 
 T = TypeVar("T")

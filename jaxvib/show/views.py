@@ -247,11 +247,12 @@ class ShaftView(RotorView):
 def view_of(scene: Scene) -> View:
     """Return the drawing of a scene, chosen by the kind of places of its machine."""
     machine = scene.machine
-    if machine.places == "point" and machine.mounting().axes != (0, 1):
+    views = {"platform": PlatformView, "shaft": ShaftView, "point": FrontView, "plane": PlaneView}
+    not_drawn = machine.places == "point" and machine.mounting().axes != (0, 1)
+    if not_drawn or machine.places not in views or machine.body_count > 1:
         problem = (
-            f"is {machine.kind!r}; sketches are available for machines with platforms, a shaft or bodies, or that move across "
-            "and up"
+            f"is {machine.kind!r}; sketches are available for machines with platforms, a shaft or one body in a plane, or that "
+            "move across and up"
         )
         raise InputError("machine.kind", problem)
-    views = {"platform": PlatformView, "shaft": ShaftView, "point": FrontView, "plane": PlaneView}
     return views[machine.places](scene)

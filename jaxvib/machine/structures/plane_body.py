@@ -1,8 +1,10 @@
-"""Rigid body that moves in its plane on springs and dampers: screens, feeders, conveyors."""
+"""Rigid bodies that move in their plane on springs and dampers: screens, feeders, conveyors."""
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,35 +13,48 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.mount import Mount, Place
+from jaxvib.machine.mount import BodyPoint, Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
-from jaxvib.units import Number
+from jaxvib.units import Number, count
 
 
 class PlaneSupport(Part):
-    """Pair of springs and dampers between a point of a body and the foundation, at right angles to each other.
+    """Pair of springs and dampers at right angles, between a point of a body and the foundation or another body.
 
     **Attributes**
 
     - `at` (2,), m: the point of the body, (x, y) from its centre of mass
     - `stiffness` (2,) N/m and `damping` (2,) N s/m, along the directions at `angle` and `angle` + 90 degrees
     - `angle`, rad: of the first spring, anticlockwise from x
+    - `body`: number of the body, from 0; `to`: number of the other body, None for the foundation
+    - `at_other` (2,), m: the point of the other body, from its centre of mass; None for the foundation
     """
 
     at: Array = eqx.field(metadata=unit("m", "m", words="position of the support", typical=0.5))
     stiffness: Array = eqx.field(metadata=unit("N/m", "N/m", low=0.0, words="stiffness of the support"))
     damping: Array = eqx.field(metadata=unit("N s/m", "N s/m", low=0.0, words="damping of the support"))
     angle: Array = eqx.field(metadata=unit("rad", words="angle of the support", typical=0.5))
+    at_other: Array | None = eqx.field(metadata=unit("m", "m", words="position of the support on the other body", typical=0.5))
+    body: int = eqx.field(static=True)
+    to: int | None = eqx.field(static=True)
 
 
 def support(
-    *, at: Sequence[Number], stiffness: Sequence[Number], damping: Sequence[Number], angle: Number = 0.0
+    *,
+    at: Sequence[Number],
+    stiffness: Sequence[Number],
+    damping: Sequence[Number],
+    angle: Number = 0.0,
+    body: int = 0,
+    to: int | None = None,
+    at_other: Sequence[Number] | None = None,
 ) -> PlaneSupport:
     """Return a support of a body in its plane: two springs with dampers at right angles.
 
         force on the foundation = R^T diag(k1, k2) R u + R^T diag(c1, c2) R u',    R = [[cos a, sin a], [-sin a, cos a]]
 
-    u is the displacement (x, y) of the point `at`, a the `angle`.
+    u is the displacement (x, y) of the point `at`, a the `angle`. Between two bodies u is the displacement of `at` relative to
+    that of `at_other`.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -47,8 +62,12 @@ def support(
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
     - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m)
     - `angle` of the first spring, rad, anticlockwise from x; typical: 0 (the default)
+    - `body`: number of the body in a `plane_network`, from 0; typical: 0 (the default)
+    - `to`: number of the body at the other end; default: the foundation
+    - `at_other` (2,): the point of that body, m from its centre of mass; typical: 0.2 to 3 m
 
-    **Returns** `PlaneSupport`. **Raises** `InputError` for wrong units, wrong lengths and negative coefficients.
+    **Returns** `PlaneSupport`. **Raises** `InputError` for wrong units, wrong lengths, negative coefficients, and another body
+    without a point on it.
 
     >>> import jaxvib as jv
     >>> jv.support(at=(1.2, -0.2), stiffness=("200 N/mm", "400 N/mm"), damping=(2e3, 4e3)).stiffness.tolist()
@@ -56,10 +75,112 @@ def support(
 
     Source: equilibrium of two linear springs.
     """
-    return PlaneSupport(**read_numbers(PlaneSupport, "", at=at, stiffness=stiffness, damping=damping, angle=angle))
+    for name, number in (("body", body), ("to", 0 if to is None else to)):
+        count(number, name, low=0)
+    if (to is None) != (at_other is None):
+        raise InputError("at_other", f"is {quoted(at_other)} and to is {to}; a support between two bodies needs both")
+    if to == body:
+        raise InputError("to", f"is {to}, the body itself; a support joins two different bodies")
+    found = read_numbers(PlaneSupport, "", at=at, stiffness=stiffness, damping=damping, angle=angle)
+    other = None if at_other is None else read_numbers(PlaneSupport, "", at_other=at_other)["at_other"]
+    return PlaneSupport(**found, at_other=other, body=body, to=to)
 
 
-class PlaneBody(Machine):
+class Body(Part):
+    """Rigid body of a `plane_network`: `mass`, kg, and `inertia` about its centre of mass, kg m^2."""
+
+    mass: Array = eqx.field(metadata=unit("kg", low=0.0, open_low=True, words="mass of the body"))
+    inertia: Array = eqx.field(metadata=unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the body"))
+
+
+def body(*, mass: Number, inertia: Number) -> Body:
+    """Return a rigid body of a `plane_network`.
+
+    **Arguments** (SI, or strings with a unit, greater than 0; exciters included, loads not)
+
+    - `mass`, kg; typical: 100 to 10000
+    - `inertia` about its centre of mass, kg m^2; typical: 20 to 20000
+
+    **Returns** `Body`. **Raises** `InputError` for wrong units and values that are not positive.
+
+    >>> import jaxvib as jv
+    >>> float(jv.body(mass="2 t", inertia=600.0).mass)
+    2000.0
+    """
+    return Body(**read_numbers(Body, "", mass=mass, inertia=inertia))
+
+
+class _Bodies(Machine):
+    """Bodies in a plane, three coordinates each. A subclass has `supports`."""
+
+    if TYPE_CHECKING:  # a field here would come before those of the subclasses
+        supports: tuple[PlaneSupport, ...] = eqx.field(init=False)
+    places = "plane"
+
+    @abc.abstractmethod
+    def _inertias(self) -> list[tuple[Array, Array]]:
+        """Return the mass and the moment of inertia of each body."""
+
+    @property
+    def body_count(self) -> int:
+        """Number of bodies."""
+        return len(self._inertias())
+
+    def carrier(self) -> Carrier:
+        """Return the matrices of the coordinates x, y and psi of each body."""
+        inertias = self._inertias()
+        size = 3 * len(inertias)
+        zero = jnp.zeros((size, size), inertias[0][0].dtype)
+        force = {"stiffness": zero[:2], "damping": zero[:2]}
+        matrix = {"stiffness": zero, "damping": zero}
+        for each in self.supports:
+            rows = self._point_rows(each.at, each.body)
+            if each.to is not None and each.at_other is not None:
+                rows = rows - self._point_rows(each.at_other, each.to)
+            turn = jnp.stack([jnp.cos(each.angle), jnp.sin(each.angle)])
+            along = jnp.stack([turn, jnp.stack([-turn[1], turn[0]])])
+            for name in matrix:
+                at_point = (along.T * getattr(each, name)[None]) @ along @ rows
+                if each.to is None:
+                    force[name] = force[name] + at_point
+                matrix[name] = matrix[name] + rows.T @ at_point
+        numbers = [""] if len(inertias) == 1 else map(str, range(len(inertias)))
+        return Carrier(
+            mass=jnp.diag(jnp.stack([value for mass, inertia in inertias for value in (mass, mass, inertia)])),
+            damping=matrix["damping"],
+            stiffness=matrix["stiffness"],
+            foundation_stiffness=force["stiffness"],
+            foundation_damping=force["damping"],
+            coordinates=tuple(f"{name}{number}" for number in numbers for name in ("x", "y", "psi")),
+            coordinate_units=("m", "m", "rad") * len(inertias),
+        )
+
+    def mount(self, at: Place = None) -> Mount:
+        """Return the motion of the axis at the point `at`, and the rotation of the exciter's housing with its body."""
+        rows = self.rows_at(at, "at")
+        turn = np.eye(rows.shape[1])[3 * (at.body if isinstance(at, BodyPoint) else 0) + 2]
+        return Mount(rows=(rows,), axes=(0, 1), turn=jnp.asarray(turn, rows.dtype))
+
+    def rows_at(self, place: Place, name: str = "place") -> Array:
+        """Return the rows of the point (x, y) of a body, m from its centre of mass; None is the centre of mass."""
+        point, body = (place.at, place.body) if isinstance(place, BodyPoint) else (place, 0)
+        dtype = self._inertias()[0][0].dtype
+        if point is None:
+            return self._point_rows(jnp.zeros(2, dtype), body)
+        size = len(point) if isinstance(point, (list, tuple)) else getattr(point, "size", 1)
+        if size != 2:
+            raise InputError(name, f"is {quoted(point)}; on a body in a plane give (x, y), m from its centre of mass")
+        return self._point_rows(jnp.asarray(point, dtype), body)
+
+    def _point_rows(self, at: Array, body: int) -> Array:
+        """Return the rows (2, nd) of the point `at` of a body."""
+        lever = jnp.stack([-at[1], at[0]])
+        own = jnp.concatenate([jnp.eye(2, dtype=at.dtype), lever[:, None]], axis=1)
+        before, after = 3 * body, 3 * (self.body_count - body - 1)
+        return own if before + after == 0 else jnp.pad(own, ((0, 0), (before, after)))
+
+
+class PlaneBody(_Bodies):
     """Rigid body with the coordinates q = (x, y, psi): its centre of mass across and up, and its anticlockwise rotation.
 
         m x'' = f_x,    m y'' = f_y,    J psi'' = moment of the forces
@@ -78,49 +199,28 @@ class PlaneBody(Machine):
     inertia: Array = eqx.field(metadata=unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the body"))
     supports: tuple[PlaneSupport, ...]
     kind: str = eqx.field(static=True)
-    places = "plane"
 
-    def carrier(self) -> Carrier:
-        """Return the matrices of the three coordinates."""
-        zero = jnp.zeros((3, 3), self.mass.dtype)
-        force = {"stiffness": zero[:2], "damping": zero[:2]}
-        matrix = {"stiffness": zero, "damping": zero}
-        for each in self.supports:
-            rows = _rows(each.at)
-            turn = jnp.stack([jnp.cos(each.angle), jnp.sin(each.angle)])
-            along = jnp.stack([turn, jnp.stack([-turn[1], turn[0]])])
-            for name in matrix:
-                at_point = (along.T * getattr(each, name)[None]) @ along @ rows
-                force[name] = force[name] + at_point
-                matrix[name] = matrix[name] + rows.T @ at_point
-        return Carrier(
-            mass=jnp.diag(jnp.stack([self.mass, self.mass, self.inertia])),
-            damping=matrix["damping"],
-            stiffness=matrix["stiffness"],
-            foundation_stiffness=force["stiffness"],
-            foundation_damping=force["damping"],
-            coordinates=("x", "y", "psi"),
-            coordinate_units=("m", "m", "rad"),
-        )
-
-    def mount(self, at: Place = None) -> Mount:
-        """Return the motion of the axis at the point `at`, and the rotation of the exciter's housing with the body."""
-        return Mount(rows=(self.rows_at(at, "at"),), axes=(0, 1), turn=jnp.asarray(np.eye(3)[2], self.mass.dtype))
-
-    def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the rows of the point (x, y) of the body, m from its centre of mass; None is the centre of mass."""
-        if place is None:
-            return _rows(jnp.zeros(2, self.mass.dtype))
-        size = len(place) if isinstance(place, (list, tuple)) else getattr(place, "size", 1)
-        if size != 2:
-            raise InputError(name, f"is {quoted(place)}; on a body in a plane give (x, y), m from its centre of mass")
-        return _rows(jnp.asarray(place, self.mass.dtype))
+    def _inertias(self) -> list[tuple[Array, Array]]:
+        return [(self.mass, self.inertia)]
 
 
-def _rows(at: Array) -> Array:
-    """Return the rows (2, 3) of the point `at`."""
-    lever = jnp.stack([-at[1], at[0]])
-    return jnp.concatenate([jnp.eye(2, dtype=at.dtype), lever[:, None]], axis=1)
+class PlaneNetwork(_Bodies):
+    """Rigid bodies in a plane, joined to each other and to the foundation; coordinates (x, y, psi) of each, see `PlaneBody`.
+
+    **Attributes**: `bodies`, see `Body`; `supports`, see `PlaneSupport`.
+    """
+
+    bodies: tuple[Body, ...]
+    supports: tuple[PlaneSupport, ...]
+    kind: str = eqx.field(static=True)
+
+    @property
+    def mass(self) -> Array:
+        """Mass of each body, kg."""
+        return jnp.stack([each.mass for each in self.bodies])
+
+    def _inertias(self) -> list[tuple[Array, Array]]:
+        return [(each.mass, each.inertia) for each in self.bodies]
 
 
 def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport]) -> PlaneBody:
@@ -149,11 +249,54 @@ def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport
 
     Source: Blekhman 1988, Synchronization in Science and Technology: equations of a body with unbalance exciters.
     """
+    read = _read_supports(supports, 1)
+    found = read_numbers(PlaneBody, "machine", mass=mass, inertia=inertia)
+    return PlaneBody(**found, supports=read, kind="plane_body")
+
+
+def plane_network(bodies: Sequence[Body], supports: Sequence[PlaneSupport]) -> PlaneNetwork:
+    """Return rigid bodies that move in a plane, joined to each other and to the foundation by springs.
+
+        M_b x_b'' = f_x,    M_b y_b'' = f_y,    J_b psi_b'' = moment of the forces          for each body b
+
+    Examples are a screen on a frame that is isolated from the building, and a conveyor with a counterweight. Displacements are
+    measured from static equilibrium; rotations are assumed to be small.
+
+    **Arguments**
+
+    - `bodies`: a list of `body`; they are numbered from 0, in `Exciter(body=)` and `support(body=, to=)`
+    - `supports`: a list of `support`, at least one
+
+    **Returns** `PlaneNetwork`. **Raises** `InputError` for lists without an entry, entries of another type, and supports of a
+    body that does not exist.
+
+    >>> import jaxvib as jv
+    >>> frame = [jv.support(at=(x, -0.2), stiffness=(1e5, 2e5), damping=(500, 900), body=1) for x in (-1.5, 1.5)]
+    >>> joints = [jv.support(at=(x, -0.3), stiffness=(2e5, 4e5), damping=(800, 900), to=1, at_other=(x, 0.2)) for x in (-1, 1)]
+    >>> machine = jv.plane_network([jv.body(mass=2000, inertia=600), jv.body(mass=900, inertia=400)], frame + joints)
+    >>> machine.carrier().coordinates
+    ('x0', 'y0', 'psi0', 'x1', 'y1', 'psi1')
+
+    Source: Newton's and Euler's equations of rigid bodies, linear in the displacements.
+    """
+    if not isinstance(bodies, (list, tuple)) or not bodies:
+        raise InputError("machine.bodies", f"is {quoted(bodies)}; it must be a list of bodies, [body(mass=..., inertia=...)]")
+    for k, each in enumerate(bodies):
+        if not isinstance(each, Body):
+            raise InputError(f"machine.bodies[{k}]", f"is {quoted(each)}; it must be a body(mass=..., inertia=...)")
+    return PlaneNetwork(bodies=tuple(bodies), supports=_read_supports(supports, len(bodies)), kind="plane_network")
+
+
+def _read_supports(supports: Sequence[PlaneSupport], bodies: int) -> tuple[PlaneSupport, ...]:
+    """Return supports. **Raises** `InputError` for parts of another type, and for bodies that do not exist."""
     if not isinstance(supports, (list, tuple)) or not supports:
         raise InputError("machine.supports", f"is {quoted(supports)}; it must be a list of supports, [support(at=...), ...]")
     for k, each in enumerate(supports):
         if not isinstance(each, PlaneSupport):
             problem = f"is {quoted(each)}; it must be a support(at=..., stiffness=..., damping=...)"
             raise InputError(f"machine.supports[{k}]", problem)
-    found = read_numbers(PlaneBody, "machine", mass=mass, inertia=inertia)
-    return PlaneBody(**found, supports=tuple(supports), kind="plane_body")
+        for name, number in (("body", each.body), ("to", each.to)):
+            if number is not None and number >= bodies:
+                has = f"bodies 0 to {bodies - 1}" if bodies > 1 else "one body, number 0"
+                raise InputError(f"machine.supports[{k}].{name}", f"is {number}; the machine has {has}")
+    return tuple(supports)
