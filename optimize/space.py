@@ -20,8 +20,6 @@ from jaxvib.units.known import require_known
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import Quantity, require_quantity
 
-__all__ = ["Bounds", "Choice", "DesignSpace", "HeldQuantity", "Source", "hold"]
-
 Numbers = TypeVar("Numbers", np.ndarray, Array)
 
 Bounds = tuple[Number, Number] | tuple[Number, Number, str]

@@ -32,8 +32,6 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached
 
-__all__ = ["drive_torques", "energy", "foundation_force", "normal_force", "power"]
-
 
 @validated
 def foundation_force(scene: Scene, state: State) -> Array:

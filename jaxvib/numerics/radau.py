@@ -12,8 +12,6 @@ from numpy.polynomial import legendre
 
 from jaxvib.numerics.linalg import small_solve
 
-__all__ = ["NODES", "flow", "steps_for", "transition"]
-
 _STAGES = 6
 
 _PHASE = 1.0

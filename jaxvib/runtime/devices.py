@@ -20,8 +20,6 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 
-__all__ = ["arrays_on_device", "float_dtype", "known", "numpy_of", "on_device", "shared_devices", "take_a_device"]
-
 _VISIBILITY_VARIABLES = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 """Environment variables that restrict a process to some of the machine's accelerators."""
 

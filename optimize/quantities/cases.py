@@ -21,8 +21,6 @@ from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder
 from optimize.quantities.quantity import Quantity, require_quantity
 
-__all__ = ["expected", "quantile", "under", "worst"]
-
 
 @dataclass(frozen=True)
 class Changed:

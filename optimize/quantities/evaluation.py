@@ -23,8 +23,6 @@ from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.units.known import is_known
 
-__all__ = ["Case", "Evaluation", "Key", "Target", "TargetRecorder", "guesses"]
-
 _NO_FOLD = 10.0
 """Factor on the rotor speed that replaces the upper fold of a mode if no fold ends it at higher rotor speeds."""
 

@@ -19,20 +19,6 @@ from jaxvib.units import Quantity as UnitQuantity
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.user_inputs import arguments, number_in, same_unit
 
-__all__ = [
-    "TIERS",
-    "BuiltinQuantity",
-    "Combined",
-    "Demand",
-    "Pair",
-    "Quantity",
-    "Tier",
-    "largest",
-    "least",
-    "require_quantity",
-    "walk",
-]
-
 Pair = int | tuple[int, int] | None
 """Platform of an amplitude, or pair of platforms of a relative amplitude; None: see `between`."""
 

@@ -9,8 +9,6 @@ from functools import lru_cache
 from jaxvib.units import Number, number, unit_ratio
 from jaxvib.units.known import require_known
 
-__all__ = ["arguments", "number_in", "same_unit"]
-
 
 def arguments(function: Callable[..., object]) -> int:
     """Return the number of required arguments of a function; 1 if it is unknown."""

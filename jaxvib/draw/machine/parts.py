@@ -15,8 +15,6 @@ from matplotlib.patches import Polygon
 
 from jaxvib.draw.style import Look
 
-__all__ = ["Part", "Text", "arrow", "box", "circle", "damper", "ground", "put", "sector", "spring", "turning_arrow"]
-
 Point = tuple[float, float]
 
 

@@ -35,9 +35,6 @@ from jaxvib.units import count, known_number
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["Orbit", "OrbitStatus", "judgement_of", "numbers_of", "orbits", "plot_period", "swing"]
-
-
 _MAX_INTEGRATION_STEPS = 2**17
 """Maximum number of integration steps in a turn; beyond it no multipliers are computed. The fastest motion of the carrier is
 then about 3e4 times as fast as the loads, and an orbit would take seconds to hours."""

@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["Linearized", "newton"]
-
 _MAX_NEWTON_STEPS = 60
 """Maximum number of Newton steps, rejected ones included; ordinary points take 4 to 6."""
 

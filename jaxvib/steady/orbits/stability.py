@@ -17,8 +17,6 @@ from jaxvib.numerics.linalg import small_solve
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
 
-__all__ = ["Floquet", "deflate", "floquet", "is_stiff", "steps_for"]
-
 _PHASE_PER_STEP = 0.7
 """Phase of the carrier's fastest motion in an explicit step, rad. With order 8 the error of the multipliers is then 1e-12 for
 loads as fast as the carrier, and 1e-10 for loads three times as fast."""

@@ -24,18 +24,6 @@ from jaxvib.numerics.linalg import small_solve, solve_in_turn
 from jaxvib.steady.orbits.newton import Linearized, newton
 from jaxvib.steady.orbits.stability import deflate
 
-__all__ = [
-    "PeriodicScene",
-    "WholeMotion",
-    "body_counts",
-    "collocation_error",
-    "is_forced",
-    "multipliers_of",
-    "periodic_scene",
-    "solve_whole",
-    "state_of",
-]
-
 
 def body_counts(scene: Scene) -> tuple[int, ...]:
     """Return for each exciter the number of its bodies: its loads; or a motor's rotor; or none, if an ideal drive turns it."""
