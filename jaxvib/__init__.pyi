@@ -56,6 +56,15 @@ from jaxvib.steady.jams.phase_search import PhaseJams, phase_jams
 from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus
 from jaxvib.steady.shapes import ModeShapes, mode_shapes
 
+# Synchronous regimes
+from jaxvib.steady.regimes.synchronous import (
+    RegimeSearchStatus,
+    RegimeStatus,
+    SynchronousRegime,
+    SynchronousRegimes,
+    synchronous_regimes,
+)
+
 # Exact jams
 from jaxvib.steady.orbits.diagram import ExactBranches
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
@@ -212,6 +221,12 @@ __all__ = [
     "PhaseJam",
     "PhaseStatus",
     "PhasePattern",
+    # Synchronous regimes
+    "synchronous_regimes",
+    "SynchronousRegimes",
+    "SynchronousRegime",
+    "RegimeStatus",
+    "RegimeSearchStatus",
     # Exact jams
     "jam_orbit",
     "Orbit",

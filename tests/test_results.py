@@ -45,6 +45,17 @@ ROTOR = jv.Scene(
     jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04),
     jv.ConstantSpeed(460.0),
 )
+SCREEN = jv.Scene(
+    jv.plane_body(
+        mass=300.0,
+        inertia=75.0,
+        supports=[jv.support(at=(x, 0.0), stiffness=(3e3, 3e3), damping=(150.0, 150.0)) for x in (-0.6, 0.6)],
+    ),
+    exciters=[
+        jv.Exciter(drive=jv.InductionMotor(100.0, 60.0, 0.1, 0.05), unbalance=0.4, at=(x, 0.0), direction=way)
+        for x, way in ((-0.6, 1), (0.6, -1))
+    ],
+)
 ROD = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
 
 
@@ -123,6 +134,8 @@ RESULTS = {
     "Orbit": lambda: jv.jam_orbit(SCENE, mode=1),
     "PhaseJams": cached(lambda: jv.phase_jams(ROTOR, starts=4)),
     "PhaseJam": lambda: RESULTS["PhaseJams"]().select(0),
+    "SynchronousRegimes": cached(lambda: jv.synchronous_regimes(SCREEN)),
+    "SynchronousRegime": lambda: RESULTS["SynchronousRegimes"]().select(0),
     "PhaseBranch": lambda: phase_branch(ROTOR, RESULTS["PhaseJams"]().select(0), jnp.array([150.0, 172.0])),
     "CharacteristicSpeeds": lambda: characteristic_speeds(SCENE),
     "Criterion": lambda: jv.criterion(SCENE),
@@ -159,7 +172,7 @@ RESULTS = {
 
 # fmt: off
 SEVERAL_PANELS = ["Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-                  "BalancedStates", "Swing", "Identified", "RunUps", "Audit"]
+                  "BalancedStates", "Swing", "Identified", "RunUps", "Audit", "SynchronousRegimes"]
 # fmt: on
 
 

@@ -84,6 +84,7 @@ _GROUPS = {
         "modes": "modes",
         "criterion": "criterion",
         "whirl": "whirl",
+        "regimes": "motion.regimes",
         "stability-map": "motion.stability",
         "onset": "motion.stability",
     },

@@ -32,6 +32,13 @@ circle (two equal directions), e^T B A = 0 and the averaged equations are exact.
 The equilibria are exactly the leading-order jams: V = i Omega Y and A = -Omega^2 Y turn the equations into those of
 `steady_displacement` and `jam_rotor_speed`. Gravity and every other potential of the load's angle have mean torque 0.
 
+**Several exciters.** The same equations hold for every rotating mass, a load or an unbalanced rotor, in either direction: its
+angle in the fixed frame is sigma phi with sigma = +1 (anticlockwise) or -1, and e = (1, -i sigma). The motor of an unbalance
+gives the torque T(w) in place of that of the drag, and I is the inertia of its rotor; under an ideal drive I is infinite. All
+exciters share the amplitudes Y and V. A set of amplitudes Y_k for each exciter, Y_k' = V_k - i w_k Y_k, describes the same
+motion with Y = sum_k Y_k e^{i psi_k}, because the equations are linear in them. The rotation of a housing with the machine,
+which changes the torque of a motor by -T'(w) c q', is left out.
+
 Source: the method of averaging, N. N. Bogoliubov, Yu. A. Mitropolsky, Asymptotic Methods in the Theory of Non-linear
 Oscillations, 1961; I. I. Blekhman, Synchronization in Science and Technology, 1988. The averaged equations are (1), (2) of the
 antiphase paper in general form.
@@ -39,33 +46,31 @@ antiphase paper in general form.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from typing import cast
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import LinearModel, linear_model, turning_loads
+from jaxvib.equations.linear import LinearModel, linear_model, require_circular, require_terms, turning_loads
 from jaxvib.equations.state import State
+from jaxvib.errors import InputError, within
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.terms import GravityField, LoadPotential
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.mount import Mount
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.linalg import eigenvalues_in_turn, magnitude, small_solve, times, unrolled_inverse
-
-__all__ = [
-    "AVERAGED_TERMS",
-    "Amplitudes",
-    "Averaged",
-    "amplitudes_of",
-    "averaged_field",
-    "averaged_growth",
-    "averaged_loads",
-    "averaged_model",
-    "mean_torque",
-]
 
 AVERAGED_TERMS = (GravityField, LoadPotential)
 """Terms that the averaged equations include: potentials, whose mean torque is 0."""
+
+LATE = math.inf
+"""Time after all changes of the drives, s, at which steady motions are computed."""
 
 _CIRCLE = (1.0, -1.0j)
 
@@ -101,9 +106,12 @@ class Averaged(eqx.Module):
     """Averaged equations of a scene for time integration; a pure function of time (s) and `Amplitudes`.
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), where M includes the loads' masses
-    - `port` (levers, np, nd): B and, if loads have stations, T; `input_matrix`: M^-1 times their transposes, (levers, np, nd)
-    - `levers` g (levers, count): 1 and, if loads have stations, s_j in m
-    - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s, all (count,)
+    - `port` (levers, np, nd): B and, if loads have stations, T, of each exciter; `input_matrix`: M^-1 times their transposes,
+      (levers, np, nd)
+    - `levers` g (levers, count): 1 and, if loads have stations, s_j in m; 0 for the rows of other exciters
+    - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s of each rotating mass, all (count,)
+    - of each exciter: `drives`; `counts`, the number of its loads, 0 for an unbalance; `directions` of rotation
+    - `owners` (levers,): the exciter of each row of `levers`
     """
 
     stiffness: Array
@@ -115,17 +123,28 @@ class Averaged(eqx.Module):
     unbalance: Array
     inertia: Array
     drag: Array
-    drive: Drive
+    drives: tuple[Drive, ...]
     axes: tuple[int, ...] = eqx.field(static=True)
+    counts: tuple[int, ...] = eqx.field(static=True)
+    directions: tuple[int, ...] = eqx.field(static=True)
+    owners: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def is_prescribed(self) -> np.ndarray:
+        """True for the unbalances under ideal drives, whose speed is prescribed, (count,)."""
+        each = [[count == 0 and drive.ideal] * max(count, 1) for count, drive in zip(self.counts, self.drives, strict=True)]
+        return np.concatenate(each)
 
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
         """Return the time derivative of `state` at time `t`."""
-        n = self.drive.rotor_speed(t, None)
+        speeds = self.rotor_speeds(t, state.rate)
         at = jnp.cos(state.phase) + 1j * jnp.sin(state.phase)
-        free = self.drag * (n - state.rate) / self.inertia
+        free = self.driving_torque(t, speeds, state.rate) / self.inertia
+        if any(self.is_prescribed):
+            free = free + self._prescribed_acceleration(t)
         unforced = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
-            unforced = unforced - n * times(self.gyroscopic, state.velocity)
+            unforced = unforced - self.gyroscopic_speed(speeds) * times(self.gyroscopic, state.velocity)
 
         circle, levers = self._circle(), self.levers
         push = jnp.sum(self.input_matrix * circle, axis=1)
@@ -150,6 +169,42 @@ class Averaged(eqx.Module):
             phase=state.rate - turn.imag,
         )
 
+    def rotor_speeds(self, t: Array, rate: Array) -> list[Array]:
+        """Return the speed of each exciter's rotor in its direction, rad/s, from the rates (count,) of the rotating masses."""
+        begins = np.cumsum([0, *(max(count, 1) for count in self.counts)])
+        return [
+            drive.rotor_speed(t, None if drive.ideal else (jnp.zeros_like(t), rate[begin]))
+            for drive, begin in zip(self.drives, begins, strict=False)
+        ]
+
+    def gyroscopic_speed(self, speeds: Sequence[Array]) -> Array:
+        """Return the mean of the rotors' `speeds`, anticlockwise, by which the gyroscopic matrix is multiplied, rad/s."""
+        turned = [n if way == 1 else -n for way, n in zip(self.directions, speeds, strict=True)]
+        return turned[0] if len(turned) == 1 else sum(turned[1:], turned[0]) / len(turned)
+
+    def driving_torque(self, t: Array, speeds: Sequence[Array], rate: Array) -> Array:
+        """Return the torque of the drag on each load and of the motor on each unbalance, (count,) N m.
+
+        It is 0 for an unbalance of prescribed speed. `t`, s; `speeds` of the rotors, see `rotor_speeds`; `rate` (count,) rad/s.
+        """
+        if len(self.drives) == 1 and self.counts[0]:
+            return self.drag * (speeds[0] - rate)
+        torques, begin = [], 0
+        for drive, count, n in zip(self.drives, self.counts, speeds, strict=True):
+            here = slice(begin, begin + max(count, 1))
+            motor = drive.torque_and_inertia(t, n)
+            torques.append(self.drag[here] * (n - rate[here]) if count or motor is None else motor[0][None])
+            begin = here.stop
+        return jnp.concatenate(torques)
+
+    def _prescribed_acceleration(self, t: Array) -> Array:
+        """Return the accelerations of the masses of prescribed speed, 0 for others, (count,) rad/s^2."""
+        each = []
+        for drive, count in zip(self.drives, self.counts, strict=True):
+            change = None if count else drive.rotor_acceleration(t)
+            each.append(jnp.zeros(max(count, 1), self.drag.dtype) if change is None else change[None])
+        return jnp.concatenate(each)
+
     def ripple(self, state: Amplitudes) -> Array:
         """Return the amplitude of each load's angle under the dropped torque, (count,) rad.
 
@@ -164,12 +219,31 @@ class Averaged(eqx.Module):
 
     def _circle(self) -> Array:
         """Return e, a row for each direction of the port."""
-        return jnp.asarray([_CIRCLE[axis] for axis in self.axes])[None, :, None]
+        if set(self.directions) == {1}:
+            return jnp.asarray([_CIRCLE[axis] for axis in self.axes])[None, :, None]
+        ways = [self.directions[owner] for owner in self.owners]
+        return jnp.asarray([[(1.0, -1j * way)[axis] for axis in self.axes] for way in ways])[:, :, None]
 
 
 def averaged_loads(scene: Scene) -> CircularLoads:
     """Return the loads of a scene that the averaged equations include. **Raises** `InputError` as `turning_loads`."""
     return turning_loads(scene, AVERAGED_TERMS)
+
+
+def require_rotating_masses(scene: Scene) -> None:
+    """Require that each exciter of a scene has an unbalance, or loads on circles with an ideal drive, and allowed effects.
+
+    **Raises** `InputError` for other exciters and for effects with terms other than `AVERAGED_TERMS`.
+    """
+    for k, exciter in enumerate(scene.exciters):
+        with within(scene.place_of(k)):
+            if exciter.loads is None:
+                continue
+            if exciter.unbalance is not None:
+                problem = "is given beside loads; this theory has either an unbalance or loads on a rotor: simulate both"
+                raise InputError("unbalance", problem)
+            require_circular(exciter.loads, exciter.drive)
+    require_terms(scene.all_effects, AVERAGED_TERMS)
 
 
 def averaged_field(scene: Scene) -> Averaged:
@@ -193,58 +267,105 @@ def averaged_field(scene: Scene) -> Averaged:
 
 def averaged_model(model: LinearModel) -> Averaged:
     """Return `averaged_field` of a scene that is already assembled and validated."""
-    carrier, mount, loads, drive = model.carrier, model.mount, turning_loads(model.scene), model.scene.drive
-    one = jnp.ones((1, loads.count), dtype=model.mass.dtype)
-    levers = jnp.concatenate([one if lever is None else lever[None] for lever in mount.levers])
-    port = jnp.concatenate([rows[None] for rows in mount.rows[: len(mount.levers)]])
-    n = carrier.mass.shape[0]
+    carrier, mounts, exciters = model.carrier, model.mounts, model.scene.exciters
+    levers = [_levers(exciter, mount, model.mass.dtype) for exciter, mount in zip(exciters, mounts, strict=True)]
+    port = jnp.concatenate([rows[None] for mount in mounts for rows in mount.rows[: len(mount.levers)]])
+    n, gyroscopic = carrier.mass.shape[0], mounts[0].gyroscopic
     parts = [carrier.stiffness, carrier.damping, port.reshape(-1, n).T]
-    parts += [] if mount.gyroscopic is None else [mount.gyroscopic]
+    parts += [] if gyroscopic is None else [gyroscopic]
     solved = small_solve(model.mass, jnp.concatenate(parts, axis=1))
     p = port.shape[0] * port.shape[1]
+    stiffness, damping = solved[:, :n], solved[:, n : 2 * n]
+    solved_gyroscopic = None if gyroscopic is None else solved[:, 2 * n + p :]
+    input_matrix = solved[:, 2 * n : 2 * n + p].T.reshape(port.shape)
+    numbers = (_rotating_masses(exciter, model.mass.dtype) for exciter in exciters)
+    unbalance, inertia, drag = (parts[0] if len(parts) == 1 else jnp.concatenate(parts) for parts in zip(*numbers, strict=True))
+    return Averaged(
+        stiffness=stiffness,
+        damping=damping,
+        gyroscopic=solved_gyroscopic,
+        input_matrix=input_matrix,
+        port=port,
+        levers=levers[0] if len(levers) == 1 else _block_diagonal(levers),
+        unbalance=unbalance,
+        inertia=inertia,
+        drag=drag,
+        drives=tuple(exciter.drive for exciter in exciters),
+        axes=mounts[0].axes,
+        counts=tuple(0 if exciter.loads is None else exciter.loads.count for exciter in exciters),
+        directions=tuple(exciter.direction for exciter in exciters),
+        owners=tuple(k for k, mount in enumerate(mounts) for _ in mount.levers),
+    )
+
+
+def _levers(exciter: Exciter, mount: Mount, dtype: jnp.dtype) -> Array:
+    """Return the levers (levers, count) of the rotating masses of an exciter."""
+    one = jnp.ones((1, 1 if exciter.loads is None else exciter.loads.count), dtype=dtype)
+    return jnp.concatenate([one if lever is None else lever[None] for lever in mount.levers])
+
+
+def _rotating_masses(exciter: Exciter, dtype: jnp.dtype) -> tuple[Array, Array, Array]:
+    """Return unbalances S, inertias I and drags D (count,) of the rotating masses of an exciter."""
+    if exciter.loads is None:
+        motor = exciter.drive.torque_and_inertia(jnp.asarray(LATE), exciter.drive.speed)
+        numbers = exciter.unbalance, jnp.inf if motor is None else motor[1], 0.0
+        unbalance, inertia, drag = (jnp.reshape(jnp.asarray(x, dtype), (1,)) for x in numbers)
+        return unbalance, inertia, drag
+    loads = cast(CircularLoads, exciter.loads)
 
     def each(value: Array) -> Array:
         return jnp.broadcast_to(value, (loads.count,))
 
-    return Averaged(
-        stiffness=solved[:, :n],
-        damping=solved[:, n : 2 * n],
-        gyroscopic=None if mount.gyroscopic is None else solved[:, 2 * n + p :],
-        input_matrix=solved[:, 2 * n : 2 * n + p].T.reshape(port.shape),
-        port=port,
-        levers=levers,
-        unbalance=each(loads.mass * loads.radius),
-        inertia=each(loads.inertia_factor() * loads.mass * loads.radius**2),
-        drag=each(loads.drag * loads.radius**2),
-        drive=drive,
-        axes=mount.axes,
-    )
+    unbalance = each(loads.mass * loads.radius)
+    inertia = each(loads.inertia_factor() * loads.mass * loads.radius**2)
+    return unbalance, inertia, each(loads.drag * loads.radius**2)
 
 
-def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: Array) -> Array:
-    """Return the growth rate of small disturbances of a jam, 1/s.
+def _block_diagonal(blocks: Sequence[Array]) -> Array:
+    width = sum(block.shape[1] for block in blocks)
+    begins = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    rows = [jnp.pad(b, ((0, 0), (at, width - at - b.shape[1]))) for b, at in zip(blocks, begins, strict=False)]
+    return jnp.concatenate(rows)
 
-    It is the largest real part of the eigenvalues of the averaged equations, linearized about the jam. The eigenvalue 0 of a
-    common shift of all phases is left out. The result is NaN if the jam is not finite.
 
-    **Arguments**: `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The speed of the
-    drive is constant.
+def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: Array, neutral: Array | int = 1) -> Array:
+    """Return the growth rate of small disturbances of rotating masses that turn at one speed, 1/s.
+
+    It is the largest real part of the eigenvalues of the averaged equations, linearized about the motion. The eigenvalue 0 of a
+    common shift of all phases is left out. The result is NaN if the motion is not finite.
+
+    **Arguments**
+
+    - `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The drives have constant speed,
+      or their torque is a function of the speed
+    - `neutral`: number of eigenvalues 0 to leave out, 1 and one for each direction of a family of motions
     """
     nd, count = displacement.shape[0], phase.shape[0]
+    free = np.flatnonzero(~field.is_prescribed)
 
     def flow(x: Array) -> Array:
         y = x[: 2 * nd] + 1j * x[2 * nd : 4 * nd]
-        change = field(jnp.zeros_like(omega), Amplitudes(y[:nd], y[nd:], x[4 * nd : 4 * nd + count], x[4 * nd + count :]))
+        w, psi = x[4 * nd : 4 * nd + free.size], x[4 * nd + free.size :]
+        rate = w if free.size == count else jnp.full_like(psi, omega).at[free].set(w)
+        change = field(jnp.full_like(omega, LATE), Amplitudes(y[:nd], y[nd:], rate, psi))
         rates = jnp.concatenate([change.displacement, change.velocity])
-        return jnp.concatenate([rates.real, rates.imag, change.rate, change.phase])
+        return jnp.concatenate([rates.real, rates.imag, change.rate[free], change.phase])
 
     y = jnp.concatenate([displacement, 1j * omega * displacement])
-    matrix = jax.jacfwd(flow)(jnp.concatenate([y.real, y.imag, jnp.full_like(phase, omega), phase]))
+    matrix = jax.jacfwd(flow)(jnp.concatenate([y.real, y.imag, jnp.full_like(phase[free], omega), phase]))
+    return largest_growth(matrix, neutral)
+
+
+def largest_growth(matrix: Array, neutral: Array | int) -> Array:
+    """Return the largest real part of the eigenvalues of a matrix, 1/s, without the `neutral` ones closest to 0.
+
+    The result is NaN if the matrix is not finite.
+    """
     # The library routine for eigenvalues does not return for a matrix that is not finite.
     finite = jnp.all(jnp.isfinite(matrix))
     values = eigenvalues_in_turn(jnp.where(finite, matrix, 0.0))
-    common = jnp.argmin(jnp.abs(values))
-    growth = jnp.max(jnp.where(jnp.arange(values.shape[0]) == common, -jnp.inf, values.real))
+    rank = jnp.argsort(jnp.argsort(jnp.abs(values)))
+    growth = jnp.max(jnp.where(rank < neutral, -jnp.inf, values.real))
     return jnp.where(finite, growth, jnp.nan)
 
 

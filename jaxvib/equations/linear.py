@@ -15,6 +15,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.modal import ModalResponse, modal_response
 from jaxvib.equations.model import Model, assemble
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import (
     ContactFriction,
@@ -24,7 +25,7 @@ from jaxvib.machine.effects.terms import (
     RotorImbalance,
     Term,
 )
-from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.loads import CircularLoads, Loads
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
@@ -41,28 +42,6 @@ from jaxvib.numerics.linalg import (
 from jaxvib.results.status import failure
 from jaxvib.runtime.programs import cached
 from jaxvib.units.known import when_known
-
-__all__ = [
-    "JAM_TERMS",
-    "TURNING_TERMS",
-    "FrequencyStatus",
-    "JammedModel",
-    "LinearModel",
-    "circular_loads",
-    "estimated_frequencies",
-    "jammed_loads",
-    "jammed_model",
-    "linear_model",
-    "natural_frequencies",
-    "peak_force",
-    "require_drag",
-    "require_one_point",
-    "require_terms",
-    "steady_displacement",
-    "turning",
-    "turning_loads",
-]
-
 
 TURNING_TERMS = (GravityField, LoadPotential, LoadInteraction, RotorImbalance)
 """Terms that analyses of turning loads include.
@@ -296,9 +275,13 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     return jammed_model(scene).displacement(omega, speed)
 
 
-def turning(mount: Mount) -> Array:
-    """Return e (np,): a point on a unit circle with angle w t moves by Re(e exp(i w t)) in the mount's directions."""
-    return jnp.asarray([(1.0, -1.0j)[axis] for axis in mount.axes])
+def turning(mount: Mount, direction: int = 1) -> Array:
+    """Return e (np,): a point on a unit circle with angle w t, clockwise -w t, moves by Re(e exp(i w t)) in the mount's
+    directions.
+
+    `direction` is +1 anticlockwise, -1 clockwise.
+    """
+    return jnp.asarray([(1.0, -1.0j if direction == 1 else 1.0j)[axis] for axis in mount.axes])
 
 
 def peak_force(force: Array) -> Array:
@@ -366,6 +349,13 @@ def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[Circ
             "rotates with the housing of its exciter, which this function does not include: use simulate, settle or ensemble"
         )
         raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
+    require_circular(loads, drive)
+    require_terms(scene.all_effects, included)
+    return cast(CircularLoads, loads), mount
+
+
+def require_circular(loads: Loads, drive: Drive) -> None:
+    """**Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`."""
     if not loads.circular:
         holds = "this function needs loads on a circle (property circular): ball, roller, pendulum"
         raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {holds}; use simulate for others")
@@ -375,8 +365,6 @@ def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[Circ
             f"is {quoted(drive.kind)}; this function needs a prescribed rotor speed (property ideal): "
             "use ConstantSpeed, or simulate",
         )
-    require_terms(scene.all_effects, included)
-    return cast(CircularLoads, loads), mount
 
 
 def require_terms(

@@ -275,6 +275,18 @@ def _eigenvectors_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tu
     return jax.lax.map(eigenvectors_in_turn, matrix), (True, True)
 
 
+@custom_vmap
+def svd_in_turn(matrix: Array) -> tuple[Array, Array, Array]:
+    """Singular value decomposition U, s, V^T of a matrix (n, n), see `eigenvalues_in_turn`."""
+    left, values, right = jnp.linalg.svd(matrix)
+    return left, values, right
+
+
+@svd_in_turn.def_vmap
+def _svd_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[tuple[Array, ...], tuple[bool, ...]]:
+    return jax.lax.map(svd_in_turn, matrix), (True, True, True)
+
+
 def refine_solution(product: Callable[[Array], Array], nearly: Callable[[Array], Array], b: Array, norm: Array) -> Array:
     """x of A x = b, with A x = `product`(x), its approximate inverse `nearly` and its row-sum `norm`.
 

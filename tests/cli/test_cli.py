@@ -371,3 +371,18 @@ def test_interrupts_end_a_command_whose_threads_compile():
     """An interrupted `join` marks its thread as finished, so that an orderly exit would crash in the compiler."""
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=600.0)
     assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "answered", "")
+
+
+def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
+    springs = [jv.support(at=(x, 0.0), stiffness=(3e3, 3e3), damping=(150.0, 150.0)) for x in (-0.6, 0.6)]
+    motor = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
+    ends = ((-0.6, 1), (0.6, -1))
+    exciters = [jv.Exciter(drive=motor, unbalance=0.4, at=(x, 0.0), direction=way) for x, way in ends]
+    screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    jv.save_scene(jv.Scene(screen, exciters=exciters), tmp_path / "screen.toml")
+    code, out, _ = typed("regimes", "screen.toml", "--json", "--out", "o")
+    regimes = json.loads(out)["regimes"]
+    assert code == 0 and [regime["stable"] for regime in regimes] == [True, False]
+    np.testing.assert_allclose(np.abs([regime["phases"][1] for regime in regimes]), [np.pi, 0.0], atol=1e-9)
+    assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
+    assert "954.887" in typed("regimes", "screen.toml")[1]

@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import averaged_growth
+from jaxvib.equations.torque_balance import TorqueBalance, assemble_torque_balance, influence_of
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -34,9 +35,6 @@ from jaxvib.steady.jams.phase_starts import (
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     PhaseJam,
-    TorqueBalance,
-    assemble_torque_balance,
-    influence_of,
     jam_from,
     loads_with_drag,
     phase_jam,

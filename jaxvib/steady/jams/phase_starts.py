@@ -12,12 +12,13 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.equations.torque_balance import TorqueBalance, influence_of, torques_at
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
-from jaxvib.steady.jams.phases import TorqueBalance, influence_of, solve_balance, torques_at
+from jaxvib.steady.jams.phases import solve_balance
 
 LOAD_SPEEDS = 240
 """Number of load speeds at which phases are searched, besides those near resonances."""
@@ -122,7 +123,8 @@ def _cluster_balance(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalan
     levers = on_device(np.asarray(averaged.levers)[:, first])
     averaged = eqx.tree_at(lambda a: (a.unbalance, a.drag, a.inertia, a.levers), averaged, (*scaled, levers))
     direction = on_device(np.asarray(balance.direction)[first])
-    return eqx.tree_at(lambda b: (b.averaged, b.direction), balance, (averaged, direction))
+    motor_torque = on_device(np.asarray(balance.motor_torque)[first])
+    return eqx.tree_at(lambda b: (b.averaged, b.direction, b.motor_torque), balance, (averaged, direction, motor_torque))
 
 
 def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

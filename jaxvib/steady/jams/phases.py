@@ -13,15 +13,23 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import speed_text
-from jaxvib.equations.averaged import Averaged, averaged_growth, averaged_model, mean_torque
-from jaxvib.equations.linear import JAM_TERMS, LinearModel, linear_model, peak_force, require_drag, turning, turning_loads
+from jaxvib.equations.averaged import averaged_growth
+from jaxvib.equations.linear import JAM_TERMS, peak_force, require_drag, turning_loads
+from jaxvib.equations.torque_balance import (
+    TorqueBalance,
+    assemble_torque_balance,
+    balance_residuals,
+    influence_of,
+    motion_of,
+    torques_at,
+    unknowns_of,
+)
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, times
+from jaxvib.numerics.linalg import eliminate, magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
@@ -123,60 +131,6 @@ class PhaseJam(AbstractPhaseJam):
         return phase_circles([(speed_text(self.omega, 4), np.asarray(self.phase))], ax=ax)
 
 
-class TorqueBalance(eqx.Module):
-    """Balance of the mean torques on the loads of a scene.
-
-    **Attributes**: the linear `model`; the `averaged` equations at the rotor speed of the scene; `direction` (count, nd),
-    complex: generalized force of each load per unit of its centrifugal force.
-    """
-
-    model: LinearModel
-    averaged: Averaged
-    direction: Array
-
-    @property
-    def unbalance(self) -> Array:
-        """S = m R of each load, (count,) kg m."""
-        return self.averaged.unbalance
-
-    @property
-    def drag(self) -> Array:
-        """b_W R^2 of each load, (count,) N m s."""
-        return self.averaged.drag
-
-    @property
-    def speed(self) -> Array:
-        """Rotor speed, rad/s."""
-        return self.averaged.drive.speed
-
-
-def assemble_torque_balance(scene: Scene) -> TorqueBalance:
-    """Assemble the torque balance of a scene."""
-    model, loads = linear_model(scene), turning_loads(scene)
-    averaged, rows = averaged_model(model), model.mount.load_rows(loads.count)
-    return TorqueBalance(
-        model=model,
-        averaged=eqx.tree_at(lambda field: field.drive, averaged, ConstantSpeed(scene.drive.speed)),
-        direction=jnp.einsum("jka,k->ja", rows, turning(model.mount)),
-    )
-
-
-def influence_of(balance: TorqueBalance, omega: Array) -> tuple[Array, Array]:
-    """Return the influence coefficients of the loads.
-
-    **Returns** A_jk (count, count), complex: response at load j per centrifugal force of load k; and D^-1 P^T (nd, count):
-    response of the carrier.
-    """
-    dynamic = balance.model.dynamic_stiffness(omega, balance.speed)
-    answer = small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
-    return balance.direction.conj() @ answer, answer
-
-
-def torques_at(balance: TorqueBalance, influence: Array, omega: Array, turn: Array) -> Array:
-    """Return torques (count,) N m of `phase_torques` from influence coefficients (count, count) and exp(i a) (count,)."""
-    return mean_torque(balance.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, balance.unbalance * turn))
-
-
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     """Return the mean torque (count,) N m of the vibration on loads that turn at `omega` (scalar, rad/s), at `phase` (count,).
 
@@ -251,18 +205,15 @@ def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_numb
     """
 
     def residuals(x: Array, given: TorqueBalance) -> tuple[Array, None]:
-        w = x[0] * jax.lax.stop_gradient(given.speed)
-        angles = jnp.concatenate([jnp.zeros(1, x.dtype), x[1:]])
-        turn = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
-        torque = torques_at(given, influence_of(given, w)[0], w, turn)
-        return ((given.speed - w) + torque / given.drag) / given.speed, None
+        return balance_residuals(x, given), None
 
     frozen = jax.lax.stop_gradient(balance)
-    start = jnp.concatenate([jnp.reshape(omega / balance.speed, (1,)), phase[1:] - phase[0]])
-    x, _ = damped_newton(residuals, jax.lax.stop_gradient(start), frozen, on_numbers=on_numbers)
+    start = jax.lax.stop_gradient(unknowns_of(balance, omega, phase))
+    x, _ = damped_newton(residuals, start, frozen, on_numbers=on_numbers)
     # One more Newton step: its derivative with respect to the scene is that of the implicit function theorem.
-    x = x - eliminate(jax.jacfwd(residuals, has_aux=True)(x, frozen)[0], residuals(x, balance)[0])
-    return x[0] * frozen.speed, jnp.concatenate([jnp.zeros(1, x.dtype), jnp.arctan2(jnp.sin(x[1:]), jnp.cos(x[1:]))])
+    x = x - eliminate(jax.jacfwd(balance_residuals)(x, frozen), balance_residuals(x, balance))
+    w, angles = motion_of(balance, x)
+    return w, jnp.concatenate([angles[:1], jnp.arctan2(jnp.sin(angles[1:]), jnp.cos(angles[1:]))])
 
 
 @cached

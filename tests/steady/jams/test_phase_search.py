@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.equations.torque_balance import assemble_torque_balance
 from jaxvib.steady.jams import phase_search
 from jaxvib.steady.jams.phase_search import _contains_jam, phase_branch
 from jaxvib.steady.jams.phase_starts import equal_loads
-from jaxvib.steady.jams.phases import PhaseStatus, assemble_torque_balance, jam_from, phase_jam
+from jaxvib.steady.jams.phases import PhaseStatus, jam_from, phase_jam
 
 MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
 SCENE = jv.Scene(MACHINE, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))

@@ -1,0 +1,62 @@
+"""jaxvib regimes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.output import CSV, fields_of
+
+
+@app.command("regimes")
+@click.argument("scene", type=click.Path(path_type=Path))
+@WITHOUT
+@CSV
+@shared
+def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
+    """List every way in which the exciters of SCENE can turn with one speed; --out adds a picture of their phases."""
+    from jaxvib.results.status import status_name  # slow imports, which --help does not need
+    from jaxvib.steady.jams.phases import degrees
+
+    found = jv.synchronous_regimes(loaded_scene(scene, without))
+    each = [found.select(k) for k in range(found.speed.shape[0])]
+    output.picture("regimes.png", found.plot)
+    output.csv(csv, found, "regime")
+    document = {
+        "judged": "by the growth of small disturbances of the averaged motion",
+        "search": status_name(found.search),
+        "regimes": [
+            {
+                "status": regime.message,
+                **fields_of(regime, "speed", "phases", "stable", "growth", "quasi_static", "margin"),
+                **fields_of(regime, "torque", "vibrational_torque", "power", "can_start", "amplitude", "foundation_force"),
+            }
+            for regime in each
+        ],
+    }
+
+    def text() -> str:
+        from jaxvib.display import speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
+        rows = [
+            [
+                f"{scale * float(regime.speed):.6g}",
+                "stable" if regime.stable else "unstable",
+                "family" if status_name(regime.status) == "degenerate" else "",
+                " ".join(f"{degrees(float(a)):.4g}" for a in regime.phases),
+                f"{float(regime.margin):.4g}",
+                " ".join(f"{float(p):.4g}" for p in regime.power),
+                f"{float(regime.foundation_force):.4g}",
+            ]
+            for regime in each
+        ]
+        if not rows:
+            return found.summary()
+        head = [unit, "", " ", "phases, degrees", "margin", "power, W", "foundation force, N"]
+        return table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
+
+    output.done(document, text, "regimes", found)

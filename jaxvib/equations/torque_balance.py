@@ -1,0 +1,178 @@
+"""Balance of the mean torques on rotating masses that turn with one speed: influence coefficients, vibrational torques.
+
+The angle of rotating mass k in the fixed frame is th_k = sigma_k (Omega t + alpha_k), with sigma_k = +1 anticlockwise, -1
+clockwise, and e_k = (1, -i sigma_k). B_k (np, nd) are the rows of its point, S_k is its unbalance, and L_k its driving torque:
+that of the drag on a load, T(Omega) of the motor of an unbalance. With D(w) = K - w^2 M + i w (C + n G),
+
+    H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k
+    V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
+    L_i(Omega) + V_i = 0,       q = Re(Y exp(i Omega t)),     Y = Omega^2 D^-1 sum_k B_k^T e_k S_k exp(i alpha_k)
+
+Source: the averaged equations (`jaxvib.equations.averaged`) at rest; I. I. Blekhman, Synchronization in Science and Technology,
+1988, for unbalances; Artyunin 2013 for pendulums.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
+from jaxvib.equations.linear import LinearModel, linear_model, turning
+from jaxvib.machine.drive import ConstantSpeed, Drive
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.linalg import small_solve, times
+
+_TORQUE_POINTS = 33
+"""Number of speeds from 0 to the working speed at which the largest torque of a motor is read."""
+
+
+class TorqueBalance(eqx.Module):
+    """Balance of the mean torques on the rotating masses of a scene.
+
+    **Attributes**: the linear `model`; the `averaged` equations at the working speed of ideal drives; `direction` (count, nd),
+    complex: generalized force of each mass per unit of its centrifugal force; `motor_torque` (count,) N m, the
+    largest torque of the motor of an unbalance from rest to its working speed, 1 without a torque, 0 for a load.
+    """
+
+    model: LinearModel
+    averaged: Averaged
+    direction: Array
+    motor_torque: Array
+
+    @property
+    def unbalance(self) -> Array:
+        """S = m R of each mass, (count,) kg m."""
+        return self.averaged.unbalance
+
+    @property
+    def drag(self) -> Array:
+        """b_W R^2 of each load, (count,) N m s."""
+        return self.averaged.drag
+
+    @property
+    def speed(self) -> Array:
+        """Largest working speed of a drive, rad/s; of a scene with one exciter its rotor speed."""
+        drives = self.averaged.drives
+        return drives[0].speed if len(drives) == 1 else jnp.max(jnp.stack([drive.speed for drive in drives]))
+
+    @property
+    def is_prescribed(self) -> np.ndarray:
+        """True for the unbalances under ideal drives, (count,)."""
+        return self.averaged.is_prescribed
+
+    def driving_torque(self, omega: Array) -> Array:
+        """Return L (count,) N m at the speed `omega`; 0 for unbalances under ideal drives."""
+        return self.driving_torques(jnp.full_like(self.unbalance, omega))
+
+    def driving_torques(self, rate: Array) -> Array:
+        """Return L (count,) N m of masses that turn at the speeds `rate` (count,)."""
+        return self.averaged.driving_torque(jnp.full_like(rate[0], LATE), self.rotor_speeds(rate), rate)
+
+    def rotor_speeds(self, rate: Array) -> list[Array]:
+        """Return the speed of each exciter's rotor in its direction, from the speeds `rate` (count,) of the masses."""
+        return self.averaged.rotor_speeds(jnp.full_like(rate[0], LATE), rate)
+
+    def dynamic_stiffness(self, omega: Array) -> Array:
+        """Return D(omega) (nd, nd) complex, N/m."""
+        speeds = self.rotor_speeds(jnp.full_like(self.unbalance, omega))
+        return self.model.dynamic_stiffness(omega, self.averaged.gyroscopic_speed(speeds))
+
+    def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
+        """Return `driving_torque`, with all its differences between the masses multiplied by `factor`.
+
+        If an ideal drive turns an unbalance, the torques of all others are multiplied: the ideal drive balances any torque.
+        """
+        torque = self.driving_torque(omega)
+        if factor is None:
+            return torque
+        mean = jnp.zeros_like(omega) if any(self.is_prescribed) else jnp.mean(torque)
+        return mean + factor * (torque - mean)
+
+    @property
+    def torque_scale(self) -> Array:
+        """Size of the driving torques, (count,) N m: D n of a load, the `motor_torque` of an unbalance."""
+        return self.drag * self.speed + self.motor_torque
+
+
+def assemble_torque_balance(scene: Scene) -> TorqueBalance:
+    """Assemble the torque balance of a validated scene."""
+    model = linear_model(scene)
+    averaged = averaged_model(model)
+    directions = []
+    for exciter, mount, count in zip(scene.exciters, model.mounts, averaged.counts, strict=True):
+        rows = mount.load_rows(count) if count else mount.rows[0][None]
+        directions.append(jnp.einsum("jka,k->ja", rows, turning(mount, exciter.direction)))
+    drives = tuple(ConstantSpeed(drive.speed) if drive.ideal else drive for drive in averaged.drives)
+    averaged = eqx.tree_at(lambda field: field.drives, averaged, drives)
+    direction = directions[0] if len(directions) == 1 else jnp.concatenate(directions)
+    return TorqueBalance(model, averaged, direction, _motor_torque(averaged))
+
+
+def _motor_torque(averaged: Averaged) -> Array:
+    """Return the largest torque of each mass's motor, see `TorqueBalance`."""
+    shares, each = jnp.linspace(0.0, 1.0, _TORQUE_POINTS, dtype=averaged.drag.dtype), []
+    for count, drive in zip(averaged.counts, averaged.drives, strict=True):
+
+        def torque(share: Array, drive: Drive = drive) -> Array:
+            motor = drive.torque_and_inertia(jnp.full_like(share, LATE), share * drive.speed)
+            return jnp.ones_like(share) if motor is None else jnp.abs(motor[0])
+
+        most = jnp.max(jax.vmap(torque)(shares))[None]
+        each.append(jnp.zeros(count, shares.dtype) if count else jnp.where(most > 0.0, most, 1.0))
+    return jax.lax.stop_gradient(each[0] if len(each) == 1 else jnp.concatenate(each))
+
+
+def influence_of(balance: TorqueBalance, omega: Array) -> tuple[Array, Array]:
+    """Return the influence coefficients of the rotating masses.
+
+    **Returns** H_jk (count, count), complex: response at mass j per centrifugal force of mass k; and D^-1 P^T (nd, count):
+    response of the carrier.
+    """
+    dynamic = balance.dynamic_stiffness(omega)
+    answer = small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
+    return balance.direction.conj() @ answer, answer
+
+
+def torques_at(balance: TorqueBalance, influence: Array, omega: Array, turn: Array) -> Array:
+    """Return V (count,) N m from influence coefficients (count, count) and exp(i alpha) (count,)."""
+    return mean_torque(balance.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, balance.unbalance * turn))
+
+
+def unknowns_of(balance: TorqueBalance, omega: Array, phase: Array) -> Array:
+    """Return the unknowns of the balance: the speed relative to `TorqueBalance.speed`, and all phases relative to the first.
+
+    If unbalances have a prescribed speed, the unknowns are the phases of the other masses.
+    """
+    if any(balance.is_prescribed):
+        return phase[np.flatnonzero(~balance.is_prescribed)]
+    return jnp.concatenate([jnp.reshape(omega / jax.lax.stop_gradient(balance.speed), (1,)), phase[1:] - phase[0]])
+
+
+def motion_of(balance: TorqueBalance, x: Array) -> tuple[Array, Array]:
+    """Return the speed, rad/s, and the phases (count,) rad from the unknowns of the balance, see `unknowns_of`."""
+    prescribed = balance.is_prescribed
+    if not any(prescribed):
+        return x[0] * jax.lax.stop_gradient(balance.speed), jnp.concatenate([jnp.zeros(1, x.dtype), x[1:]])
+    omega = balance.averaged.drives[_first_prescribed(balance)].speed
+    return omega, jnp.zeros(prescribed.size, x.dtype).at[np.flatnonzero(~prescribed)].set(x)
+
+
+def _first_prescribed(balance: TorqueBalance) -> int:
+    field = balance.averaged
+    return next(k for k, (n, drive) in enumerate(zip(field.counts, field.drives, strict=True)) if n == 0 and drive.ideal)
+
+
+def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = None) -> Array:
+    """Return L_i + V_i of the masses of unknown motion, relative to `TorqueBalance.torque_scale`.
+
+    **Arguments**: `x`, see `unknowns_of`; `factor`, see `TorqueBalance.total_driving_torque`.
+    """
+    w, angles = motion_of(balance, x)
+    turn = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
+    torque = torques_at(balance, influence_of(balance, w)[0], w, turn)
+    residual = (balance.total_driving_torque(w, factor) + torque) / balance.torque_scale
+    return residual[np.flatnonzero(~balance.is_prescribed)] if any(balance.is_prescribed) else residual

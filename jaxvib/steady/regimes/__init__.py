@@ -1,0 +1,1 @@
+"""Synchronous regimes of several exciters: speeds, phases, stability and margins."""

@@ -1,0 +1,195 @@
+"""Search for all synchronous regimes: starts, solutions of the torque balance, and distinct ones among them."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.equations.torque_balance import (
+    TorqueBalance,
+    balance_residuals,
+    influence_of,
+    motion_of,
+    unknowns_of,
+)
+from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.parallel import in_chunks
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.newton import damped_newton
+from jaxvib.steady.regimes.local import slopes_of, vibration_scale
+from jaxvib.steady.regimes.symmetry import Exchange, distinct_regimes, exchanges_of
+
+_EVEN_SPEEDS, _NEAR_SPEEDS = 200, 40
+"""Numbers of speeds at equal distances, and on each side of a resonance or of a drive's working speed."""
+
+_PHASES_PER_UNKNOWN, _MOST_REGULAR = 24, 64
+"""Random sets of phases for each squared number of unknown phases, and largest number of regular sets."""
+
+_STARTS_PER_PROGRAM = 256
+"""Number of starts in one program."""
+
+_MAX_ROUNDS = 3
+"""Number of times that exchanged phases of known regimes are used as starts."""
+
+_ITERATIONS = 60
+"""Maximum number of steps of Newton's method."""
+
+
+def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
+    """Return the speeds (n,) rad/s and phases (n, count) rad of all distinct regimes.
+
+    1. The sum of all torques over the speed is explicit for given phases. Every root of it, for regular and random sets of
+       phases, is a start of Newton's method for the speed and all phases
+    2. Phases of the solutions, exchanged between the masses, mirrored, or turned by half a turn one by one, are further starts
+    3. Regimes that differ by a common turn or by an exchange of equal masses are one regime. Regimes of one speed whose phases
+       can change without a change of torques belong to a family, of which one member is kept
+    """
+    count, speed = balance.unbalance.size, np.asarray(balance.speed)
+    if balance.is_prescribed.all():
+        return np.asarray(motion_of(balance, jnp.zeros(0)))[0][None], np.zeros((1, count), speed.dtype)
+    exchanges, tolerance = exchanges_in(balance), tolerances(speed.dtype)
+    sets, speeds = _sets_of_phases(balance.is_prescribed, speed.dtype), _speeds(balance)
+    known = np.zeros(0, speed.dtype), np.zeros((0, count), speed.dtype), np.zeros(0, int)
+    for _ in range(_MAX_ROUNDS):
+        solved = _solutions(balance, *_starts(balance, speeds, sets))
+        omega, phases, neutral = (np.concatenate(pair) for pair in zip(known, solved, strict=True))
+        before = known[0].size
+        kept = _one_of_each_family(omega, neutral, tolerance[0])
+        kept = kept[distinct_regimes(omega[kept], phases[kept], exchanges, tolerance)]
+        known = omega[kept], phases[kept], neutral[kept]
+        grown = kept[kept >= before]
+        if grown.size == 0 or count == 1:
+            break
+        sets = _related(phases[grown], balance.is_prescribed)
+    return known[:2]
+
+
+def _one_of_each_family(omega: np.ndarray, neutral: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return indices of isolated regimes and of the first member of each family."""
+    kept: list[int] = []
+    for k in np.flatnonzero(neutral):
+        if not any(neutral[i] == neutral[k] and abs(omega[i] - omega[k]) <= tolerance * omega[k] for i in kept):
+            kept.append(int(k))
+    return np.sort(np.concatenate([np.flatnonzero(neutral == 0), np.asarray(kept, dtype=int)]))
+
+
+def tolerances(dtype: np.dtype) -> tuple[float, float]:
+    """Return the differences of speed (relative) and of phase (rad) below which two regimes count as one."""
+    eps = float(np.finfo(dtype).eps)
+    return eps**0.4, eps**0.33
+
+
+def exchanges_in(balance: TorqueBalance) -> list[Exchange]:
+    """Return the exchanges of masses that leave the balance unchanged, see `exchanges_of`."""
+    speeds = float(balance.speed) * np.array([0.31, 0.57, 0.83, 0.99])
+    influence, torque = _data_at(balance, speeds.astype(balance.unbalance.dtype))
+    numbers = [balance.unbalance, balance.averaged.inertia, balance.is_prescribed, *torque]
+    return exchanges_of(influence, np.stack([np.nan_to_num(np.asarray(x, float)) for x in numbers], axis=1))
+
+
+def _data_at(balance: TorqueBalance, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    influence, torque = _at_speeds(balance, on_device(speeds))
+    return np.asarray(influence), np.asarray(torque)
+
+
+@cached
+def _at_speeds(balance: TorqueBalance, speeds: Array) -> tuple[Array, Array]:
+    """Return influence coefficients (n, count, count) and driving torques (n, count) at speeds (n,)."""
+    return jax.vmap(lambda w: (influence_of(balance, w)[0], balance.driving_torque(w)))(speeds)
+
+
+def _speeds(balance: TorqueBalance) -> np.ndarray:
+    """Return speeds up to the largest working speed, dense near resonances and near the working speeds of the drives.
+
+    No regime is faster: there the sum of the driving torques is negative, and the vibration brakes.
+    """
+    drives = np.array([float(drive.speed) for drive in balance.averaged.drives])
+    top = drives.max()
+    resonances = np.asarray(estimated_frequencies(balance.model.scene), float)
+    centres = np.concatenate([drives, resonances[(resonances > 0.0) & (resonances < 1.2 * top)]])
+    apart = np.concatenate([[0.0], np.geomspace(1e-7, 0.3, _NEAR_SPEEDS)])
+    near = [w * (1.0 + side * apart) for w in centres for side in (-1.0, 1.0)]
+    speeds = np.unique(np.concatenate([np.linspace(0.005, 1.01, _EVEN_SPEEDS) * top, *near]))
+    return speeds[speeds < 1.02 * top].astype(balance.unbalance.dtype)
+
+
+def _sets_of_phases(prescribed: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Return regular and random sets of phases (n, count); those of masses of prescribed speed are 0."""
+    count = prescribed.size
+    free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, count)
+    n = free.size
+    halves = np.pi * (np.arange(min(2**n, _MOST_REGULAR))[:, None] >> np.arange(n) & 1)
+    splayed = 2.0 * np.pi / (n + 1) * np.arange(1, n + 1)[:, None] * np.arange(1, n + 1)
+    even = np.linspace(-np.pi, np.pi, _PHASES_PER_UNKNOWN, endpoint=False)[:, None] if n == 1 else np.zeros((0, n))
+    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (_PHASES_PER_UNKNOWN * n * n if n > 1 else 0, n))
+    sets = np.concatenate([halves, splayed, even, random])
+    phases = np.zeros((len(sets), count), dtype)
+    phases[:, free] = sets
+    return phases
+
+
+def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return speeds (n,) and phases (n, count) at which the sum of all torques passes 0, one for each root."""
+    if balance.is_prescribed.any():
+        return np.full(len(sets), np.asarray(balance.speed)), sets
+    influence, torque = _data_at(balance, speeds)
+    forces = np.asarray(balance.unbalance) * np.exp(1j * sets)
+    braking = np.einsum("ai,gik,ak->ag", forces.conj(), influence, forces, optimize=True).imag * speeds**4 / 2.0
+    total = np.sum(torque, axis=1) + braking
+    place, passed = np.nonzero(total[:, :-1] * total[:, 1:] <= 0.0)
+    low, high = total[place, passed], total[place, passed + 1]
+    share = low / np.where(low == high, 1.0, low - high)
+    return (speeds[passed] + share * (speeds[passed + 1] - speeds[passed])).astype(speeds.dtype), sets[place]
+
+
+def _related(phases: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
+    """Return sets of phases that follow from those of regimes (n, count) by exchanges, mirroring and half turns."""
+    count = phases.shape[1]
+    swaps = [np.arange(count)]
+    for i, k in itertools.combinations(range(count), 2):
+        order = np.arange(count)
+        order[[i, k]] = k, i
+        swaps.append(order)
+    swapped = [sign * phases[:, order] for order in swaps for sign in (1.0, -1.0)]
+    turned = [phases + np.pi * (np.arange(count) == k) for k in range(count)]
+    sets = np.concatenate([*swapped, *turned])
+    sets = np.where(prescribed, 0.0, sets if prescribed.any() else sets - sets[:, :1])
+    return np.asarray(sets, phases.dtype)
+
+
+def _solutions(balance: TorqueBalance, omega: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return speeds, phases and numbers of neutral directions of the solutions to which starts (n,), (n, count) lead."""
+    omega, phases, neutral, good = in_chunks(_STARTS_PER_PROGRAM, _solved, omega, phases, shared=(balance,))
+    return omega[good], phases[good], neutral[good]
+
+
+@cached
+def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
+    """Return speeds, phases, numbers of neutral directions, and True for each start that leads to a solution."""
+
+    def one(w: Array, phase: Array) -> tuple[Array, Array, Array, Array]:
+        start = unknowns_of(balance, w, phase)
+        x, _ = damped_newton(
+            lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_numbers=False
+        )
+        w, angles = motion_of(balance, x)
+        good = is_balanced(balance, x)
+        neutral = slopes_of(jnp.where(good, x, start), balance).neutral
+        return w, jnp.arctan2(jnp.sin(angles), jnp.cos(angles)), neutral, good
+
+    return jax.vmap(one)(omega, phases)
+
+
+def is_balanced(balance: TorqueBalance, x: Array) -> Array:
+    """Return True if the unknowns solve the balance, judged by the vibrational torques that are possible at their speed."""
+    free = np.flatnonzero(~balance.is_prescribed)
+    w, _ = motion_of(balance, x)
+    eps = jnp.finfo(x.dtype).eps
+    allowed = eps**0.5 * vibration_scale(balance, w) + 64.0 * eps * balance.torque_scale
+    wrong = jnp.abs(balance_residuals(x, balance)) * balance.torque_scale[free]
+    return jnp.all(wrong < allowed[free]) & (w > 0.0) & (w < 1.01 * balance.speed)

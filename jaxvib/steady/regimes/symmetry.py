@@ -1,0 +1,95 @@
+"""Exchanges of equal exciters that leave a machine unchanged, and regimes that differ only by them."""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+_MOST_MASSES = 7
+"""Largest number of rotating masses for which all exchanges are tried; 7! are 5040."""
+
+
+class Exchange(NamedTuple):
+    """Exchange of masses that leaves the balance unchanged: `order` (count,) and the shifts of phases (count,), rad.
+
+    If alpha is a regime, alpha' with alpha'[order] = alpha + shift is one.
+    """
+
+    order: np.ndarray
+    shift: np.ndarray
+
+
+def exchanges_of(influence: np.ndarray, numbers: np.ndarray) -> list[Exchange]:
+    """Return all exchanges of equal masses that leave the balance unchanged.
+
+    H[order_i, order_k] = exp(i (shift_i - shift_k)) H[i, k] at every speed. Mirror images and rotations of a machine are such
+    exchanges.
+
+    **Arguments**: `influence` H (speeds, count, count) at several speeds; `numbers` (count, m) of each mass, such as its
+    unbalance and its torque at several speeds.
+    """
+    count = influence.shape[1]
+    identity = Exchange(np.arange(count), np.zeros(count))
+    if not 1 < count <= _MOST_MASSES:
+        return [identity]
+    orders = np.array(list(itertools.permutations(range(count))))
+    scale = np.maximum(np.max(np.abs(numbers), axis=0), np.finfo(float).tiny)
+    tolerance = 100.0 * np.finfo(influence.dtype).eps
+    same = np.all(np.abs(numbers[orders] - numbers) <= tolerance * scale, axis=(1, 2))
+    orders = orders[same]
+    turned = influence[:, orders[:, :, None], orders[:, None, :]].transpose(1, 0, 2, 3)
+    size = np.max(np.abs(influence), axis=(1, 2), keepdims=True)
+    tolerance = np.sqrt(tolerance)
+    alike = np.all(np.abs(np.abs(turned) - np.abs(influence)) <= tolerance * size, axis=(1, 2, 3))
+    found = []
+    for order, there in zip(orders[alike], turned[alike], strict=True):
+        shift = _shifts(influence, there, tolerance * size)
+        wanted = np.exp(1j * (shift[:, None] - shift[None, :])) * influence
+        if np.all(np.abs(there - wanted) <= 4.0 * tolerance * size):
+            found.append(Exchange(order, shift))
+    return found
+
+
+def _shifts(influence: np.ndarray, turned: np.ndarray, small: np.ndarray) -> np.ndarray:
+    """Return the shift of each phase from masses that are coupled, one after the other."""
+    count = influence.shape[1]
+    coupled, place = np.abs(influence) > small, np.argmax(np.abs(influence), axis=0)
+    shift, known = np.zeros(count), np.zeros(count, dtype=bool)
+    while not known.all():
+        links = np.argwhere(np.any(coupled, axis=0) & known[:, None] & ~known[None, :])
+        if links.size == 0:
+            known[np.argmin(known)] = True
+            continue
+        i, k = links[0]
+        at = place[i, k], i, k
+        shift[k] = shift[i] - np.angle(turned[at] / influence[at])
+        known[k] = True
+    return shift
+
+
+def distinct_regimes(
+    speed: np.ndarray, phases: np.ndarray, exchanges: list[Exchange], tolerance: tuple[float, float]
+) -> np.ndarray:
+    """Return indices of regimes (n,) of which no two differ only by a common turn, an exchange, or rounding.
+
+    **Arguments**: `speed` (n,), `phases` (n, count); `tolerance` of speeds, relative, and of exp(i alpha).
+    """
+    turn = np.exp(1j * phases)
+    orders, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
+    places = np.argsort(orders, axis=1)
+    kept: list[int] = []
+    for k in np.argsort(-speed, kind="stable"):
+        # All exchanged forms of this regime, (exchanges, count).
+        forms = np.take_along_axis(turn[k] * np.exp(1j * shifts), places, axis=1)
+        near = [i for i in kept if abs(speed[i] - speed[k]) <= tolerance[0] * speed[i]]
+        if not near:
+            kept.append(int(k))
+            continue
+        others = turn[near]
+        common = np.sum(others[:, None] * forms.conj()[None], axis=-1, keepdims=True)
+        common = common / np.where(np.abs(common) > 0.0, np.abs(common), 1.0)
+        if not np.any(np.max(np.abs(others[:, None] - common * forms[None]), axis=-1) < tolerance[1]):
+            kept.append(int(k))
+    return np.asarray(kept, dtype=int)

@@ -1,0 +1,365 @@
+"""Synchronous regimes of several exciters: all of them, or the one near a start, in the averaged theory."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.display import speed_text
+from jaxvib.equations.averaged import averaged_growth, require_rotating_masses
+from jaxvib.equations.linear import peak_force
+from jaxvib.equations.torque_balance import (
+    TorqueBalance,
+    assemble_torque_balance,
+    balance_residuals,
+    influence_of,
+    motion_of,
+    torques_at,
+    unknowns_of,
+)
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.effects.base import total_gravity
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import status_name, status_names
+from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.parallel import in_chunks
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.newton import damped_newton
+from jaxvib.steady.jams.phases import degrees
+from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.steady.regimes.local import implicit_step, margin_of, quasi_static_growth, slopes_of, vibration_scale
+from jaxvib.steady.regimes.search import all_regimes, is_balanced
+from jaxvib.units import Number, number, numbers
+from jaxvib.units.known import when_known
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxvib.draw.style import Drawn, Onto
+
+_REGIMES_PER_PROGRAM = 16
+"""Number of regimes in one program; typical scenes have 2 to 20."""
+
+_MIN_DAMPING = 1e-9
+"""Growth, relative to the speed, above which a motion is not called stable: rounding hides weaker damping."""
+
+
+class RegimeStatus(eqx.Enumeration):
+    """Outcomes of one synchronous regime. Each member is the sentence shown to the user."""
+
+    found = "the rotating masses can turn with one speed in this way"
+    degenerate = "one of a family: phases can change without a change of torques, so that the least disturbance decides them"
+    not_converged = "no regime was found from this start"
+    unbounded = "the masses turn at a resonance that nothing damps: the vibration has no bound"
+    refused = REFUSED
+
+
+class RegimeSearchStatus(eqx.Enumeration):
+    """Outcomes of a search for all regimes."""
+
+    done = "all regimes were searched for"
+    none = (
+        "no regime: at no speed do the driving torques and the vibration balance for all masses; they turn at their own speeds"
+    )
+
+
+class AbstractSynchronousRegime(Result):
+    """Synchronous regimes, one or several; NaN if there is none.
+
+        angle of mass k in the fixed frame: direction_k (Omega t + phases_k),       q = Re(displacement exp(i Omega t))
+
+    The masses are those of the exciters in order: the unbalance of each, or its loads.
+
+    **Attributes**
+
+    - `status`: a `RegimeStatus`
+    - `speed` Omega, rad/s
+    - `phases` (mass,), rad, in the direction of rotation; 0 for the first mass, or for unbalances under ideal drives
+    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative
+    - `quasi_static`, 1/s: the same by the usual quasi-static criterion, which takes the ringing of the machine for infinitely
+      fast and calls some growing regimes stable; -inf if all speeds are prescribed
+    - `margin`: the factor by which all differences of the driving torques can grow until the regime ends in a fold; inf if it
+      does not end
+    - `torque` (mass,), N m: driving torque of the motor or of the drag, of an ideal drive the torque that it has to give
+    - `vibrational_torque` (mass,), N m: mean torque of the vibration on each mass; it balances `torque`
+    - `power` (exciter,), W, that each drive gives in the mean
+    - `can_start` (exciter,): False if gravity keeps an unbalance at the bottom against its motor at rest, S g > T(0)
+    - `displacement` (nd,): complex amplitudes, m, of rotations rad, and `amplitude` (nd,): their moduli, zero to peak
+    - `foundation_force`, N, zero to peak (for two directions the root of the summed squares of their peaks)
+    - `residual` of the balance, relative to the largest vibrational torque that is possible
+    - `scene`
+    """
+
+    status: RegimeStatus
+    speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))
+    phases: Array = eqx.field(metadata=in_unit("rad", "*", "mass"))
+    growth: Array = eqx.field(metadata=in_unit("1/s", "*"))
+    stable: Array = eqx.field(metadata=in_unit("", "*"))
+    quasi_static: Array = eqx.field(metadata=in_unit("1/s", "*"))
+    margin: Array = eqx.field(metadata=in_unit("", "*"))
+    torque: Array = eqx.field(metadata=in_unit("N m", "*", "mass"))
+    vibrational_torque: Array = eqx.field(metadata=in_unit("N m", "*", "mass"))
+    power: Array = eqx.field(metadata=in_unit("W", "*", "exciter"))
+    can_start: Array = eqx.field(metadata=in_unit("", "*", "exciter"))
+    displacement: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))
+    residual: Array = eqx.field(metadata=in_unit("", "*"))
+    scene: Scene = eqx.field(metadata=SCENE)
+
+
+class SynchronousRegime(AbstractSynchronousRegime):
+    """Synchronous regime, see `AbstractSynchronousRegime`.
+
+    Returned by `SynchronousRegimes.select` and `synchronous_regimes(scene, near=...)`.
+    """
+
+    def summary(self) -> str:
+        """Return one line of text; phases in degrees."""
+        if not np.isfinite(self.speed):
+            return self.message
+        phases = ", ".join(f"{degrees(float(a)):.4g}" for a in self.phases)
+        stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
+        family = ", one of a family" if status_name(self.status) == "degenerate" else ""
+        return f"Omega {speed_text(self.speed, 6)}, {stable}, margin {float(self.margin):.3g}{family}: {phases} deg"
+
+    @validated
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """Plot the phases of the masses on a circle, each in its direction of rotation.
+
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
+        from jaxvib.draw.results import phase_circles  # slow import
+
+        return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], ax=ax)
+
+
+class SynchronousRegimes(AbstractSynchronousRegime):
+    """All synchronous regimes of a scene: the arrays of `AbstractSynchronousRegime` with a leading axis over the n regimes.
+
+    Returned by `synchronous_regimes`. Stable regimes come first, then by falling speed.
+
+    **Additional attribute**: `search`, a `RegimeSearchStatus`.
+    """
+
+    outer_axes = ("regime",)
+
+    search: RegimeSearchStatus = eqx.field(metadata=in_unit(""))
+
+    @validated
+    def select(self, index: int) -> SynchronousRegime:
+        """Return the regime with an `index`, counted from 0. **Raises** `InputError` if there are fewer regimes."""
+        n = self.speed.shape[0]
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
+            raise InputError("index", f"is {quoted(index)}; there are {n} regimes, counted from 0")
+        fields = {name: getattr(self, name) for name in SynchronousRegime.__dataclass_fields__ if name != "scene"}
+        return SynchronousRegime(**jax.tree.map(lambda leaf: leaf[index], fields), scene=self.scene)
+
+    def summary(self) -> str:
+        """Return a line of text for each regime."""
+        lines = [self.select(k).summary() for k in range(self.speed.shape[0])]
+        return "\n".join(lines) or RegimeSearchStatus[RegimeSearchStatus.none]
+
+    @validated
+    def plot(self, *, ax: Onto = None) -> Drawn:
+        """Plot the phases of the masses of each regime on a circle.
+
+        **Returns** a matplotlib figure, or the given `ax`, which must contain one axes object for each regime.
+        """
+        from jaxvib.draw.results import phase_circles  # slow import
+
+        sets = [
+            (f"{speed_text(w, 6)}\n{'stable' if s else 'unstable'}", np.asarray(a))
+            for w, s, a in zip(self.speed, self.stable, self.phases, strict=True)
+        ]
+        return phase_circles(sets, ax=ax)
+
+
+@validated
+@overload
+def synchronous_regimes(scene: Scene) -> SynchronousRegimes: ...
+
+
+@validated
+@overload
+def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array]) -> SynchronousRegime: ...
+
+
+@validated
+def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = None) -> SynchronousRegimes | SynchronousRegime:
+    """Return every way in which all rotating masses of a scene can turn with one speed, averaged over a turn.
+
+        L_i(Omega) + V_i(Omega, alpha) = 0 for every mass i
+        V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
+        H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k,    e_k = (1, -i direction_k),    D = K - Omega^2 M + i Omega C
+
+    - The masses are the unbalances of the exciters, whose motors give L, and loads, whose drag gives L; an ideal drive turns
+      its unbalance at its speed, which is then Omega, at the angle Omega t
+    - Regimes that differ by a common turn or by an exchange of equal exciters, such as mirror images, are listed once; of a
+      family of regimes one member is listed, with the status `degenerate`
+    - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
+    - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; phases are off by tenths of a
+      radian close to where two regimes exchange stability
+    - One common speed is assumed. Exciters of different speeds do not act on each other at this order; the search leaves such
+      motions out
+
+    **Arguments**
+
+    - `scene`, with gravity or without effects; exciters have an unbalance, or loads and an ideal drive; typical: 2 to 6
+      rotating masses
+    - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime; `jit`, `vmap` and `grad` go
+      through it then. Derivatives are those of the implicit function theorem, of all but stability
+
+    **Returns** `SynchronousRegimes`, or `SynchronousRegime` with `near`.
+
+    **Raises** `InputError` for exciters with both loads and an unbalance, loads with a motor, ideal drives of different speeds,
+    and effects that this theory leaves out.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> springs = [jv.support(at=(x, 0.0), stiffness=(3e3, 3e3), damping=(150.0, 150.0)) for x in (-0.6, 0.6)]
+    >>> screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    >>> motor = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
+    >>> exciters = [jv.Exciter(drive=motor, unbalance=0.4, at=(x, 0.0), direction=s) for x, s in ((-0.6, 1), (0.6, -1))]
+    >>> found = jv.synchronous_regimes(jv.Scene(screen, exciters=exciters))
+    >>> [round(abs(float(a)), 4) for a in found.phases[:, 1]], found.stable.tolist()    # half a turn apart: a vertical line
+    ([3.1416, 0.0], [True, False])
+
+    Source: I. I. Blekhman, Synchronization in Science and Technology, 1988; the Jacobian of the slow motion in place of his
+    integral criterion.
+    """
+    scene = validate_scene(scene)
+    require_rotating_masses(scene)
+    _require_one_speed(scene)
+    count = sum(1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters)
+    if near is not None:
+        if not isinstance(near, (tuple, list)) or len(near) != 2 or np.shape(near[1]) != (count,):
+            raise InputError("near", f"must be (speed, phases) with one phase for each of the {count} rotating masses")
+        speed, phases = number(near[0], "rad/s", "near[0]", low=0.0, open_low=True), numbers(near[1], "rad", "near[1]", count)
+        return outcome(_regime_near(scene, speed, phases), scene)
+    omega, phases = all_regimes(_balance_of(scene))
+    found = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a), omega, phases)
+    kept = np.flatnonzero(status_names(found["status"]) != "not_converged")
+    kept = kept[np.lexsort((-found["speed"][kept], ~found["stable"][kept]))]
+    search = RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none
+    return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[kept], found)), scene=scene, search=search)
+
+
+_balance_of = cached(assemble_torque_balance)
+
+
+@cached
+def _regimes_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
+    return jax.vmap(lambda w, a: _numbers_near(scene, w, a))(omega, phases)
+
+
+@cached
+def _regime_near(scene: Scene, omega: Array, phases: Array) -> SynchronousRegime:
+    return SynchronousRegime(**_numbers_near(scene, omega, phases), scene=scene)
+
+
+def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
+    """Return the fields of the regime to which a start leads, without the scene."""
+    balance = assemble_torque_balance(scene)
+    frozen = jax.lax.stop_gradient(balance)
+    x = jax.lax.stop_gradient(unknowns_of(frozen, omega, phases))
+    if x.size:
+        x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), x, frozen, on_numbers=False)
+        slopes = slopes_of(x, frozen)
+        neutral = slopes.neutral
+        x = implicit_step(x, slopes, balance_residuals(x, balance))
+    else:
+        neutral = jnp.asarray(0)
+    w, angles = motion_of(balance, x)
+    angles = jnp.concatenate([angles[:1], jnp.arctan2(jnp.sin(angles[1:]), jnp.cos(angles[1:]))])
+    influence, answer = influence_of(balance, w)
+    turn = jnp.exp(1j * angles)
+    vibration = torques_at(balance, influence, w, turn)
+    driving = jnp.where(balance.is_prescribed, -vibration, balance.driving_torque(w))
+    z = w**2 * answer @ (balance.unbalance * turn)
+    force = peak_force(balance.model.carrier.foundation_force(z, 1j * w * z))
+    scale = vibration_scale(balance, w)
+    residual = jnp.max(jnp.abs(driving + vibration) / jnp.where(scale > 0.0, scale, 1.0))
+
+    eps = jnp.finfo(w.dtype).eps
+    size = jnp.max(balance.unbalance) / jnp.min(jnp.diagonal(balance.model.mass))
+    bounded = jnp.all(magnitude(z) * 100.0 * eps < size)
+    good = is_balanced(frozen, x) & _has_one_speed(balance)
+    there = good & bounded
+    status = RegimeStatus.where(neutral > 0, RegimeStatus.degenerate, RegimeStatus.found)
+    status = RegimeStatus.where(good, status, RegimeStatus.not_converged)
+    status = RegimeStatus.where(bounded | ~jnp.isfinite(w), status, RegimeStatus.unbounded)
+
+    known, at, moved = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z))
+    common = max(int(np.sum(balance.is_prescribed)), 1)
+    growth = averaged_growth(frozen.averaged, known, at, moved, common + neutral)
+    numbers = {
+        "speed": w,
+        "phases": angles,
+        "growth": growth,
+        "quasi_static": quasi_static_growth(frozen, known, at, neutral),
+        "margin": margin_of(balance, x),
+        "torque": driving,
+        "vibrational_torque": vibration,
+        "power": _power(balance, w, driving),
+        "displacement": z,
+        "amplitude": magnitude(z),
+        "foundation_force": force,
+        "residual": residual,
+    }
+    kept = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
+    stable = there & (growth < -jnp.maximum(_MIN_DAMPING, 100.0 * eps) * w)
+    return {"status": status, "stable": stable, "can_start": _can_start(scene), **kept}
+
+
+def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
+    """Return the power of each drive, (exciters,) W: the driving torque of its masses times the speed of its rotor."""
+    averaged, rate = balance.averaged, jnp.full_like(driving, omega)
+    each = np.repeat(np.arange(len(averaged.counts)), [max(count, 1) for count in averaged.counts])
+    torque = jnp.zeros(len(averaged.counts), driving.dtype).at[each].add(driving)
+    return torque * jnp.stack(balance.rotor_speeds(rate))
+
+
+def _can_start(scene: Scene) -> Array:
+    """Return True for each exciter whose motor lifts its unbalance from rest against gravity, or that has none to lift."""
+    gravity = total_gravity(scene.all_effects)
+    each = []
+    for exciter in scene.exciters:
+        motor = exciter.drive.torque_and_inertia(*(jnp.zeros_like(exciter.drive.speed),) * 2)
+        if exciter.unbalance is None or motor is None or 1 not in gravity:
+            each.append(jnp.asarray(True))
+        else:
+            each.append(motor[0] > exciter.unbalance * jnp.abs(gravity[1]))
+    return jnp.stack(each)
+
+
+def _has_one_speed(balance: TorqueBalance) -> Array:
+    """Return True if all prescribed speeds of unbalances are equal, which known speeds are checked for beforehand."""
+    field = balance.averaged
+    speeds = [drive.speed for count, drive in zip(field.counts, field.drives, strict=True) if count == 0 and drive.ideal]
+    return jnp.all(jnp.stack([speed == speeds[0] for speed in speeds])) if speeds else jnp.asarray(True)
+
+
+def _require_one_speed(scene: Scene) -> None:
+    """**Raises** `InputError` if ideal drives turn unbalances at different speeds. Traced numbers are not checked."""
+    ideal = [k for k, exciter in enumerate(scene.exciters) if exciter.loads is None and exciter.drive.ideal]
+
+    def check(*speeds: float) -> None:
+        for k, speed in zip(ideal, speeds, strict=True):
+            if speed != speeds[0]:
+                problem = f"is {float(speed):g} rad/s and that of exciters[{ideal[0]}] {float(speeds[0]):g} rad/s"
+                advice = "a regime has one speed, give ideal drives of unbalances the same"
+                raise InputError(f"exciters[{k}].drive.speed", f"{problem}; {advice}")
+
+    when_known(check, *(scene.exciters[k].drive.speed for k in ideal))
