@@ -101,7 +101,7 @@ def captures(folder: pathlib.Path, out: pathlib.Path) -> None:
     found = capture(folder / "map.zarr", report=told)
     print(found.summary(), f"\n{since(begun)}", flush=True)
     begun = clocks()
-    found.plot().savefig(out / "capture_map.png")
+    found.plot().savefig(out / "jam_map.png")
     print("figure with its folds and torus points:", since(begun), flush=True)
     data, generator = found.data.load(), np.random.default_rng(0)
     speed, rate = data["drive.speed"].values, data["start.rate"].values
