@@ -14,6 +14,7 @@ from jaxvib.display import display_units
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
 from jaxvib.machine.mount import Mount
+from jaxvib.machine.structures.matrices import from_matrices
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
@@ -147,6 +148,7 @@ __all__ = [
     "two_mass",
     "plane_body",
     "plane_network",
+    "from_matrices",
     "body",
     "support",
     "three_mass",

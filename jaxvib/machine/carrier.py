@@ -86,6 +86,7 @@ class Machine(Part):
 
     - "platform": by the number of the platform
     - "shaft": by the distance along a rotor's axis from its mass centre, m
+    - "number": by the number of a place in a list
     - "plane": by the point (x, y) of a body, m from its centre of mass
     - "point": not at all, because the exciter's place is the only one
 
@@ -110,7 +111,7 @@ class Machine(Part):
     """
 
     kind: eqx.AbstractVar[str]
-    places: ClassVar[Literal["platform", "shaft", "plane", "point"]] = "point"
+    places: ClassVar[Literal["platform", "shaft", "plane", "number", "point"]] = "point"
 
     @abc.abstractmethod
     def carrier(self) -> Carrier:

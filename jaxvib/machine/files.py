@@ -351,6 +351,9 @@ def scene_to_toml(scene: Scene) -> str:
 
 
 def _part_table(section: str, part: Any) -> Tables:
+    if part.kind not in SECTIONS[section]:
+        problem = f"is {part.kind!r}, which scene files do not describe; build it in Python"
+        raise InputError(f"{section}.kind", problem)
     return {"kind": part.kind, **_fields(part, SECTIONS[section][part.kind])}
 
 

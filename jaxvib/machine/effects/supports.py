@@ -31,7 +31,7 @@ class _Support(Effect):
 
         **Raises** `InputError` for a place that the machine does not have.
         """
-        if machine.places == "plane":
+        if machine.places in ("plane", "number"):
             problem = f"acts under a platform or around a rotor's axis, not on {quoted(machine.kind)}; leave it out"
             raise InputError(f"effects.{self.kind}", problem)
         if self.position is None:

@@ -1,0 +1,187 @@
+"""Machines from matrices of other tools, such as finite-element models of rotors and frames, reduced to their lowest modes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import is_real
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.mount import Mount, Place
+from jaxvib.machine.numbers import unit
+from jaxvib.units import count
+from jaxvib.units.known import when_known
+
+_SYMMETRY = 1e-9
+"""Largest asymmetry of a mass or stiffness matrix, relative to its largest entry."""
+
+
+class MatrixMachine(Machine):
+    """Linear structure from matrices, in modal coordinates if it was reduced; `from_matrices` returns it.
+
+    **Attributes** (nd coordinates)
+
+    - `mass`, `damping`, `stiffness` and `gyroscopic` (or None), (nd, nd)
+    - `places` (places, np, nd): the rows of each place, see `Mount`
+    - `foundation` (2, nb, nd): stiffness and damping of the force on the foundation
+    """
+
+    mass: Array = eqx.field(metadata=unit("", words="mass matrix"))
+    damping: Array = eqx.field(metadata=unit("", words="damping matrix"))
+    stiffness: Array = eqx.field(metadata=unit("", words="stiffness matrix"))
+    gyroscopic: Array | None = eqx.field(metadata=unit("", words="gyroscopic matrix"))
+    places_rows: Array = eqx.field(metadata=unit("", words="rows of the places"))
+    foundation: Array = eqx.field(metadata=unit("", words="rows of the force on the foundation"))
+    kind: str = eqx.field(static=True)
+    places = "number"
+
+    def carrier(self) -> Carrier:
+        """Return the matrices."""
+        names = tuple(f"q{k + 1}" for k in range(self.mass.shape[0]))
+        return Carrier(self.mass, self.damping, self.stiffness, self.foundation[0], self.foundation[1], names)
+
+    def mount(self, at: Place = None) -> Mount:
+        """Return the mount of an exciter at the place with the number `at`."""
+        rows = self._all_rows(at, "at")
+        axes = (1,) if rows.shape[0] == 1 else (0, 1)
+        turn = rows[2] if rows.shape[0] == 3 else None
+        return Mount(rows=(rows[: len(axes)],), axes=axes, gyroscopic=self.gyroscopic, turn=turn)
+
+    def rows_at(self, place: Place, name: str = "place") -> Array:
+        """Return the rows of the place with this number, from 1; of the first place for None."""
+        return self._all_rows(place, name)[:2]
+
+    def _all_rows(self, place: Place, name: str) -> Array:
+        number, last = 1 if place is None else place, self.places_rows.shape[0]
+        if not isinstance(number, int) or not 1 <= number <= last:
+            raise InputError(name, f"is {quoted(number)}; give the number of a place, 1 to {last}")
+        return self.places_rows[number - 1]
+
+
+def from_matrices(
+    mass: Any,
+    damping: Any,
+    stiffness: Any,
+    gyroscopic: Any = None,
+    *,
+    places: Sequence[Any],
+    foundation: Any = None,
+    reduce: int | None = 12,
+) -> MatrixMachine:
+    """Return a machine with the matrices of any linear model, such as a finite-element model of a flexible rotor.
+
+        M q'' + (C + n G) q' + K q = forces,        q = Phi r,    K Phi = M Phi diag(w^2),    Phi^T M Phi = 1
+
+    A model with more than `reduce` coordinates is reduced to its lowest real normal modes, those without damping and rotation.
+    The coordinates of the machine are then the modal amplitudes r. Displacements, forces and speeds at the places are those of
+    the model; amplitudes of coordinates are not.
+
+    **Arguments** (numbers and arrays in SI; nd coordinates of the model)
+
+    - `mass` M and `stiffness` K (nd, nd), symmetric, M positive definite, K without negative eigenvalues
+    - `damping` C (nd, nd)
+    - `gyroscopic` G (nd, nd): G times the rotor speed n times q' is a force; skew-symmetric. None without a rotor
+    - `places`: a list of points at which exciters may sit, numbered from 1 in `Exciter(at=)`. Each is a list of the indices
+      of its coordinates, [up], [across, up] or [across, up, rotation], or an array (1 to 3, nd) of rows; all of one length
+    - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or across
+      and up (nb = 2); default: the force is not known and given as 0
+    - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
+
+    **Returns** `MatrixMachine`.
+
+    **Raises** `InputError` for matrices of other shapes, values that are not finite, an asymmetric or indefinite mass or
+    stiffness matrix, and coordinates that do not exist.
+
+    >>> import jaxvib as jv, numpy as np
+    >>> chain = 4e4 * (2 * np.eye(30) - np.eye(30, k=1) - np.eye(30, k=-1))
+    >>> machine = jv.from_matrices(2.0 * np.eye(30), 1e-4 * chain, chain, places=[[29]], reduce=6)
+    >>> machine.carrier().stiffness.shape
+    (6, 6)
+
+    Source: modal reduction, for example Krämer 1993, Dynamics of Rotors and Foundations.
+    """
+    m = _matrix(mass, "machine.mass", None)
+    size = m.shape[0]
+    c, k = _matrix(damping, "machine.damping", (size, size)), _matrix(stiffness, "machine.stiffness", (size, size))
+    g = None if gyroscopic is None else _matrix(gyroscopic, "machine.gyroscopic", (size, size))
+    rows = _read_places(places, size)
+    force = jnp.zeros((2, 1, size), m.dtype) if foundation is None else _read_foundation(foundation, size)
+    for name, matrix in (("machine.mass", m), ("machine.stiffness", k)):
+        when_known(lambda matrix, name=name: _require_definite(matrix, name), matrix)
+    most = size if reduce is None else count(reduce, "machine.reduce")
+    if size > most:
+        modes = _lowest_modes(m, k, most)
+        m, c, k, g = (None if x is None else modes.T @ x @ modes for x in (m, c, k, g))
+        rows, force = rows @ modes, force @ modes
+    parts = {"mass": m, "damping": c, "stiffness": k, "gyroscopic": g, "places_rows": rows, "foundation": force}
+    return MatrixMachine(**parts, kind="matrices")  # pyright: ignore[reportArgumentType]
+
+
+def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
+    """Return the lowest real normal modes (nd, number), with the modal masses 1."""
+    factor = jnp.linalg.cholesky(mass)
+    left = jnp.linalg.solve(factor, stiffness)
+    _, vectors = jnp.linalg.eigh(jnp.linalg.solve(factor, left.T))
+    return jnp.linalg.solve(factor.T, vectors[:, :number])
+
+
+def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
+    """Return a matrix, square if `shape` is None; a number is a matrix with one entry."""
+    try:
+        found = jnp.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(name, f"is {quoted(value)}; it must be a square array of numbers, in SI units") from error
+    found = found[None, None] if found.ndim == 0 else found
+    if found.ndim != 2 or found.shape != (found.shape[:1] * 2 if shape is None else shape) or found.size == 0:
+        needed = "a square matrix" if shape is None else " x ".join(map(str, shape))
+        raise InputError(name, f"has the shape {found.shape}; {needed} is needed")
+    if when_known(lambda known: bool(np.all(np.isfinite(known))), found) is False:
+        raise InputError(name, "has an entry that is not finite; finite numbers are needed")
+    return found
+
+
+def _require_definite(matrix: np.ndarray | float, name: str) -> None:
+    """**Raises** `InputError` for a matrix that is not symmetric, or not positive (semi-)definite."""
+    full = np.atleast_2d(matrix)
+    scale = float(np.max(np.abs(full), initial=1e-300))
+    if np.max(np.abs(full - full.T)) > _SYMMETRY * scale:
+        raise InputError(name, "is not symmetric; put skew-symmetric parts into gyroscopic, or take (A + A^T)/2")
+    least = float(np.min(np.linalg.eigvalsh(full)))
+    if least <= 0.0 if name == "machine.mass" else least < -_SYMMETRY * scale:
+        allowed = "greater than 0" if name == "machine.mass" else "at least 0"
+        raise InputError(name, f"has the eigenvalue {least:g}; all must be {allowed}")
+
+
+def _read_places(places: Any, size: int) -> Array:
+    if not isinstance(places, (list, tuple, np.ndarray, Array)) or len(places) == 0:
+        raise InputError("machine.places", f"is {quoted(places)}; it must be a list of places such as [[0, 1]]")
+    rows = [_read_rows(place, f"machine.places[{k}]", size) for k, place in enumerate(places)]
+    if len({each.shape for each in rows}) > 1:
+        raise InputError("machine.places", "has places with different numbers of directions; give all the same number")
+    return jnp.stack(rows)
+
+
+def _read_rows(place: Any, name: str, size: int) -> Array:
+    """Return the rows of a place from the indices of its coordinates, or from rows."""
+    if np.ndim(place) == 1 and all(is_real(each) and int(each) == each for each in place):
+        wrong = [int(each) for each in place if not 0 <= each < size]
+        if wrong or not 1 <= len(place) <= 3:
+            raise InputError(name, f"is {quoted(list(place))}; give 1 to 3 coordinates, 0 to {size - 1}")
+        return jnp.asarray(np.eye(size)[[int(each) for each in place]], dtype=float)
+    number = np.shape(place)[0] if np.ndim(place) == 2 else 0
+    if not 1 <= number <= 3:
+        raise InputError(name, f"is {quoted(place)}; give 1 to 3 indices of coordinates, or 1 to 3 rows of {size} numbers")
+    return _matrix(place, name, (number, size))
+
+
+def _read_foundation(foundation: Any, size: int) -> Array:
+    if np.ndim(foundation) != 3 or np.shape(foundation)[0] != 2 or np.shape(foundation)[1] not in (1, 2):
+        raise InputError("machine.foundation", f"must be two arrays (T_K, T_C) of 1 or 2 rows of {size} numbers")
+    shape = (int(np.shape(foundation)[1]), size)
+    return jnp.stack([_matrix(each, f"machine.foundation[{k}]", shape) for k, each in enumerate(foundation)])

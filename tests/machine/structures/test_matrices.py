@@ -1,0 +1,182 @@
+"""Machines from matrices: equal to the machines that have them, reduced to modes, whirl of a shaft of finite elements."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+
+BALLS = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+DRIVE = jv.ConstantSpeed(60.0)
+SPRINGS = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3), angle="20 deg") for x in (-1.2, 1.1)]
+BODY = jv.plane_body(mass=200.0, inertia=60.0, supports=SPRINGS)
+
+
+def state_of(scene):
+    leaves, structure = jax.tree.flatten(jv.initial_state(scene))
+    rng = np.random.default_rng(1)
+    return jax.tree.unflatten(structure, [jnp.asarray(rng.normal(size=np.shape(leaf))) for leaf in leaves])
+
+
+def same_field(one, other):
+    state = state_of(one)
+    for found, wanted in zip(*(jax.tree.leaves(jv.vector_field(s)(0.3, state)) for s in (one, other)), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
+
+
+def test_matrices_of_a_plane_body_move_as_it_does():
+    """Two exciters, one of them a motor whose torque reacts on the body."""
+    places = ((-0.3, 0.5), (0.4, 0.2))
+    carrier = BODY.carrier()
+    rows = [[[1, 0, -y], [0, 1, x], [0, 0, 1]] for x, y in places]
+    machine = jv.from_matrices(
+        carrier.mass,
+        carrier.damping,
+        carrier.stiffness,
+        places=rows,
+        foundation=(carrier.foundation_stiffness, carrier.foundation_damping),
+    )
+    motor = jv.DCMotor(90.0, stall_torque=6.0, inertia=0.1)
+
+    def scene_of(machine, at):
+        return jv.Scene(
+            machine,
+            exciters=[jv.Exciter(drive=motor, unbalance=0.1, at=at[0]), jv.Exciter(BALLS, DRIVE, at=at[1], direction=-1)],
+        )
+
+    same_field(scene_of(machine, (1, 2)), scene_of(BODY, places))
+    q, v = np.random.default_rng(0).normal(size=(2, 3))
+    np.testing.assert_allclose(machine.carrier().foundation_force(q, v), carrier.foundation_force(q, v), rtol=1e-12)
+
+
+def test_matrices_of_a_rotor_have_its_gyroscopic_force():
+    rotor = jv.rotor(
+        mass=37.0, transverse_inertia=0.5, polar_inertia=0.1, stiffness=(6e5, 5e5), damping=(400.0, 300.0), position=(0.2, -0.2)
+    )
+    carrier, mount = rotor.carrier(), rotor.mount()
+    machine = jv.from_matrices(carrier.mass, carrier.damping, carrier.stiffness, mount.gyroscopic, places=[mount.rows[0]])
+    same_field(jv.Scene(machine, BALLS, DRIVE), jv.Scene(rotor, BALLS, DRIVE))
+
+
+LENGTH, RADIUS, E, RHO = 1.2, 0.02, 2.1e11, 7800.0
+AREA, SECOND = np.pi * RADIUS**2, np.pi * RADIUS**4 / 4.0
+
+
+def shaft(elements):
+    """Pinned shaft of Hermite elements with rotary inertia: mass, stiffness, gyroscopic of (u, u', w, w') at each node."""
+    h = LENGTH / elements
+    bending = np.array(
+        [
+            [12, 6 * h, -12, 6 * h],
+            [6 * h, 4 * h * h, -6 * h, 2 * h * h],
+            [-12, -6 * h, 12, -6 * h],
+            [6 * h, 2 * h * h, -6 * h, 4 * h * h],
+        ]
+    )
+    moved = np.array(
+        [
+            [156, 22 * h, 54, -13 * h],
+            [22 * h, 4 * h * h, 13 * h, -3 * h * h],
+            [54, 13 * h, 156, -22 * h],
+            [-13 * h, -3 * h * h, -22 * h, 4 * h * h],
+        ]
+    )
+    tilted = np.array(
+        [
+            [36, 3 * h, -36, 3 * h],
+            [3 * h, 4 * h * h, -3 * h, -h * h],
+            [-36, -3 * h, 36, -3 * h],
+            [3 * h, -h * h, -3 * h, 4 * h * h],
+        ]
+    )
+    size = 2 * (elements + 1)
+    m, k, tilt = np.zeros((3, size, size))
+    for j in range(elements):
+        own = np.ix_(range(2 * j, 2 * j + 4), range(2 * j, 2 * j + 4))
+        k[own] += E * SECOND / h**3 * bending
+        tilt[own] += RHO * SECOND / (30.0 * h) * tilted
+        m[own] += RHO * AREA * h / 420.0 * moved
+    free = [j for j in range(size) if j not in (0, size - 2)]
+    m, k, tilt = (x[np.ix_(free, free)] for x in (m + tilt, k, tilt))
+    both, turn = np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]])
+    return np.kron(both, m), np.kron(both, k), np.kron(turn, 2.0 * tilt), len(free)
+
+
+def closed_form(mode, speed):
+    """Whirl of a Rayleigh beam: (rho A + rho I b^2) w^2 -+ 2 rho I b^2 n w - E I b^4 = 0, b = mode pi/L."""
+    b = mode * np.pi / LENGTH
+    inertia, spin = RHO * (AREA + SECOND * b**2), RHO * SECOND * b**2 * speed
+    root = np.sqrt(spin**2 + inertia * E * SECOND * b**4)
+    return sorted([(root - spin) / inertia, (root + spin) / inertia])
+
+
+def test_campbell_diagram_of_a_shaft_is_the_closed_form():
+    """24 elements, 96 coordinates, reduced to 12 modes; the gyroscopic force is that of a fast rotor."""
+    mass, stiffness, gyroscopic, each = shaft(24)
+    machine = jv.from_matrices(mass, 0.0 * mass, stiffness, gyroscopic, places=[[each // 2, each + each // 2]])
+    light = jv.balls(count=1, mass=1e-9, radius=0.01, drag=1e-9)
+    speeds = np.array([100.0, 2000.0])
+    found = jv.whirl(jv.Scene(machine, light, DRIVE), speeds, loads="fixed")
+    for k, speed in enumerate(speeds):
+        wanted = np.concatenate([closed_form(mode, speed) for mode in (1, 2)])
+        np.testing.assert_allclose(np.asarray(found.speed)[k, :4], wanted, rtol=1e-5)
+
+
+def test_reduced_model_has_the_lowest_frequencies():
+    chain = 4e4 * (2 * np.eye(30) - np.eye(30, k=1) - np.eye(30, k=-1))
+    machine = jv.from_matrices(2.0 * np.eye(30), 1e-4 * chain, chain, places=[[29]], reduce=6)
+    wanted = 2.0 * np.sqrt(4e4 / 2.0) * np.sin(np.arange(1, 7) * np.pi / 62)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(machine.stiffness)), wanted, rtol=1e-9)
+    np.testing.assert_allclose(machine.mass, np.eye(6), atol=1e-12)
+    shape = np.sqrt(2.0 / 31.0 / 2.0) * np.abs(np.sin(30 * np.arange(1, 7) * np.pi / 31))
+    np.testing.assert_allclose(np.abs(machine.rows_at(1))[0], shape, rtol=1e-9)
+
+
+ONE = np.eye(2)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: jv.from_matrices(np.ones((2, 3)), ONE, ONE, places=[[0]]), r"machine.mass has the shape \(2, 3\); a square"),
+        (
+            lambda: jv.from_matrices(ONE, np.eye(3), ONE, places=[[0]]),
+            r"machine.damping has the shape \(3, 3\); 2 x 2 is needed",
+        ),
+        (
+            lambda: jv.from_matrices(-ONE, ONE, ONE, places=[[0]]),
+            "machine.mass has the eigenvalue -1; all must be greater than 0",
+        ),
+        (
+            lambda: jv.from_matrices(ONE, ONE, -ONE, places=[[0]]),
+            "machine.stiffness has the eigenvalue -1; all must be at least",
+        ),
+        (lambda: jv.from_matrices(ONE, ONE, [[1, 1], [0, 1]], places=[[0]]), "machine.stiffness is not symmetric"),
+        (lambda: jv.from_matrices(ONE, ONE, ONE * np.nan, places=[[0]]), "machine.stiffness has an entry that is not finite"),
+        (lambda: jv.from_matrices("a", ONE, ONE, places=[[0]]), "machine.mass is 'a'; it must be a square array"),
+        (lambda: jv.from_matrices(ONE, ONE, ONE, places=[]), r"machine.places is \[\]; it must be a list of places"),
+        (
+            lambda: jv.from_matrices(ONE, ONE, ONE, places=[[2]]),
+            r"machine.places\[0\] is \[2\]; give 1 to 3 coordinates, 0 to 1",
+        ),
+        (lambda: jv.from_matrices(ONE, ONE, ONE, places=[[0], [0, 1]]), "machine.places has places with different numbers"),
+        (lambda: jv.from_matrices(ONE, ONE, ONE, places=[[0]], foundation=[1.0]), "machine.foundation must be two arrays"),
+        (lambda: jv.from_matrices(ONE, ONE, ONE, places=[[0]], reduce=0), "machine.reduce is 0; it must be a whole number"),
+        (
+            lambda: jv.Scene(jv.from_matrices(ONE, ONE, ONE, places=[[0]]), exciters=[jv.Exciter(BALLS, DRIVE, at=2)]),
+            "at is 2; give the number of a place, 1 to 1",
+        ),
+        (
+            lambda: jv.sketch(jv.Scene(jv.from_matrices(ONE, ONE, ONE, places=[[0]]), BALLS, DRIVE)),
+            "machine.kind is 'matrices'; sketches are available",
+        ),
+        (
+            lambda: jv.scene_to_toml(jv.Scene(jv.from_matrices(ONE, ONE, ONE, places=[[0]]), BALLS, DRIVE)),
+            "machine.kind is 'matrices', which scene files do not describe; build it in Python",
+        ),
+    ],
+)
+def test_wrong_input_ends_in_one_sentence(make, says):
+    with pytest.raises(jv.InputError, match=says):
+        make()
