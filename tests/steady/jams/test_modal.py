@@ -9,7 +9,7 @@ from load_speeds import complex_response, matrices, unbalance_and_drag
 
 import jaxvib as jv
 from jaxvib.equations.linear import jammed_model
-from jaxvib.steady.jams.folds import rotor_speed_at, scanned_slope, scanned_speed
+from jaxvib.steady.jams.folds import rotor_speed_at, scanned_slope, scanned_slopes, scanned_speed
 from jaxvib.steady.jams.jam import jams_of
 
 N = 6
@@ -81,6 +81,29 @@ def test_scanned_rotor_speed_is_that_of_a_dense_solve(name):
     np.testing.assert_allclose(scanned, awaited, rtol=1e-7 if name in ROUGH else 1e-10)
     h = 1e-6
     differences = np.array([(dense_speed(s, w + h) - dense_speed(s, w - h)) / (2.0 * h) for w in SPEEDS])
+    np.testing.assert_allclose(slope, differences, atol=1e-6 * np.max(np.abs(differences)))
+
+
+def test_slopes_in_blocks_are_those_of_single_speeds():
+    model = jammed_model(SCENES["general damping"]).decomposed()
+    grid = jnp.linspace(0.1, 6.0, 12_001)
+    one_by_one = jax.jit(jax.vmap(lambda w: scanned_slope(model, w)))(grid)
+    np.testing.assert_allclose(jax.jit(scanned_slopes)(model, grid), one_by_one, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["general damping", "equal frequencies", "free to drift"])
+def test_fold_speeds_and_their_derivatives_are_those_of_matrices(name):
+    s = SCENES[name]
+
+    def speeds(scale):
+        return jams_of(eqx.tree_at(lambda s: s.machine.damping, s, scale * s.machine.damping)).folds.rotor_speed
+
+    folds, one, h = jams_of(s).folds, jnp.asarray(1.0), 1e-5
+    there = np.asarray(folds.exists)
+    awaited = [dense_speed(s, w) for w in np.asarray(folds.omega)[there]]
+    np.testing.assert_allclose(folds.rotor_speed[there], awaited, rtol=1e-10)
+    slope = jax.jit(jax.jacfwd(speeds))(one)[there]
+    differences = ((speeds(one + h) - speeds(one - h)) / (2.0 * h))[there]
     np.testing.assert_allclose(slope, differences, atol=1e-6 * np.max(np.abs(differences)))
 
 
