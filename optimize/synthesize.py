@@ -68,31 +68,31 @@ def synthesize(
 ) -> Synthesis:
     """Search a design space from many random starts at once for the least value of a quantity, subject to demands.
 
-    - Starts are drawn evenly from the bounds and moved onto the held quantities
-    - Adam (optax) descends from all of them at once, each step along the held quantities, with an augmented Lagrangian for the
-      demands
-    - Sequential quadratic programming with exact first derivatives polishes
-    - Catalogues are chosen from by branch and bound, numbers of loads by trying each
-    - Jam modes are followed from one design to the next and looked up on the whole branch in the end
+    - Starts are drawn uniformly within the bounds and changed until the held quantities have their values
+    - Adam (optax) descends from all of them at once; its steps keep the held quantities, and an augmented Lagrangian includes
+      the demands
+    - Sequential quadratic programming with exact first derivatives refines the best designs
+    - Values of catalogues are chosen by branch and bound; each allowed number of loads is tried
+    - Jam modes are followed from one design to the next; at the end they are searched for again on the whole branch
 
     **Arguments**
 
     - `space`: a `DesignSpace`
     - `objective`: a `Quantity` such as `force_per_amplitude(mode=3)`; write `-quantity` for one that shall be large
     - `subject_to`: demands such as `[amplitude(mode=3) > "2 mm", power(mode=3) < 500.0]`
-    - `starts`: number of random starts; typical: 32 to 256 (the default). The time grows in proportion, and so does the chance
-      of the lowest valley
+    - `starts`: number of random starts; typical: 32 to 256 (the default). The time is proportional to it; more starts also
+      make it more probable that the lowest minimum is found
     - `seed` of these starts
     - `iterations` of the descent; typical: 50 to 200 (default 100)
     - `rate`: first step of the descent, in parts of a free parameter's range; typical: 0.01 to 0.1 (default 0.05)
     - `polishing`: steps of sequential quadratic programming; typical: 12 (the default)
     - `searcher`: the method before the polishing, "gradients" (Adam from the starts), or "cma": CMA-ES, which computes values
-      alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `cma`); its few best designs are
+      alone, `starts` x `iterations` of them, for objectives with many local minima (extra `cma`); its few best designs are
       polished
     - `begin`: a `Synthesis` of this space from which to continue, in place of random starts
-    - `verify`: True to compute the exact motion of the best design and, if it is stable, integrate the full equations until
-      they have settled, the loads at first up to 1e-3 rad beside that motion, and measure; `unverified` states why there is no
-      such run
+    - `verify`: True to compute the exact motion of the best design. If it is stable, the full equations are integrated until
+      the motion has settled, from a state in which the loads deviate by up to 1e-3 rad, and the quantities are measured;
+      `unverified` states why there is no such run
     - `throw`: raise if demands contradict each other; otherwise the status and `limits` show it
     - `progress`: a function, called with the present step and its finished share (0 to 1). An interrupt (Ctrl-C) ends the
       search at once with its best design, which is not polished and not verified
@@ -142,7 +142,9 @@ def synthesize(
     limits = limits_of(problem, demands, found, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
         broken = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.broken)
-        raise failure(SynthesisStatus.contradictory, f" (nearest: {broken}); widen the bounds or relax a demand")
+        raise failure(
+            SynthesisStatus.contradictory, f" (not met by the nearest machine: {broken}); widen the bounds or relax a demand"
+        )
     tell("checking", 0.9)
     verify = verify and bool(kept[best]) and not found.interrupted
     unfinished = "the search was interrupted" if found.interrupted else "the machine does not meet all demands"
@@ -243,8 +245,8 @@ def _search(
         missing = _missing(space, objective, demands, options)
         raise ComputationError(
             "no_feasible_start",
-            f"of the random designs in the bounds ({options.starts} starts) none has {missing}; widen the bounds or choose "
-            "another mode",
+            f"{missing}: does not exist for any of the {options.starts} random designs within the bounds; widen the bounds or "
+            "choose another mode",
         )
     return best[0], best[1], best[2]._replace(existing=existing, drawn=drawn)
 
@@ -299,7 +301,7 @@ def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]
 
 
 def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
-    """Return the exact motion of a jam mode; None if there is none, or for a scene that its theory cannot include."""
+    """Return the exact motion of a jam mode; None if there is none, or if the method does not include the scene."""
     try:
         orbit = jam_orbit(scene, mode=mode, throw=False)
     except (InputError, ComputationError):
@@ -363,7 +365,8 @@ def _table(
 def _other_tiers(
     scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, mode: int | None
 ) -> tuple[list[float], list[float]]:
-    """Return the quantities by the exact motion and by the run of the verification, NaN if they lack the tier."""
+    """Return the quantities by the exact motion and by the run of the verification, NaN for a quantity that this tier cannot
+    compute."""
 
     def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
         other = quantity.at_tier(tier)

@@ -29,7 +29,8 @@ _ONLY = {"fmi": "fmu", "drive": "fmu", "source_only": "fmu", "mode": "state-spac
     help="Quantity of the frequency responses in UFF [displacement].",
 )
 @click.option(
-    "--rotor-speed", help="Rotor speed for the linear machine, without a jam, such as '3000 rpm' [speed of the drive]."
+    "--rotor-speed",
+    help=("Rotor speed of the machine at rest (state space without --mode, or UFF), such as '3000 rpm' [speed of the drive]."),
 )
 @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
 def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) -> None:
@@ -37,7 +38,7 @@ def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) ->
     given = {name: value for name, value in options.items() if value is not None}
     for name, value in given.items():
         if to not in ([_ONLY[name]] if _ONLY[name] else ["state-space", "uff"]):
-            raise InputError(f"--{name.replace('_', '-')}", f"is {value}, which is not an option of --to {to}; leave it out")
+            raise InputError(f"--{name.replace('_', '-')}", f"cannot be used with --to {to}; leave it out")
     loaded, output = loaded_scene(scene), Output(as_json, None, scene=scene)
     if to == "fmu":
         source_only = bool(given.pop("source_only", False))
@@ -45,7 +46,7 @@ def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) ->
         path, message = unit.path, unit.message
     elif to == "uff":
         path = jv.export_uff(loaded, out, **given)  # pyright: ignore[reportArgumentType]
-        message = f"{len(jv.read_uff(path).functions)} frequency response functions, nodes and natural motions"
+        message = f"{len(jv.read_uff(path).functions)} frequency response functions, nodes and mode shapes"
     else:
         mode = given.pop("mode", None)
         at = "rest" if mode is None else jv.jam_modes(loaded).select(mode)  # pyright: ignore[reportArgumentType]

@@ -51,7 +51,7 @@ def curve_chart(
     if np.any(missing):
         axis.plot(value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not all starts captured")
     axis.set_xlabel("value")
-    axis.set_ylabel("initial speed relative to the\nrotor, in the rotor's speed")
+    axis.set_ylabel("initial speed relative to the\nrotor / rotor speed")
     axis.set_ylim(-1.03, 0.0)
     legend_above(axis)
     return figure if ax is None else ax
@@ -93,7 +93,7 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     legend_above(paths, 3)
     speeds.axhline(0.0, color=GUIDE, ls="--", lw=0.8)
     speeds.set_xlabel("time, s")
-    speeds.set_ylabel("speed relative to the\nrotor, in the rotor's speed")
+    speeds.set_ylabel("speed relative to the\nrotor / rotor speed")
     legend_above(speeds)
     return figure if ax is None else ax
 

@@ -1,10 +1,11 @@
 """One exciter of a machine: its loads and its rotor, eliminated from the equations of motion.
 
 With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, a load obeys u'' = H^-1 (r - E a). Here a is
-the acceleration of the point that carries the load, and E is m J^T minus the part of a friction that is proportional to the
-normal force of the load. The load exerts the force -(W a + g) on that point, with W = m 1 - m J H^-1 E and
-g = m (J H^-1 r + c). The unbalanced rotor of a motor is one more such body. The added mass and the reaction of the exciter
-are the sums over all loads, with their levers on the rows of the mount. They contain its whole effect on the machine.
+the acceleration of the point that carries the load, and E is m J^T minus the factor of a in the friction on the load, if a
+friction is proportional to its normal force. The load exerts the force -(W a + g) on that point, with W = m 1 - m J H^-1 E (1
+is the unit matrix) and g = m (J H^-1 r + c). The unbalanced rotor of a motor is one more such body. The added mass and the
+reaction of the exciter are the sums of W and g over all loads, with the levers of the loads on the rows of the mount. These
+two contain the whole effect of the exciter on the machine.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class RotorDynamics(eqx.Module):
     - `unbalance` about the axis, kg m, or None
     - `effects`, prepared for the loads
     - `axes` of the mount
-    - `row_count`: number of entries of the mount's rows that move loads or an unbalanced rotor
+    - `row_count`: number of the first arrays in the rows of the mount on which loads or an unbalanced rotor act
     """
 
     levers: tuple[Array | None, ...]
@@ -407,7 +408,8 @@ class ExciterDynamics(RotorDynamics):
     def _slip_change(
         self, motion: Motion, slip: tuple[Array, ...], rolling: ContactSolution, change: tuple[Array, ...], at_loads: Axes
     ) -> tuple[Array, ...]:
-        """Return the rate of each slip: the missing force of rolling divided by the inertia of a load's rotation."""
+        """Return the rate of each slip: the part of the force required for rolling that the contact cannot transmit, divided
+        by the inertia of the load's rotation."""
         force, state, loads = list(rolling.force), motion.state, self.loads
         for each in rolling.friction:
             for i, f in enumerate(each.linear(at_loads)):
@@ -420,7 +422,10 @@ class ExciterDynamics(RotorDynamics):
         if not self.can_slide:
             return None
         if state.spin is None or state.spin.slip is None:
-            raise InputError("state.spin", "has no slip, but an effect of the scene needs it; use with_spin(scene, state)")
+            raise InputError(
+                "state.spin",
+                "has no sliding velocity (spin.slip), but an effect of the scene needs it; use with_spin(scene, state)",
+            )
         return state.spin.slip
 
     def _drilling_spin(self, state: ExciterState, speed: Array) -> DrillingSpin | None:
@@ -428,7 +433,9 @@ class ExciterDynamics(RotorDynamics):
             return None
         if state.spin is None or state.spin.drilling is None:
             raise InputError(
-                "state.spin", "has no drilling spin, but an effect of the scene needs it; use with_spin(scene, state)"
+                "state.spin",
+                "has no spin about the contact normal (spin.drilling), but an effect of the scene "
+                "needs it; use with_spin(scene, state)",
             )
         return self.loads.drilling_spin(state.angle, state.rate, speed, state.spin.slip)
 

@@ -1,4 +1,4 @@
-"""Equations of a scene as a function of its numbers, of time, states and inputs, for other tools."""
+"""Equations of a scene as a function of its parameters, of time, states and inputs, for other tools."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
 
 
 def has_events(scene: Scene) -> bool:
-    """True if the equations have branches: nonsmooth forces, or a drive whose acceleration jumps."""
+    """True if the equations are piecewise: nonsmooth forces, or a drive whose acceleration jumps."""
     smooth = all(term.is_smooth for effect in scene.all_effects for term in effect.terms())
     return not smooth or any(exciter.drive.jump_ts() for exciter in scene.exciters)
 

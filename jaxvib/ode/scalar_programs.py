@@ -25,7 +25,8 @@ from jaxvib.runtime.compat import (
 )
 
 _MAX_RECOMPUTED = 8
-"""Largest number of operations of a value with several uses that is not fenced, see `fenced`."""
+"""A value that is used several times and needs more operations than this is protected from recomputation by the compiler, see
+`fenced`."""
 
 
 def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -67,10 +68,11 @@ def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
-    """Results of a program on scalars, without repeated computation of values by the compiler.
+    """Return the results of a program on scalars whose values the compiler cannot recompute for each use.
 
-    Every value with several uses and more than a few operations is fenced, see `jaxvib.numerics.fence`. Otherwise the time
-    grows without bound for nested shared parts, as in derivatives of equations: 4096 samples of 3000 operations took 8 s.
+    Every value with several uses and more than a few operations is fenced, see `jaxvib.numerics.fence`. Otherwise the
+    computing time grows without bound for nested shared parts, as in derivatives of equations: 4096 samples of 3000 operations
+    took 8 s.
     """
     jaxpr = program.jaxpr
     uses: dict[Var, int] = {}
@@ -118,7 +120,7 @@ def _commutative() -> set[Primitive]:
 
 
 def is_floating(x: Any) -> bool:
-    """True if a variable of a program has single or double precision, for which `jaxvib.numerics` has sines."""
+    """True if a variable of a program has single or double precision; only for these `jaxvib.numerics` has its own sine."""
     return x.aval.dtype in (np.float32, np.float64)
 
 

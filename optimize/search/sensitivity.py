@@ -18,8 +18,8 @@ _STEP = 0.01
 
 
 def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
-    """Return the limits of the best design: held quantities, demands and active bounds; `sides` (mi, 2): values of the demands
-    and of their limits."""
+    """Return the limits of the best design: held quantities, demands and active bounds; `sides` (number of demands, 2): the
+    value of each demanded quantity, and its limit."""
     best, m = found.best, problem.equalities
     values, duals = found.point.values[best], found.optimality
     objective = abs(values[0]) if np.isfinite(values[0]) else np.nan
@@ -65,7 +65,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
 def neighbours(problem: Problem, found: Found) -> np.ndarray:
     """Return the free parameters (1 + 2 d, d), SI, of the best design and of its neighbours.
 
-    A neighbour has one number that is 1 % smaller or larger.
+    In each neighbour one free parameter is 1 % smaller or larger.
     """
     numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
     off = np.diag(_STEP * numbers)

@@ -44,8 +44,8 @@ def test_universal_files_are_exported(machine, tmp_path, capsys):
     ("words", "says"),
     [
         (["--to", "fmu", "--out", "/none/m.fmu"], "path is '/none/m.fmu', and its folder does not exist"),
-        (["--to", "uff", "--out", "m.unv", "--fmi", "2.0"], "--fmi is 2.0, which is not an option of --to uff; leave it out"),
-        (["--to", "fmu", "--out", "m.fmu", "--rotor-speed", "9"], "--rotor-speed is 9, which is not an option of --to fmu"),
+        (["--to", "uff", "--out", "m.unv", "--fmi", "2.0"], "--fmi cannot be used with --to uff; leave it out"),
+        (["--to", "fmu", "--out", "m.fmu", "--rotor-speed", "9"], "--rotor-speed cannot be used with --to fmu"),
         (["--to", "state-space", "--out", "m.mat", "--mode", "9"], "mode is 9; "),
         (["--to", "state-space", "--out", "m.mat", "--rotor-speed", "-3"], "rotor_speed is "),
     ],

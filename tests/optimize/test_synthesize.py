@@ -171,9 +171,9 @@ def test_what_is_missing_at_the_start_is_named():
     nowhere = Quantity("nowhere", "", lambda s: s.drive.speed * jnp.nan)
     half = [Quantity(f"half {sign:+d}", "", lambda s, sign=sign: jnp.sqrt(sign * (s.loads.drag - 1.5))) for sign in (1, -1)]
     for objective, demands, says in (
-        (total_mass(), [nowhere < 1.0], r"none has nowhere; widen"),
-        (nowhere, [total_mass() < 1.0], r"none has nowhere; widen"),
-        (half[0], [half[1] < 1.0], r"none has all of: half \+1, half -1, 1; widen"),
+        (total_mass(), [nowhere < 1.0], r"nowhere: does not exist for any"),
+        (nowhere, [total_mass() < 1.0], r"nowhere: does not exist for any"),
+        (half[0], [half[1] < 1.0], r"all of: half \+1, half -1, 1: does not exist for any"),
     ):
         with pytest.raises(jv.ComputationError, match=says) as caught:
             synthesize(DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}), objective, subject_to=demands, starts=4)

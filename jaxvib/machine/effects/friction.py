@@ -23,9 +23,9 @@ Reaction = Literal["exact", "run_up", "steady"]
 def sliding_sign(slip: Array, width: Array) -> Array:
     """Return tanh(slip / width), the sign of a sliding speed, smooth over the `width`.
 
-    With the exact sign, a joint sticks under the fraction f < 1 of the largest friction. With the smooth sign it creeps at the
-    speed width artanh(f), which tends to 0 with the width. An oscillation with the largest speed v loses less energy to dry
-    friction than with the exact sign; the relative difference is (pi^2/24) (width/v)^2.
+    With the exact sign, a joint does not move if its load is the fraction f < 1 of the largest friction. With the smooth sign
+    it creeps at the speed width artanh(f), which tends to 0 with the width. An oscillation with the largest speed v loses less
+    energy to dry friction than with the exact sign; the relative difference is (pi^2/24) (width/v)^2.
 
     >>> [round(float(sliding_sign(x, 0.1)), 4) for x in (-1.0, 0.0, 0.05, 1.0)]
     [-1.0, 0.0, 0.4621, 1.0]
@@ -49,12 +49,13 @@ class DryFriction(Effect):
 
     - `reaction="exact"`: N = m (R phi'^2 - n . a - g sin phi), n the load's direction, a the acceleration of the point that
       carries it, g the gravity of the scene. N is linear in the accelerations and is solved together with them
-    - `"run_up"`: N = m R phi'^2 - 2 m R speed (speed - phi'), as printed for a run-up (its second term mixes frames)
+    - `"run_up"`: N = m R phi'^2 - 2 m R speed (speed - phi'), as printed for a run-up (its second term mixes quantities of the
+      fixed and the rotating frame)
     - `"steady"`: N = m R speed^2, as printed for loads that turn with the rotor
 
     Viscous bearing friction is the loads' `drag`, mu1 = b_W R^2; typical: 3e-4 to 2e-3 N m s. The sign of N is that of the
-    motion without this friction. If the sign with friction differs, N is smaller than mu2 times the other forces, and so is the
-    error.
+    motion without this friction. The friction can reverse the sign only if |N| is smaller than mu2 times the other forces on
+    the load; the error of N is then also smaller than this product.
 
     **Arguments** (SI, or strings with a unit)
 

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn
 
 _LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
-"""Amplitude, rad, above which the averaged formula and the fitted arcs have a relative error, and that error."""
+"""Amplitude, rad, above which a relative error of the averaged formula and of the fitted arcs is assumed, and this error."""
 
 _MAX_AMPLITUDE = np.pi / 2.0
-"""Amplitude, rad, beyond which the error of the arcs fitted to the turning points is unknown. With 25 samples a second and weak
-friction it changed mu1 by 0.4 to 0.9 percent, up to three times the interval of the noise."""
+"""Amplitude, rad, beyond which the error of the arcs fitted to the turning points is unknown. With 25 samples a second and
+weak friction this error changed mu1 by 0.4 to 0.9 percent, up to three times the interval that follows from the noise."""
 
 
 class Estimate(NamedTuple):
@@ -83,9 +83,13 @@ class Decrement(Result):
     def summary(self) -> str:
         """Return the number with its interval as text."""
         return (
-            f"by {self.periods} periods: mu1 {self.viscous.value:.5g} N m s, from {self.viscous.low:.5g} to "
-            f"{self.viscous.high:.5g}; {len(self.estimates)} pairs scatter by {self.scatter:.2g}"
-            + (f", and drift by {self.drift:.2g} standard errors: not by viscous friction alone" if self.is_drifting else "")
+            f"over {self.periods} periods: mu1 {self.viscous.value:.5g} N m s, from {self.viscous.low:.5g} to "
+            f"{self.viscous.high:.5g}; the values of {len(self.estimates)} pairs scatter by {self.scatter:.2g} (relative)"
+            + (
+                f", and drift by {self.drift:.2g} standard errors: the decay is not caused by viscous friction alone"
+                if self.is_drifting
+                else ""
+            )
         )
 
     @property
@@ -106,9 +110,9 @@ class Decrement(Result):
 def turning_points(record: Record) -> TurningPoints:
     """Return the turning points of a recorded swing, each from all samples within a sixth of a period about it.
 
-    The angle there is fitted by c + a cos(v t) + b sin(v t), whose extremum is the turning point; v = w sqrt(cos A), w the
-    frequency of small swings and A the amplitude, gives the fourth derivative of a large swing there, too. The spread of the
-    samples about all these arcs gives the noise.
+    The angle there is fitted by c + a cos(v t) + b sin(v t), whose extremum is the turning point. With v = w sqrt(cos A),
+    where w is the frequency of small swings and A the amplitude, the arc also has the fourth derivative of a large swing at
+    the turning point. The spread of the samples about all these arcs gives the noise.
 
     **Returns** `TurningPoints`. **Raises** `InputError` for a record with fewer than three turning points, or too few samples
     in a period.
@@ -126,9 +130,7 @@ def turning_points(record: Record) -> TurningPoints:
     noise = float(np.median(np.abs(rough))) / 0.6745 / np.sqrt(70.0)  # fourth differences of a smooth signal are negligible
     peaks = _regular(t, _alternating(f, max(8.0 * noise, 1e-3 * float(np.ptp(f)))))
     if len(peaks) < 3:
-        raise InputError(
-            record.name, f"turns {len(peaks)} times; at least 3 turning points are needed, record more of the swing"
-        )
+        raise InputError(record.name, f"has {len(peaks)} turning points; at least 3 are needed, record more of the swing")
     frequency = np.pi / float(np.median(np.diff(t[peaks])))
     ends = f[peaks]
     middle = float(np.mean((ends[:-2] + 2.0 * ends[1:-1] + ends[2:]) / 4.0))
@@ -142,7 +144,7 @@ def turning_points(record: Record) -> TurningPoints:
         # A large swing has the form of the arc only close to the turning point; a coarse record needs the whole sixth.
         near = away <= np.pi / 3.0 / (1.0 + size**2 / 3.0)
         near = near if np.count_nonzero(near) >= 9 else away <= np.pi / 3.0
-        # In units of 1/w; negative beyond 90 deg, where the arc is a hyperbolic cosine.
+        # Time x in units of 1/w and square = (v/w)^2, which is negative beyond 90 deg: the arc is then a hyperbolic cosine.
         square = float(np.cos(size))
         x = small * (t[near] - t[k])
         basis = _arcs(x, square)
@@ -164,7 +166,9 @@ def turning_points(record: Record) -> TurningPoints:
         spare += len(x) - 3
     if len(times) < 3:
         raise InputError(
-            record.name, f"shows {len(times)} whole turning points; at least 3 are needed, record more of the swing"
+            record.name,
+            f"has {len(times)} turning points that are far enough from both ends; at least 3 are "
+            "needed, record more of the swing",
         )
     noise = np.sqrt(squares / spare)
     return TurningPoints(np.array(times), np.array(angles), noise * np.sqrt(gains), float(noise))
@@ -217,12 +221,13 @@ def ten_periods(
         mu1 = J [G(phi_1) - G(phi_11)] / (10 T),     G' = sin A / (4 [E/K - cos^2(A/2)]) = 2/A - 5 A/48 - ...
 
     - Small swings with viscous friction shrink by exp(-mu1 t/(2 J)), hence 2 J ln(ratio)/(10 T)
-    - A large swing of amplitude A loses mu1 times its action in a period; with the complete elliptic integrals K and E of
-      modulus sin(A/2) this is A' = -(mu1/J)/G'(A), which the second line integrates and which is used here. Beyond 60 deg an
-      error of 0.1 % is left; the interval counts it
-    - Beyond 90 deg the error of the turning points is unknown, and the interval is 0 to infinity; `identify` gives one there
-    - Dry friction is left out: it adds 4 T_f/(pi w A) to mu1 (torque T_f, amplitude A, frequency w), more the smaller the
-      swing; `drift` shows it, and the interval does not hold mu1 then. `identify` finds both
+    - In one period, a large swing of amplitude A loses the energy mu1 times the integral of the angular speed over the angle.
+      With the complete elliptic integrals K and E of modulus sin(A/2) it follows that A' = -(mu1/J)/G'(A). The second line is
+      the integral of this equation, and it is used here. Beyond 60 deg an error of 0.1 % remains, which the interval includes
+    - Beyond 90 deg the error of the turning points is unknown, and the interval is 0 to infinity; `identify` gives a finite
+      interval in this case
+    - Dry friction is neglected: it adds 4 T_f/(pi w A) to mu1 (torque T_f, amplitude A, frequency w), more for smaller swings.
+      `drift` shows this, and the interval then does not contain mu1. `identify` finds the viscous and the dry friction
 
     **Arguments**
 
@@ -230,9 +235,9 @@ def ten_periods(
     - `record` of its swing; typical: 10 to 60 s, first amplitude 3 to 30 deg
     - `periods` between the two amplitudes; typical: 10 (the default). More periods average more noise and need a larger first
       swing
-    - `instrument`: relative uncertainty of J, from ruler and scales, added to the interval in squares; typical: 0.01 to 0.03
-      (default 0)
-    - `turns` of the record, if known already
+    - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
+      interval; typical: 0.01 to 0.03 (default 0)
+    - `turns`: turning points of the record, if they are known already
 
     **Returns** `Decrement`; typical: mu1 of 3e-4 to 2e-3 N m s, 0.0015 in the paper. **Raises** `InputError` if the record is
     shorter.
@@ -300,6 +305,7 @@ def _slope(amplitude: np.ndarray) -> np.ndarray:
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
-    """Return an estimate with its interval; errors of noise and instruments are added in squares."""
+    """Return an estimate with its interval; its half-width is the root of the sum of the squares of the errors of noise and
+    instruments."""
     half = float(np.hypot(quantile * error, instrument * value))
     return Estimate(value, error, value - half, value + half)

@@ -64,7 +64,7 @@ def test_contradictory_demands_are_named_with_what_is_missing():
     np.testing.assert_allclose(total_off, 1e4, rtol=1e-4)
     assert "not met" in "\n".join(best.findings())
     assert best.unverified == "the machine does not meet all demands" and best.run is None
-    with pytest.raises(jv.ComputationError, match=r"contradictory: .*nearest: .*% off.*relax a demand"):
+    with pytest.raises(jv.ComputationError, match=r"contradictory: .*not met by the nearest machine: .*% off.*relax a demand"):
         found(space, NEAREST, subject_to=demands)
 
 

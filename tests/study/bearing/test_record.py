@@ -96,7 +96,7 @@ def test_wrong_records(tmp_path):
         jv.Record(t, 0.01 * t).between(1.0, 3.0)
     with pytest.raises(jv.InputError, match="cannot be read"):
         jv.read_record(tmp_path / "none.csv")
-    with pytest.raises(jv.InputError, match="turns 0 times; at least 3 turning points"):
+    with pytest.raises(jv.InputError, match="has 0 turning points; at least 3"):
         jv.identify(ROD, jv.Record(t, 0.01 * t))
     with pytest.raises(jv.InputError, match=r"has \d samples about the turning point at .* s; 5 are needed"):
         jv.identify(ROD, jv.Record(t, 0.1 * np.cos(np.pi * t / 3.0)))
