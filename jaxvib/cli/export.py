@@ -36,7 +36,7 @@ _ONLY = {"fmi": "fmu", "drive": "fmu", "source_only": "fmu", "mode": "state-spac
 def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) -> None:
     """Write SCENE for other tools: an FMU, a state-space model (MAT) or a universal file (UFF)."""
     given = {name: value for name, value in options.items() if value is not None}
-    for name, value in given.items():
+    for name in given:
         if to not in ([_ONLY[name]] if _ONLY[name] else ["state-space", "uff"]):
             raise InputError(f"--{name.replace('_', '-')}", f"cannot be used with --to {to}; leave it out")
     loaded, output = loaded_scene(scene), Output(as_json, None, scene=scene)
