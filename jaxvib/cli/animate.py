@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -33,14 +33,9 @@ def animate(
     until: str | None,
     start: Start | None,
     mode: int | None,
-    begin: str | None,
-    end: str | None,
-    seconds: str | None,
-    fps: int,
-    magnify: float | None,
-    width: float,
     kind: str,
     output: Output,
+    **options: Any,
 ) -> None:
     """Make a film of the moving machine in slow motion: animation.gif and animation.html, in --out or the current folder.
 
@@ -62,7 +57,7 @@ def animate(
             )
         else:
             motion, scene = jv.jam_orbit(loaded, mode=mode), loaded
-    film = jv.animate(motion, scene=scene, begin=begin, end=end, seconds=seconds, fps=fps, magnify=magnify, width=width)
+    film = jv.animate(motion, scene=scene, **options)
     for suffix in ("gif", "html"):
         if kind in (suffix, "both"):
             film.save(output.made(f"animation.{suffix}"))

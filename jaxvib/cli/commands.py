@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
@@ -13,10 +13,6 @@ from jaxvib.cli.app import Output, app, shared
 from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
-
-if TYPE_CHECKING:
-    from jaxvib.motion.start import Start
-
 
 _SCREENS = ("linear-screen", "circular-screen", "feeder")
 _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus", *_SCREENS)
@@ -67,17 +63,12 @@ def new(kind: str, output: Output) -> None:
 @shared
 def simulate(
     scene: Path,
-    until: str,
-    start: Start,
-    mode: int | None,
-    separation: str | None,
-    spin_up: str | None,
     tolerance: float | None,
     accuracy: float | None,
-    max_steps: int | None,
     window: bool,
     csv: Path | None,
     output: Output,
+    **options: Any,
 ) -> None:
     """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its picture."""
     from jaxvib.ode.progress import ProgressBar  # slow import, which --help does not need
@@ -87,15 +78,10 @@ def simulate(
     loaded = jv.load_scene(scene)
     run = jv.simulate(
         loaded,
-        until,
-        start=start,
-        mode=mode,
-        separation=separation,
-        spin_up=spin_up,
         stepsize_controller=chosen_steps(tolerance, accuracy),
-        max_steps=max_steps,
         save="window" if window else "all",
-        progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, until) else None,
+        progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, options["until"]) else None,
+        **options,
     )
     output.picture("history.png", lambda: run.plot())
     output.keep("run.npz", run)

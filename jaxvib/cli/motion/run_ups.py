@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -21,26 +22,13 @@ from jaxvib.cli.document import SEPARATION
 @click.option("--tolerance", type=float, help="Allowed error of one time step [1e-7].")
 @click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups computed in parallel.")
 @shared
-def run_ups(
-    scene: Path,
-    until: str,
-    drags: tuple[str, ...],
-    starts: int | None,
-    seed: int,
-    separation: str | None,
-    tolerance: float | None,
-    batch: int,
-    output: Output,
-) -> None:
+def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
     """Run SCENE up from rest at each drag with each set of initial angles, and report the final regimes of the loads."""
     from jaxvib.units import number
 
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
     steps = None if tolerance is None else jv.Tolerance(tolerance)
-    loaded = jv.load_scene(scene)
-    found = jv.run_ups(
-        loaded, until, drag=each, starts=starts, seed=seed, separation=separation, batch=batch, stepsize_controller=steps
-    )
+    found = jv.run_ups(jv.load_scene(scene), drag=each, stepsize_controller=steps, **options)
     output.picture("run_ups.png", found.plot)
     output.keep("run_ups.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))
@@ -58,4 +46,5 @@ def run_ups(
         shares = [[f"{row['drag']:.5g}", *(f"{100.0 * row['shares'][kind]:.3g} %" for kind in kinds)] for row in rows]
         return "\n".join([table("final motion of the loads", ["drag, N s/m", *kinds], shares), found.summary()])
 
-    output.done({"until": until, "starts": len(found.angle), "seed": seed, "run_ups": rows}, text, "run_ups", found)
+    document = {"until": options["until"], "starts": len(found.angle), "seed": options["seed"], "run_ups": rows}
+    output.done(document, text, "run_ups", found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
@@ -12,9 +12,6 @@ from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared
 from jaxvib.cli.document import SEPARATION, chosen_steps, measured_document, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
-
-if TYPE_CHECKING:
-    from jaxvib.motion.start import Start
 
 _START = click.option(
     "--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state [jam with --mode, else rest]."
@@ -32,26 +29,13 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 @click.option("--stretches", type=int, default=200, show_default=True, help="Largest number of stretches.")
 @SPEED
 @shared
-def settle(
-    scene: Path,
-    start: Start | None,
-    mode: int | None,
-    separation: str | None,
-    drift: float | None,
-    tolerance: float | None,
-    stretches: int,
-    speed: str | None,
-    output: Output,
-) -> None:
+def settle(scene: Path, speed: str | None, tolerance: float | None, output: Output, **options: Any) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change, or change without a trend.
 
     --out saves the last stretch. With --drift, the motion must repeat itself with at most this relative change.
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
-    steps = chosen_steps(tolerance, None)
-    run = jv.settle(
-        loaded, start=start, mode=mode, separation=separation, drift=drift, stretches=stretches, stepsize_controller=steps
-    )
+    run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance, None), **options)
     output.picture("history.png", run.plot)
     output.keep("run.npz", run)
     output.done(run_document(run), run.summary, "settle", run)
@@ -69,22 +53,12 @@ def settle(
 @CSV
 @shared
 def envelope(
-    scene: Path,
-    until: str,
-    start: Start | None,
-    mode: int | None,
-    separation: str | None,
-    spin_up: str | None,
-    tolerance: float | None,
-    without: tuple[str, ...],
-    csv: Path | None,
-    output: Output,
+    scene: Path, tolerance: float | None, without: tuple[str, ...], csv: Path | None, output: Output, **options: Any
 ) -> None:
     """Integrate the averaged equations of SCENE, for long run-ups in steps of many turns; --out saves them (envelope.npz)."""
     loaded = loaded_scene(scene, without)
-    begin = ("rest" if mode is None else "jam") if start is None else start
     steps = None if tolerance is None else jv.Tolerance(tolerance)
-    run = jv.envelope(loaded, until, start=begin, mode=mode, separation=separation, spin_up=spin_up, stepsize_controller=steps)
+    run = jv.envelope(loaded, stepsize_controller=steps, **_with_start(options))
     output.picture("envelope.png", run.plot)
     output.keep("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
@@ -101,22 +75,16 @@ def envelope(
 @SPEED
 @click.option("--stretches", type=int, default=40, show_default=True, help="Number of stretches of the run, at least 8.")
 @shared
-def growth(
-    scene: Path,
-    until: str,
-    start: Start | None,
-    mode: int | None,
-    separation: str | None,
-    speed: str | None,
-    stretches: int,
-    output: Output,
-) -> None:
+def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> None:
     """Measure the growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and the time after which
     derivatives fail."""
-    if start == "spin_up":
+    if options["start"] == "spin_up":
         raise InputError("--start", "is 'spin_up'; the growth of disturbances needs a constant speed, use 'rest' or 'jam'")
-    begin = ("rest" if mode is None else "jam") if start is None else start
-    loaded = loaded_scene(scene, speed=speed, constant=True)
-    found = jv.growth(loaded, until, start=begin, mode=mode, separation=separation, stretches=stretches)
+    found = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))
     output.picture("growth.png", found.plot)
     output.done(found.as_dict(), found.summary, "growth", found)
+
+
+def _with_start(options: dict[str, Any]) -> dict[str, Any]:
+    """Return options of a run that starts in a jam if it has a mode, and otherwise at rest."""
+    return {**options, "start": options["start"] or ("rest" if options["mode"] is None else "jam")}

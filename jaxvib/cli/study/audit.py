@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -41,15 +41,11 @@ if TYPE_CHECKING:
 def audit(
     scene: Path | None,
     accuracy: str,
-    mode: int | None,
-    until: str | None,
-    start: Literal["rest", "turning"] | None,
     add_missing: bool,
-    tiers: bool,
-    repeats: int,
     count_operations: bool,
     without: tuple[str, ...],
     output: Output,
+    **options: Any,
 ) -> None:
     """Report the change and the cost of each effect and each tier of SCENE: negligible effects, and effects that may be
     missing.
@@ -69,16 +65,7 @@ def audit(
     from jaxvib.units import number
 
     share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
-    found = jv.audit(
-        loaded_scene(scene, without),
-        accuracy=share,
-        mode=mode,
-        until=until,
-        start=start,
-        possible=None if add_missing else (),
-        tiers=tiers,
-        repeats=repeats,
-    )
+    found = jv.audit(loaded_scene(scene, without), accuracy=share, possible=None if add_missing else (), **options)
     if found.effects:
         output.picture("audit.png", found.plot)
     output.done(found.as_dict(), lambda: audit_text(found), "audit", found)
