@@ -38,6 +38,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import degrees
 from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.steady.points import Harmonic, PointAnswers
 from jaxvib.steady.regimes.local import implicit_step, margin_of, quasi_static_growth, slopes_of, vibration_scale
 from jaxvib.steady.regimes.search import all_regimes, is_balanced
 from jaxvib.units import Number, number, numbers
@@ -119,11 +120,15 @@ class AbstractSynchronousRegime(Result):
     scene: Scene = eqx.field(metadata=SCENE)
 
 
-class SynchronousRegime(AbstractSynchronousRegime):
+class SynchronousRegime(PointAnswers, AbstractSynchronousRegime):
     """Synchronous regime, see `AbstractSynchronousRegime`.
 
     Returned by `SynchronousRegimes.select` and `synchronous_regimes(scene, near=...)`.
     """
+
+    def harmonic(self) -> Harmonic:
+        """Return the vibration of the coordinates at Omega."""
+        return Harmonic(self.scene.machine, self.speed, self.displacement)
 
     def summary(self) -> str:
         """Return one line of text; phases in degrees."""
