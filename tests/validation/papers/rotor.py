@@ -141,7 +141,7 @@ def _least_that_jams() -> float:
 
 
 _READING = f"run-up of 6 s with {VARIANTS[_BOTH]}"
-_ECCENTRICITY = "e = 0.22 mm (it reproduces the ripple of the first jam; the printed 25*10^-1 m^2 is not a length)"
+_ECCENTRICITY = "eccentricity e = 0.22 mm, which reproduces the ripple of the first jam (the printed 25*10^-1 m^2 is not a length)"
 
 _number = partial(PrintedNumber, "rotor")
 _speed_number = partial(_number, "section V", unit="rad/s", within=0.05)
@@ -185,7 +185,7 @@ NUMBERS = (
         reason="with the printed c2 = 13635 N no first jam is stable at 9.2e-4 N m s",
     ),
     _friction_number(
-        "friction with the first jam at 169.6 rad/s",
+        "friction at which the first jam has 169.6 rad/s",
         7.5e-4,
         lambda: _holding(_first_jams(), _FIRST, 169.6),
         within=2.5e-4,
@@ -210,7 +210,7 @@ NUMBERS = (
         misprint=Misprint("0.8 m", "0.08 m", "friction at which the printed jam exists", 0.08),
     ),
     _friction_number(
-        "friction with the second jam at 271.1 rad/s",
+        "friction at which the second jam has 271.1 rad/s",
         1.75e-2,
         lambda: _holding(_second_jams(), _SECOND, 271.1),
         within=2.5e-3,
