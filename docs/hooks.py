@@ -12,8 +12,13 @@ from mkdocs.structure.files import File
 
 ROOT = pathlib.Path(__file__).parents[1]
 OPTIMIZE = "Design: the package `optimize`"
-INCLUDED = {"contributing.md": "CONTRIBUTING.md", "engine.md": "jaxvib/ode/README.md", "changelog.md": "CHANGELOG.md"}
-"""Pages that stand elsewhere in the project."""
+INCLUDED = {
+    "contributing.md": "CONTRIBUTING.md",
+    "engine.md": "jaxvib/ode/README.md",
+    "cache.md": "jaxvib/runtime/README.md",
+    "changelog.md": "CHANGELOG.md",
+}
+"""Pages whose text is in another folder of the project, by the name of the page."""
 
 
 def public_groups():
@@ -56,7 +61,8 @@ def on_files(files, config):
     """The pages of the reference, which are written nowhere else, and those that stand elsewhere."""
     for page, source in INCLUDED.items():
         text = (ROOT / source).read_text(encoding="utf-8")
-        text = text.replace("](jaxvib/ode/README.md)", "](engine.md)").replace("](docs/", "](")
+        text = text.replace("](jaxvib/ode/README.md)", "](engine.md)").replace("](jaxvib/runtime/README.md)", "](cache.md)")
+        text = text.replace("](docs/", "](")
         files.append(File.generated(config, page, content=text))
     for name, content in _pictures().items():
         files.append(File.generated(config, f"made/{name}", content=content))

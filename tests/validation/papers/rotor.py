@@ -141,7 +141,9 @@ def _least_that_jams() -> float:
 
 
 _READING = f"run-up of 6 s with {VARIANTS[_BOTH]}"
-_ECCENTRICITY = "eccentricity e = 0.22 mm, which reproduces the ripple of the first jam (the printed 25*10^-1 m^2 is not a length)"
+_ECCENTRICITY = (
+    "eccentricity e = 0.22 mm, which reproduces the ripple of the first jam (the printed 25*10^-1 m^2 is not a length)"
+)
 
 _number = partial(PrintedNumber, "rotor")
 _speed_number = partial(_number, "section V", unit="rad/s", within=0.05)
