@@ -86,6 +86,22 @@ def make(value: Any) -> jv.Scene:
     return eqx.tree_at(lambda s: s.loads.drag, scene(), jnp.asarray(value))
 
 
+def springs() -> list[Any]:
+    return [jv.support(at=(x, 0.0), stiffness=(4e5, 4e5), damping=(2e3, 2e3)) for x in (-1.0, 1.0)]
+
+
+@functools.cache
+def screen() -> jv.Machine:
+    return jv.plane_body(mass=2000.0, inertia=600.0, supports=springs())
+
+
+@functools.cache
+def screen_scene() -> jv.Scene:
+    motor = jv.DCMotor("1000 rpm", stall_torque=300.0, inertia=0.5)
+    placed = [jv.Exciter(drive=motor, unbalance=1.5, at=(x, 0.0), direction=d) for x, d in ((-0.3, 1), (0.3, -1))]
+    return jv.Scene(screen(), exciters=placed)
+
+
 def calls() -> Iterator[Callable[[], Call]]:
     """Every valid call, made when it is needed."""
 
@@ -125,6 +141,13 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("Dimensionless", **form, **scales)
     one = dict(omega=1.0, amplitude=1e-3, force=1.0)
     yield call("Dimensionless.read", lambda: jv.Dimensionless(**form).read, **{k: jnp.asarray(v) for k, v in one.items()})
+    yield call("support", at=(1.0, -0.2), stiffness=(4e5, 4e5), damping=(2e3, 2e3), angle=0.1)
+    yield call("plane_body", mass=2000.0, inertia=600.0, supports=later(springs))
+    loaded = dict(loads=later(lambda: scene().loads), drive=later(lambda: scene().drive))
+    yield call("Exciter", **loaded, unbalance=0.5, unbalance_mass=None, at=2, body=0, direction=-1, effects=())
+    yield call("Exciter", **loaded, unbalance=None, unbalance_mass=None, at=(0.1, 0.2), body=0, direction=1, effects=())
+    yield call("unbalance", force="20 kN", at="1000 rpm")
+    yield call("SwitchedOff", motor=later(lambda: screen_scene().exciters[0].drive), at=1.0, bearing=0.01)
     yield call("balls", count=2, mass=0.8, radius=0.12, drag=1.5, ball_radius=0.01)
     yield call("rollers", count=2, mass=0.8, radius=0.12, drag=1.5, ball_radius=0.01)
     yield call("pendulums", count=2, mass=0.8, radius=0.12, drag=1.5, inertia=0.01)
@@ -145,6 +168,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("LoadContact", stiffness=1e6, damping=0.0, restitution=None)
     parts = {name: later(lambda name=name: getattr(scene(), name)) for name in ("machine", "loads", "drive")}
     yield call("Scene", **parts, effects=(jv.Gravity(),))
+    yield call("Scene of exciters", lambda: jv.Scene, machine=later(screen), exciters=later(lambda: screen_scene().exciters))
     toml = later(lambda: jv.scene_to_toml(scene()))
     file = later(lambda: jv.save_scene(scene(), FOLDER / "scene.toml"))
     yield call("load_scene", path=file)
@@ -171,6 +195,9 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("stability_map", make=make, values=[1.0, 2.0], omega=(10.0, 15.0), points=8)
     ends = dict(between=(0.02, 0.05), omega=(0.36, 0.5))
     yield call("stability_onset", make=heavy, kind="torus", **ends, points=60, accuracy=0.9)
+    pair = dict(speed=None, phases=(0.0, 3.1), accuracy=None, points=None, throw=True)
+    yield call("synchronous_orbit", scene=later(screen_scene), regime=None, **pair)
+    yield call("ellipse_of", amplitude=jnp.array([0.005, -0.005j]), speed=100.0, slope=0.0, remainder=0.0)
     # Balancing
     r = later(rotor_scene)
     yield call("criterion", scene=r)
@@ -235,7 +262,20 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("load", path=later(lambda: jv.jam_modes(scene()).save(FOLDER / "modes")))
     yield call("write_csv", result=later(run), axis="time", path=path)
     yield call("html_report", result=modes, path=path, title="t", scene=s, figures=())
+    # Exchange
+    unit = dict(fmi="2.0", start="rest", mode=None, drive="scene", binary=False)
+    yield call("export_fmu", scene=s, path=path, **unit)
+    yield call("export_fmu of a body", lambda: jv.export_fmu, scene=later(screen_scene), path=path, **unit | {"drive": "input"})
+    yield call("state_space", scene=s, at="rest", rotor_speed=100.0)
+    yield call("state_space of a jam", lambda: jv.state_space, scene=s, at=later(lambda: jv.jam_modes(scene()).select(3)))
+    yield call("StateSpace.frequency_response", lambda: jv.state_space(scene()).frequency_response, omega=[10.0, 20.0])
+    yield call("StateSpace.save", lambda: jv.state_space(scene()).save, path=path)
+    lines = dict(quantity="displacement", frequencies=(1.0, 2.0, 3.0), rotor_speed=100.0)
+    yield call("export_uff", source=s, path=path, **lines)
+    yield call("read_uff", path=later(lambda: jv.export_uff(scene(), FOLDER / "machine.uff", frequencies=(1.0, 2.0, 3.0))))
+    yield call("display_units", speed="rpm", si=False)
     # Methods of results
+    yield call("Result.to_pandas", lambda: jv.branches(scene(), points=50).to_pandas, axis=None)
     yield call("Result.save", lambda: jv.jam_modes(scene()).save, path=path)
     yield call("Result.load", lambda: jv.JamModes.load, path=later(lambda: jv.jam_modes(scene()).save(FOLDER / "modes")))
     figure = dict(unit="Hz", ax=None)
