@@ -27,7 +27,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
 from jaxvib.steady.jams.phases import PhaseJam
-from jaxvib.units import Number, number
+from jaxvib.units import Number, Numbers, number, numbers
 
 if TYPE_CHECKING:
     import control
@@ -77,9 +77,10 @@ class StateSpace(NamedTuple):
         """Return the eigenvalues of A, (nx,) complex, 1/s."""
         return np.linalg.eigvals(self.A)
 
-    def frequency_response(self, omega: Any) -> np.ndarray:
+    @validated
+    def frequency_response(self, omega: Numbers) -> np.ndarray:
         """Return C (i w - A)^-1 B + D, the amplitudes of outputs per input at `omega` (nw,) rad/s; shape (nw, ny, nu)."""
-        frequencies = np.atleast_1d(np.asarray(omega, float))[:, None, None]
+        frequencies = np.ravel(np.asarray(numbers(omega, "rad/s", "omega", None), float))[:, None, None]
         inner = np.linalg.solve(1j * frequencies * np.eye(len(self.A)) - self.A, self.B.astype(complex))
         return self.C @ inner + self.D
 

@@ -19,7 +19,7 @@ from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, Roto
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.mount import Mount, Place, on_body, read_place
 from jaxvib.machine.numbers import Part, read_numbers, unit
-from jaxvib.units import Number, number
+from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known
 
 _MIN_RATIO = 1e-15
@@ -99,7 +99,7 @@ class Exciter(Part):
         self.carries = ("loads",) * (loads is not None) + ("unbalance",) * (unbalance is not None)
         place = read_place(at, "at")
         self.platform, self.position = (place, None) if isinstance(place, int) else (None, place)
-        self.body = body
+        self.body = count(body, "body", low=0)
 
     @property
     def is_plain(self) -> bool:

@@ -25,7 +25,8 @@ from jaxvib.results.fields import in_unit, is_single, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
-from jaxvib.units import Number, known_number, numbers
+from jaxvib.units import Number, known_number, number, numbers
+from jaxvib.units.known import when_known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,9 +89,8 @@ class Ellipse(eqx.Module):
         return self.summary() if is_single(self) else super().__repr__()
 
 
-def ellipse_of(
-    amplitude: Array, speed: Array | float, *, slope: Array | float = 0.0, remainder: Array | float = 0.0
-) -> Ellipse:
+@validated
+def ellipse_of(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0, remainder: Number = 0.0) -> Ellipse:
     """Return the ellipse of u = Re(U e^{i w t}).
 
         x + i y = P e^{i w t} + N e^{-i w t},    P = (U_x + i U_y)/2,    N = conj(U_x - i U_y)/2
@@ -104,12 +104,26 @@ def ellipse_of(
     - `remainder` of the motion, see `Ellipse`
 
     **Returns** `Ellipse`. Derivatives are finite everywhere. At a circle, where the derivative of |P| or |N| does not exist, it
-    is 0.
+    is 0. **Raises** `InputError` for numbers that are not finite, and for another number of amplitudes.
 
     >>> import jax.numpy as jnp
     >>> print(ellipse_of(jnp.array([0.005, -0.005j]), 100.0).summary())
     semi-axes 5 and 5 mm, anticlockwise, a circle, 5.099 g, throw number 5.099
     """
+    if jnp.shape(amplitude) != (2,):
+        raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give the two amplitudes across and up")
+    when_known(_require_finite, amplitude)
+    w, along = number(speed, "rad/s", "speed"), number(slope, "rad", "slope")
+    return _ellipse_of(jnp.asarray(amplitude), w, along, number(remainder, "", "remainder", low=0.0))
+
+
+def _require_finite(amplitude: np.ndarray) -> None:
+    if not np.all(np.isfinite(amplitude)):
+        raise InputError("amplitude", f"is {quoted(amplitude)}; finite numbers are needed")
+
+
+def _ellipse_of(amplitude: Array, speed: Array, slope: Array, remainder: Array) -> Ellipse:
+    """Return `ellipse_of` numbers that are validated already."""
     x, y = amplitude[0], amplitude[1]
     forward, backward = (x + 1j * y) / 2.0, jnp.conj(x - 1j * y) / 2.0
     one, other = magnitude(forward), magnitude(backward)
@@ -265,4 +279,4 @@ def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellips
     amplitude = rows @ motion.amplitude
     on = 0.5 * jnp.sum(jnp.abs(amplitude) ** 2)
     off = jnp.zeros_like(on) if motion.rest is None else jnp.sum((rows @ motion.rest) * rows)
-    return amplitude, ellipse_of(amplitude, motion.speed, slope=slope, remainder=jnp.sqrt(off / on))
+    return amplitude, _ellipse_of(amplitude, motion.speed, slope, jnp.sqrt(off / on))

@@ -152,3 +152,9 @@ def test_other_packages_have_the_same_response():
 def test_wrong_arguments_end_in_one_sentence(call, says):
     with pytest.raises(jv.InputError, match="^" + says.replace("(", r"\(")):
         call(scene())
+
+
+def test_hostile_frequencies_of_responses_are_refused():
+    for omega in ("a", {}, [1.0 + 1j], [float("nan")], object()):
+        with pytest.raises(jv.InputError, match="^omega"):
+            jv.state_space(scene()).frequency_response(omega)

@@ -145,6 +145,7 @@ BAD = {
         lambda: jv.Scene(TWO, LOADS, DRIVE, exciters=[jv.Exciter(LOADS, DRIVE)]),
         "are given together with loads or drive",
     ),
+    "body": (lambda: jv.Exciter(LOADS, DRIVE, body=0.5), r"body is 0.5; it must be a whole number, at least 0"),
     "none": (lambda: jv.Scene(TWO, exciters=[]), r"exciters is \[\]; it must be a list of exciters"),
     "replaced number": (
         lambda: jv.simulate(eqx.tree_at(lambda s: s.exciters[1].unbalance, two(), -1.0), 1.0),

@@ -183,3 +183,16 @@ def test_run_without_a_trajectory_refuses_its_whole_motion():
     run = run_of(exciter((0.0, 0.5)))
     with pytest.raises(jv.InputError, match="part is 'all', but the run kept its window only"):
         run.point(part="all")
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "speed", "says"),
+    [
+        (jnp.ones(3), 100.0, r"^amplitude has the shape \(3,\); give the two amplitudes across and up"),
+        (jnp.array([1.0, jnp.nan]), 100.0, "^amplitude is .*; finite numbers are needed"),
+        (jnp.ones(2), jnp.asarray(True), "^speed is "),
+    ],
+)
+def test_wrong_numbers_of_ellipses_are_refused(amplitude, speed, says):
+    with pytest.raises(jv.InputError, match=says):
+        jv.ellipse_of(amplitude, speed)
