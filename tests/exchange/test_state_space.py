@@ -156,5 +156,5 @@ def test_wrong_arguments_end_in_one_sentence(call, says):
 
 def test_hostile_frequencies_of_responses_are_refused():
     for omega in ("a", {}, [1.0 + 1j], [float("nan")], object()):
-        with pytest.raises(jv.InputError, match="^omega"):
+        with pytest.raises(jv.InputError, match=r"^omega"):
             jv.state_space(scene()).frequency_response(omega)
