@@ -181,7 +181,7 @@ def race(free: int, seconds: float) -> None:
         ("CMA-ES", lambda: by_evolution_strategy(problem, seconds)),
         ("differential evolution", lambda: by_differential_evolution(problem, seconds)),
     ):
-        # Of 50 platforms the whole branches of a first population of 800 take half an hour.
+        # The first population for 50 platforms has 800 designs.
         if name == "differential evolution" and free > _LARGEST_POPULATION:
             continue
         courses[name] = course = search()
