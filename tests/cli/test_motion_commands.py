@@ -13,6 +13,7 @@ from small_machine import small_run
 import jaxvib as jv
 from jaxvib.cli.app import _HOMES, app, run
 from jaxvib.machine.files import EFFECTS, SECTIONS, TEMPLATES
+from jaxvib.machine.structures.screens import SCREENS
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
 
@@ -216,5 +217,5 @@ def test_help_imports_nothing_slow_and_lists_the_choices():
         (name, p.name): tuple(getattr(p.type, "choices", ())) for name in _HOMES for p in app.get_command(None, name).params
     }
     assert options["cost", "quantity"] == QUANTITIES and options["cost", "solvers"] == tuple(SOLVERS)
-    machines = tuple(name.replace("_", "-") for name in TEMPLATES)
+    machines = tuple(name.replace("_", "-") for name in (*TEMPLATES, *SCREENS))
     assert options["new", "kind"] == (*machines, "design", "measurement", "sweep")
