@@ -72,7 +72,6 @@ def test_leaves_of_one_exciter_keep_their_order():
         jv.audit,
         lambda s: jv.jam_orbit(s, omega=9.0),
         lambda s: jv.whirl(s, [9.0]),
-        lambda s: jv.growth(s, 9.0),
         lambda s: jv.initial_state(s, "jam", mode=1),
     ],
 )
