@@ -102,7 +102,7 @@ def test_dimensionless_forms_refuse_what_cannot_be():
         (dict(natural=(1.0,) * 4), "natural has 4 values; the papers' machines have 1, 2 or 3 platforms"),
         (dict(eps=0.0), "eps is 0; it must be greater than 0"),
         (dict(rho=-1.0), "rho is -1; it must be greater than 0"),
-        (dict(eps=0.5, count=3), "1 - (mass of all loads)/M2S is -0.5; it must be greater than 0"),
+        (dict(eps=0.5, count=3), "1 - (mass of all loads)/M2S (from eps, kappa and count) is -0.5; it must be greater than 0"),
         (dict(kappa=0.5), "kappa is 0.5; it must be at least 1"),
     ):
         with pytest.raises(jv.InputError) as error:
@@ -195,7 +195,7 @@ WRONG_ROTORS = {
         lambda: touching(),
         r"needs loads on one track, but the loads of this machine run at several stations",
     ),
-    "twice": (lambda: rotor_scene(effects=(jv.Gravity(), jv.Gravity())), r"names gravity 2 times"),
+    "twice": (lambda: rotor_scene(effects=(jv.Gravity(), jv.Gravity())), r"contains gravity 2 times"),
 }
 
 

@@ -197,7 +197,7 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
         (lambda: jv.Sliding(0.1, width=-1.0), "effects.sliding.width is -1 m/s; it must be greater than 0"),
         (
             lambda: jv.Scene(HEAVY, PLANE, jv.ConstantSpeed(1.0), (jv.FreeSpin(),)),
-            "effects.free_spin needs balls in a torus; 'ball' are not coupled",
+            "effects.free_spin needs balls in a torus; 'ball' have no drilling spin",
         ),
         (
             lambda: jv.Scene(
