@@ -1,0 +1,99 @@
+"""Synchronous regimes: a family, no damping, derivatives, a dense scan, bad input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+
+MOTOR = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
+
+
+def body(stiffness=3e3, damping=150.0):
+    springs = [jv.support(at=(x, 0.0), stiffness=(stiffness,) * 2, damping=(damping,) * 2) for x in (-0.6, 0.6)]
+    return jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+
+
+def scene_of(places, ways, drives=None, machine=None, unbalance=0.4, effects=()):
+    drives = drives or [MOTOR] * len(places)
+    parts = zip(drives, places, ways, strict=True)
+    exciters = [jv.Exciter(drive=d, unbalance=unbalance, at=at, direction=way) for d, at, way in parts]
+    return jv.Scene(machine or body(), exciters=exciters, effects=effects)
+
+
+PAIR = [(-0.6, 0.0), (0.5, 0.1)]
+
+
+def test_opposite_exciters_at_the_centre_are_one_family():
+    found = jv.synchronous_regimes(scene_of([(0.0, 0.0)] * 2, (1, -1)))
+    assert found.speed.size == 1 and found.select(0).status_name == "degenerate"
+    assert "family" in found.summary()
+
+
+def test_no_damping_is_not_called_stable():
+    found = jv.synchronous_regimes(scene_of(PAIR, (1, -1), machine=body(damping=0.0)))
+    assert found.speed.size == 2 and np.all(np.isfinite(found.growth)) and not np.any(found.stable)
+    np.testing.assert_allclose(found.speed, 100.0, rtol=1e-12)
+
+
+def test_derivatives_are_those_of_finite_differences():
+    def ask(x):
+        first = jv.InductionMotor(100.05, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
+        scene = scene_of(PAIR, (1, -1), [first, MOTOR])
+        scene = eqx.tree_at(lambda s: (s.machine.mass, s.exciters[1].unbalance), scene, (300.0 * x, 0.4 * x**2))
+        regime = jv.synchronous_regimes(scene, near=(99.9, jnp.array([0.0, 3.0])))
+        return jnp.stack([regime.speed, regime.phases[1], regime.margin, regime.power[0], regime.foundation_force])
+
+    forward, backward = jax.jit(jax.jacfwd(ask))(1.0), jax.jit(jax.jacrev(ask))(1.0)
+    step = 1e-4
+    values = jax.vmap(ask)(1.0 + step * jnp.array([-2.0, -1.0, 1.0, 2.0]))
+    differences = jnp.array([1.0, -8.0, 8.0, -1.0]) @ values / (12.0 * step)
+    np.testing.assert_allclose(forward, differences, rtol=2e-6)
+    np.testing.assert_allclose(backward, forward, rtol=1e-9)
+    assert np.all(np.isfinite(values)) and np.all(np.abs(forward) > 1e-9)
+
+
+def brute_force(scene, omegas, angles):
+    """Regimes of two motors: the phase difference of torques along every root of their sum, on a dense grid."""
+    carrier, exciters = scene.machine.carrier(), scene.exciters
+    m, c, k = (np.asarray(x) for x in (carrier.mass, carrier.damping, carrier.stiffness))
+    rows = [np.array([[1, 0, -e.at[1]], [0, 1, e.at[0]]]).T @ np.array([1, -1j * e.direction]) for e in exciters]
+    d = np.array(rows)
+    receptance = np.linalg.inv(k - omegas[:, None, None] ** 2 * m + 1j * omegas[:, None, None] * c)
+    h = np.einsum("ia,gab,kb->gik", d.conj(), receptance, d) * 0.4**2 * omegas[:, None, None] ** 4 / 2
+    turn = np.exp(1j * angles)[:, None]
+    first = np.imag(h[:, 0, 0] + turn * h[:, 0, 1]) + np.asarray(jax.vmap(exciters[0].drive.torque)(jnp.asarray(omegas)))
+    second = np.imag(h[:, 1, 1] + h[:, 1, 0] / turn) + np.asarray(jax.vmap(exciters[1].drive.torque)(jnp.asarray(omegas)))
+    total, crossings = first + second, []
+    # Follow each root of the total over the angle; count sign changes of the first torque along it.
+    place, at = np.nonzero(total[:, :-1] * total[:, 1:] < 0)
+    share = total[place, at] / (total[place, at] - total[place, at + 1])
+    speed = omegas[at] + share * (omegas[at + 1] - omegas[at])
+    value = first[place, at] + share * (first[place, at + 1] - first[place, at])
+    for row in range(len(angles) - 1):
+        here, there = place == row, place == row + 1
+        for w, v in zip(speed[here], value[here], strict=True):
+            near = np.argmin(np.abs(speed[there] - w))
+            if abs(speed[there][near] - w) < 0.05 and v * value[there][near] < 0:
+                crossings.append((w, angles[row]))
+    return np.array(crossings)
+
+
+@pytest.mark.parametrize(("stall", "ways"), [(60.0, (1, 1)), (9.0, (1, 1))])
+def test_search_of_two_exciters_equals_a_dense_scan(stall, ways):
+    drives = [jv.DCMotor(n, stall_torque=stall, inertia=0.05) for n in (100.0, 97.0)]
+    scene = scene_of(PAIR, ways, drives, body(1.2e5, 350.0))
+    expected = brute_force(scene, np.linspace(1.0, 101.0, 8001), np.linspace(-np.pi, np.pi, 1441))
+    found = jv.synchronous_regimes(scene)
+    phase = np.asarray(found.phases[:, 1])
+    for w, a in expected:
+        apart = np.abs(np.exp(1j * phase) - np.exp(1j * a)) + np.abs(np.asarray(found.speed) - w)
+        assert np.min(apart) < 0.03
+    assert found.speed.size == len(expected) > 0
+
+
+def test_start_with_a_wrong_number_of_phases_is_refused():
+    with pytest.raises(jv.InputError, match="one phase for each of the 2 rotating masses"):
+        jv.synchronous_regimes(scene_of(PAIR, (1, 1)), near=(99.0, jnp.zeros(3)))
