@@ -56,7 +56,7 @@ class Motion(NamedTuple):
     **Attributes**
 
     - `state`, and the rotor's `speed`
-    - `imbalance` of the rotor, see `RotorDynamics._imbalance`
+    - `imbalance_derivatives` of the rotor, see `RotorDynamics._imbalance_derivatives`
     - `kinematics` of the loads
     - `drag` (count,): torque of the rotor on the loads
     - `weight`: torque of gravity on the unbalance, see `RotorDynamics.weight`
@@ -67,7 +67,7 @@ class Motion(NamedTuple):
 
     state: ExciterState
     speed: Array
-    imbalance: tuple[list[Array], list[Array]] | None
+    imbalance_derivatives: tuple[list[Array], list[Array]] | None
     kinematics: Kinematics
     drag: Array
     weight: Array | None
@@ -81,14 +81,14 @@ class Eliminated(NamedTuple):
 
     **Attributes**
 
-    - `rate_without_carrier`, `accelerance`: loads move with u'' = `rate_without_carrier` - `accelerance` . a_j, where a_j is
-      the acceleration at each load, by axis
+    - `acceleration_without_carrier`, `response_to_carrier`: loads move with
+      u'' = `acceleration_without_carrier` - `response_to_carrier` . a_j, where a_j is the acceleration at each load, by axis
     - `added_mass`, `reaction`: the force of the exciter on the rows is -(`added_mass` a + `reaction`)
     - `rotor`: the rotor of a motor moves with theta'' = `rotor`[0] - `rotor`[1] . a; None under an ideal drive
     """
 
-    rate_without_carrier: tuple[Array, ...]
-    accelerance: dict[int, tuple[Array, ...]]
+    acceleration_without_carrier: tuple[Array, ...]
+    response_to_carrier: dict[int, tuple[Array, ...]]
     added_mass: Sequence[Sequence[Array | float]]
     reaction: Sequence[Array | float]
     rotor: tuple[Array, list[Array]] | None
@@ -96,7 +96,8 @@ class Eliminated(NamedTuple):
     def change(self, a: Axes) -> tuple[Array, ...]:
         """Return u'' from `a`, the accelerations of the points that carry the loads."""
         return tuple(
-            f - sum(self.accelerance[axis][i] * x for axis, x in a.items()) for i, f in enumerate(self.rate_without_carrier)
+            f - sum(self.response_to_carrier[axis][i] * x for axis, x in a.items())
+            for i, f in enumerate(self.acceleration_without_carrier)
         )
 
 
@@ -130,7 +131,7 @@ class RotorDynamics(eqx.Module):
         """Return the quantities that do not need the accelerations, for a rotor that turns at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
         drag, weight = jnp.zeros_like(speed), self.weight(t, state)
-        return Motion(state, speed, self._imbalance(t, state), no_loads, drag, weight, no_contact, housing, t)
+        return Motion(state, speed, self._imbalance_derivatives(t, state), no_loads, drag, weight, no_contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the exciter's own accelerations in terms of those of the mount.
@@ -174,16 +175,16 @@ class RotorDynamics(eqx.Module):
         """
         motor = self._motor(motion)
         if motor is None:
-            if motion.imbalance is not None:
-                reaction = [g + b for g, b in zip(reaction, motion.imbalance[1], strict=True)]
+            if motion.imbalance_derivatives is not None:
+                reaction = [g + b for g, b in zip(reaction, motion.imbalance_derivatives[1], strict=True)]
             return added_mass, reaction, None
         torque, inertia = motor
         taken, felt = self._taken_torque(motion, drag, coupling)
         free = (torque - taken) / inertia
         row = [f / inertia for f in felt] + [jnp.zeros_like(free)] * (len(reaction) - len(felt))
-        if motion.imbalance is None:
+        if motion.imbalance_derivatives is None:
             return added_mass, reaction, (free, row)
-        along, bend = motion.imbalance
+        along, bend = motion.imbalance_derivatives
         added_mass = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(added_mass, along, strict=True)]
         reaction = [g + b + d * free for g, b, d in zip(reaction, bend, along, strict=True)]
         return added_mass, reaction, (free, row)
@@ -201,9 +202,9 @@ class RotorDynamics(eqx.Module):
         taken = self._total(drag)
         taken = taken if motion.weight is None else taken + motion.weight
         by_loads = [self._total(coupling[i], lever) for lever in self.levers for i in self.axes] if coupling else []
-        if motion.imbalance is None:
+        if motion.imbalance_derivatives is None:
             return taken, by_loads
-        along = motion.imbalance[0]
+        along = motion.imbalance_derivatives[0]
         return taken, [f + d for f, d in zip(by_loads, along, strict=False)] + along[len(by_loads) :]
 
     def _add_housing(self, motion: Motion, part: Eliminated, drag: Array, coupling: Axes) -> Eliminated:
@@ -220,7 +221,7 @@ class RotorDynamics(eqx.Module):
         rotor = None if part.rotor is None else (part.rotor[0], [*part.rotor[1], zero])
         return part._replace(added_mass=added_mass, reaction=[*part.reaction, torque], rotor=rotor)
 
-    def _imbalance(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
+    def _imbalance_derivatives(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
         """Return two derivatives of d(theta), the imbalance on each row of the mount; None without an imbalance.
 
         The first is d'. The second is d'' theta'^2 under a motor, and the second time derivative of d under an ideal drive.
@@ -279,7 +280,7 @@ class ExciterDynamics(RotorDynamics):
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return the quantities that do not need the accelerations, for a rotor that turns at `speed`."""
-        imbalance = self._imbalance(t, state)
+        imbalance_derivatives = self._imbalance_derivatives(t, state)
         found = kinematics(self.loads, state.angle, state.rate)
         drag, force = self._forces(state, speed)
         g = total_gravity(self.effects)
@@ -287,7 +288,7 @@ class ExciterDynamics(RotorDynamics):
         rubbing = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
         friction = [each.signed({}) if each.normal is None else each for each in rubbing]
         contact = ContactSolution(self.loads.inertia_factor(), force, friction)
-        return Motion(state, speed, imbalance, found, drag, self.weight(t, state), contact, housing, t)
+        return Motion(state, speed, imbalance_derivatives, found, drag, self.weight(t, state), contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the accelerations of loads and rotor in terms of those of the mount.
@@ -304,10 +305,10 @@ class ExciterDynamics(RotorDynamics):
         free = solve(tuple(force))
         rows = {axis: [m * column[axis] for column in found.columns] for axis in axes}
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, coupling, strict=True)] for axis, row in rows.items()}
-        accelerance = {axis: solve(tuple(row)) for axis, row in rows.items()}
-        added_mass, reaction = self._felt_by_mount(found, free, accelerance)
+        response_to_carrier = {axis: solve(tuple(row)) for axis, row in rows.items()}
+        added_mass, reaction = self._felt_by_mount(found, free, response_to_carrier)
         added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag, coupling[0])
-        part = Eliminated(free, accelerance, added_mass, reaction, rotor)
+        part = Eliminated(free, response_to_carrier, added_mass, reaction, rotor)
         return self._add_housing(motion, part, drag, coupling[0])
 
     def at_loads(self, a: Sequence[Array]) -> Axes:
@@ -385,7 +386,7 @@ class ExciterDynamics(RotorDynamics):
         return drag, force, coupling
 
     def _felt_by_mount(
-        self, found: Kinematics, free: tuple[Array, ...], accelerance: Mapping[int, tuple[Array, ...]]
+        self, found: Kinematics, free: tuple[Array, ...], response_to_carrier: Mapping[int, tuple[Array, ...]]
     ) -> tuple[list[list[Array | float]], list[Array | float]]:
         """Return added mass and reaction of the loads.
 
@@ -393,7 +394,7 @@ class ExciterDynamics(RotorDynamics):
         """
         m, axes, levers = self.loads.mass, self.axes, self.levers
         across = {axis: [column[axis] for column in found.columns] for axis in axes}
-        own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(across[i], accelerance[k]) for i in axes for k in axes}
+        own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(across[i], response_to_carrier[k]) for i in axes for k in axes}
         moments = {
             (i, k, low, high): self._total(own[i, k], levers[low], levers[high])
             for i, k in own
