@@ -70,6 +70,7 @@ from jaxvib.steady.regimes.synchronous import (
 from jaxvib.steady.orbits.diagram import ExactBranches
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus
+from jaxvib.steady.orbits.limit import LimitStatus, SynchronizationLimit, synchronization_limit
 from jaxvib.steady.orbits.synchronous import SynchronousOrbit, SynchronousStatus, synchronous_orbit
 from jaxvib.study.maps.stability_onset import stability_map, stability_onset
 
@@ -234,6 +235,9 @@ __all__ = [
     "Orbit",
     "OrbitStatus",
     "ExactBranches",
+    "synchronization_limit",
+    "SynchronizationLimit",
+    "LimitStatus",
     "synchronous_orbit",
     "SynchronousOrbit",
     "SynchronousStatus",

@@ -40,7 +40,7 @@ from jaxvib.units import Number, Numbers, known_number
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["SynchronousOrbit", "SynchronousStatus", "synchronous_orbit"]
+__all__ = ["HasSpeedAndPhases", "SynchronousOrbit", "SynchronousStatus", "synchronous_orbit"]
 
 _UNKNOWN_STEPS = 64
 """Number of integration steps for the multipliers under a JAX transformation; reverse derivatives need a static number."""
@@ -60,7 +60,7 @@ class SynchronousStatus(eqx.Enumeration):
     refused = REFUSED
 
 
-class _HasSpeedAndPhases(Protocol):
+class HasSpeedAndPhases(Protocol):
     """Synchronous regime of the averaged theory."""
 
     @property
@@ -174,7 +174,7 @@ def _at(scene: Scene, omega: Array, displacement: Array, deviation: Array, theta
 @validated
 def synchronous_orbit(
     scene: Scene,
-    regime: _HasSpeedAndPhases | None = None,
+    regime: HasSpeedAndPhases | None = None,
     *,
     speed: Number | None = None,
     phases: Numbers | None = None,

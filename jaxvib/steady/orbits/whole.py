@@ -156,14 +156,14 @@ def _rates(grid: Grid, x: Array) -> tuple[Array, Array]:
     return x @ grid.first.T, x @ grid.second.T
 
 
-def _residual(scene: PeriodicScene, grid: Grid, x: Array, omega: Array) -> Array:
+def residual_of(scene: PeriodicScene, grid: Grid, x: Array, omega: Array) -> Array:
     """Return d^2 x/dtheta^2 minus the acceleration by the equations of motion at the points, (n, M)."""
     rate, second = _rates(grid, x)
     theta = jnp.asarray(grid.theta, x.dtype)
     return second - jax.vmap(scene.acceleration, in_axes=(0, 1, 1, None), out_axes=1)(theta, x, rate, omega)
 
 
-def _collocation(scene: PeriodicScene, grid: Grid, x: Array, omega: Array, *, forced: bool) -> _Collocation:
+def collocation(scene: PeriodicScene, grid: Grid, x: Array, omega: Array, *, forced: bool) -> _Collocation:
     """Return residuals and their Jacobian.
 
     Without forcing, the speed Omega is the last unknown, and the last equation keeps the mean deviation of the first body.
@@ -204,7 +204,7 @@ def solve_whole(
     motion, follow from the implicit function theorem.
     """
     if known is None:
-        start = _start(scene, grid, omega)
+        start = linear_start(scene, grid, omega)
     else:
         start, omega = known.x, omega if forced else known.omega
     speed = omega if forced else jax.lax.stop_gradient(omega)
@@ -213,7 +213,7 @@ def solve_whole(
     return WholeMotion(x, w)
 
 
-def _start(scene: PeriodicScene, grid: Grid, omega: Array) -> Array:
+def linear_start(scene: PeriodicScene, grid: Grid, omega: Array) -> Array:
     """Return the linear response of the carrier to bodies that turn uniformly.
 
     q = Re(Y e^(i theta)),    D(Omega) Y = Omega^2 sum_k S_k B_k^T (1, -i sigma_k) e^(i alpha_k)
@@ -248,7 +248,7 @@ def _solve(
         return x + change[:size].reshape(x.shape), w if forced else w + change[-1]
 
     def linearize(x: Array, w: Array) -> Linearized:
-        found = _collocation(scene, on, x, w, forced=forced)
+        found = collocation(scene, on, x, w, forced=forced)
         right = found.residual.ravel() if forced else jnp.append(found.residual.ravel(), 0.0)
         # Residuals of the carrier count with the torques that they cause. Otherwise no step that turns bodies would reduce the
         # norm, because the torques between bodies are small beside the forces on the carrier.
@@ -266,8 +266,8 @@ def _solve_jvp(primals, tangents, *, grid: tuple[int, bool], forced: bool, is_kn
     x, w = _solve(scene, omega, start, grid=grid, forced=forced, is_known=is_known)
     on = grid_of(*grid)
     by_omega = tangents[1] if forced else None
-    change = eqx.filter_jvp(lambda s, v: _residual(s, on, x, v), (scene, w), (tangents[0], by_omega))[1].ravel()
-    matrix = _collocation(scene, on, x, w, forced=forced).matrix
+    change = eqx.filter_jvp(lambda s, v: residual_of(s, on, x, v), (scene, w), (tangents[0], by_omega))[1].ravel()
+    matrix = collocation(scene, on, x, w, forced=forced).matrix
     found = -jnp.linalg.solve(matrix, change if forced else jnp.append(change, 0.0))
     speed = (jnp.zeros_like(w) if by_omega is None else by_omega) if forced else found[-1]
     return (x, w), (found[: x.size].reshape(x.shape), speed)
@@ -280,9 +280,9 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
     change by one Newton step with the residuals at twice as many points, and the highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
-    found, nd = _collocation(scene, grid, x, omega, forced=forced), scene.coordinates
+    found, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates
     fine = grid_of(2 * grid.theta.size, grid.symmetric)
-    between = _residual(scene, fine, x @ resampling(grid, fine), omega) @ resampling(fine, grid)
+    between = residual_of(scene, fine, x @ resampling(grid, fine), omega) @ resampling(fine, grid)
     change = solve_in_turn(found.matrix, between.ravel() if forced else jnp.append(between.ravel(), 0.0))
     last = jnp.abs(analyzed(x, deviation_analysis(grid))[:, -1:])
     off = jnp.concatenate([jnp.abs(change[: x.size].reshape(x.shape)), last], axis=1)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
+from scipy.optimize import brentq, fsolve
 
 import jaxvib as jv
 
@@ -197,6 +197,56 @@ def test_motor_that_is_off_follows_the_other_one():
     assert float(orbit.torque[0]) > 0.02 * float(orbit.speed) and -np.pi / 2.0 < float(orbit.phases[1]) < 0.0
 
 
+@pytest.mark.parametrize(("speed", "phase"), [(18.0, 0.0), (33.0, np.pi)])
+def test_two_jammed_balancers_push_the_mode_together(speed, phase):
+    # In step below the resonance of the translation (20 rad/s), against each other below that of the turn (36.5 rad/s).
+    machine = body((4e5, 4e5), (2e3, 2e3), places=((-1.0, 0.0), (1.0, 0.0)))
+    balls = jv.balls(count=1, mass=4.0, radius=0.2, drag=0.5)
+    exciters = [jv.Exciter(balls, jv.ConstantSpeed(60.0), at=(x, 0.0)) for x in (-0.8, 0.8)]
+    orbit = jv.synchronous_orbit(jv.Scene(machine, exciters=exciters), speed=speed, phases=[0.0, phase])
+    assert float(orbit.phases[1]) == pytest.approx(phase, abs=1e-9)
+    assert (15.0 < float(orbit.speed) < 20.0) if phase == 0.0 else (25.0 < float(orbit.speed) < 36.5)
+    translation, turn = np.asarray(orbit.amplitude[0]), np.asarray(orbit.amplitude[2])
+    assert (turn < 1e-9 < translation) if phase == 0.0 else (translation < 1e-9 < turn)
+
+
+def averaged(unbalance):
+    """Speed and phase of two opposite motors by the averaged equations, written anew."""
+    # The slip of the motors relative to their housings also damps the turn of the body.
+    stiffness, damping, mass = np.diag([8e5, 8e5, 8e5]), np.diag([4e3, 4e3, 4e3 + 6.0]), np.diag([2000.0, 2000.0, 600.0])
+    places, directions, speeds = ((-0.5, 0.0), (0.9, 0.3)), (1, -1), (100.0, 100.02)
+
+    def balance(unknown):
+        speed, phases = unknown[0], np.array([0.0, unknown[1]])
+        receptance = np.linalg.inv(stiffness - speed**2 * mass + 1j * speed * damping)
+        e = [np.array([1.0, -1j * d]) @ [[1.0, 0.0, -b], [0.0, 1.0, a]] for (a, b), d in zip(places, directions, strict=True)]
+        h = np.array([[e_i.conj() @ receptance @ e_k for e_k in e] for e_i in e])
+        turned = np.exp(1j * (phases[None] - phases[:, None]))
+        vibrational = speed**4 / 2.0 * unbalance**2 * np.sum((turned * h).imag, axis=1)
+        return 300.0 * (1.0 - speed / np.array(speeds)) + vibrational
+
+    return fsolve(balance, [100.0, np.pi - np.arctan2(0.3, 0.9)], xtol=1e-13)
+
+
+def test_averaged_motion_differs_by_the_square_of_the_unbalance():
+    machine, errors = body((4e5, 4e5), (2e3, 2e3), places=((-1.0, 0.0), (1.0, 0.0))), []
+    for unbalance in (1.0, 2.0):
+        numbers = zip((100.0, 100.02), ((-0.5, 0.0), (0.9, 0.3)), (1, -1), strict=True)
+        exciters = [jv.Exciter(drive=motor(n), unbalance=unbalance, at=p, direction=d) for n, p, d in numbers]
+        speed, phase = averaged(unbalance)
+        orbit = jv.synchronous_orbit(jv.Scene(machine, exciters=exciters), speed=speed, phases=[0.0, phase])
+        errors.append(abs(float(orbit.speed) - speed) / (100.01 - speed))
+    assert errors[1] < 2.0**2 / (600.0 * 0.5)
+    assert errors[1] / errors[0] == pytest.approx(4.0, rel=0.3)
+
+
+def test_single_precision_finds_the_motion(general, orbit):
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), general)
+    found = jv.synchronous_orbit(single, phases=jnp.asarray([0.0, 3.0], jnp.float32), speed=jnp.float32(100.0), throw=False)
+    assert found.status_name in ("found", "under_resolved")
+    assert float(found.speed) == pytest.approx(float(orbit.speed), rel=1e-5)
+
+
 GRADED = ("exciters[0].unbalance", "exciters[1].drive.speed", "machine.mass")
 
 
@@ -268,3 +318,31 @@ def test_wrong_input_ends_in_one_sentence(general):
         jv.synchronous_orbit(general, phases=[0.0, 1.0, 2.0])
     with pytest.raises(jv.InputError, match="regime is given beside speed"):
         jv.synchronous_orbit(general, jv.synchronous_orbit(general, phases=[0.0, 3.0]), speed=100.0)
+
+
+def test_limit_of_synchronization_is_the_fold_of_the_motion(general, orbit):
+    limit = jv.synchronization_limit(general, orbit, over="exciters[1].drive.speed")
+    assert float(limit.value[0]) < 100.4 < float(limit.value[1])
+    assert repr(limit).startswith("exciters[1].drive.speed from 98.69") and len(limit.plot().axes) == 1
+    for end, outward in ((0, -1.0), (1, 1.0)):
+        start = {"speed": limit.speed[end], "phases": limit.phases[end], "throw": False, "points": 17}
+        names = []
+        for share in (-1e-5, 1e-5):
+            numbers = (1.5, float(limit.value[end]) * (1.0 + outward * share), 2000.0)
+            names.append(jv.synchronous_orbit(with_numbers(general, numbers), **start).status_name)
+        assert names == ["found", "not_converged"]
+
+
+def test_motion_near_a_fold_says_so(general, orbit):
+    limit = jv.synchronization_limit(general, orbit, over="exciters[1].drive.speed")
+    at_limit = with_numbers(general, (1.5, float(limit.value[1]) * (1.0 - 1e-14), 2000.0))
+    found = jv.synchronous_orbit(at_limit, speed=limit.speed[1], phases=limit.phases[1], throw=False, points=17)
+    assert found.status_name in ("at_fold", "under_resolved") and not bool(found.error < 1e-9)
+
+
+def test_limit_needs_a_number_and_a_free_phase(general, orbit):
+    with pytest.raises(jv.InputError, match="is not a parameter of this scene"):
+        jv.synchronization_limit(general, orbit, over="exciters[1].drive.torque")
+    with pytest.raises(jv.InputError, match="has no exciter whose phase is free"):
+        ideal = symmetric([(0.0, 0.0)] * 2, directions=(1, -1), drive=jv.ConstantSpeed(100.0))
+        jv.synchronization_limit(ideal, jv.synchronous_orbit(ideal, points=17), over="exciters[1].unbalance")

@@ -1,0 +1,270 @@
+"""Limits of synchronization: folds of exact synchronous motions over a number of the scene."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError
+from jaxvib.machine.numbers.named import find_number, put_numbers
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.fourier import grid_of
+from jaxvib.numerics.linalg import solve_in_turn
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import member
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.orbits.newton import Linearized, newton
+from jaxvib.steady.orbits.synchronous import HasSpeedAndPhases, synchronous_orbit
+from jaxvib.steady.orbits.whole import (
+    PeriodicScene,
+    body_counts,
+    collocation,
+    is_forced,
+    linear_start,
+    periodic_scene,
+    residual_of,
+)
+
+if TYPE_CHECKING:
+    from jaxvib.draw.style import Drawn, Onto
+
+__all__ = ["LimitStatus", "SynchronizationLimit", "synchronization_limit"]
+
+_PHASE_STEP = 0.1
+"""Change of the phase between two points of a branch, rad."""
+
+_MAX_BRANCH_POINTS = 70
+"""Number of points in which a fold must be passed; together they are more than a turn of the phase."""
+
+
+class LimitStatus(eqx.Enumeration):
+    """Outcomes of a search for the limit of synchronization. Each member is the sentence shown to the user."""
+
+    found = "the motion ends here at a fold: beyond it these exciters do not turn together in it"
+    not_found = "no fold was found in this direction: the motion could not be followed to one"
+
+
+class SynchronizationLimit(Result):
+    """Range of a number of the scene in which a synchronous motion exists, (2,): its lower and its upper end.
+
+    Returned by `synchronization_limit`. At both ends the motion meets another one and vanishes.
+
+    **Attributes**
+
+    - `status`: a `LimitStatus` for each end
+    - `value` (2,) of the number `over`, SI; NaN without a fold
+    - `speed` (2,), rad/s, and `phases` (2, N), rad, of the motion there, see `SynchronousOrbit`
+    - `start`: value of the number in the scene, SI
+    - `branch_values` and `branch_phases` (P,): value of the number over the phase, rad, of one exciter along the branch
+    """
+
+    outer_axes = ("end",)
+
+    status: LimitStatus
+    value: np.ndarray = eqx.field(metadata=in_unit("", "end"))
+    speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "end"))
+    phases: np.ndarray = eqx.field(metadata=in_unit("rad", "end", "exciter"))
+    start: np.ndarray = eqx.field(metadata=in_unit(""))
+    branch_values: np.ndarray = eqx.field(metadata=in_unit("", "branch_point"))
+    branch_phases: np.ndarray = eqx.field(metadata=in_unit("rad", "branch_point"))
+    over: str = eqx.field(static=True, metadata=in_unit(""))
+
+    def summary(self) -> str:
+        """Return both ends of the range as text."""
+        low, high = (float(x) for x in self.value)
+        return f"{self.over} from {low:.8g} to {high:.8g} (now {float(self.start):.8g})\n{self.message}"
+
+    @validated
+    def plot(self, *, ax: Onto = None) -> Drawn:
+        """Plot the number over the phase along the branch. **Returns** a matplotlib figure, or the given `ax`."""
+        from jaxvib.draw.results import signals_chart  # slow import
+
+        values = [(self.over, np.asarray(self.branch_values)[:, None], [self.over])]
+        return signals_chart(np.rad2deg(np.asarray(self.branch_phases)), values, across="phase, degrees", ax=ax)
+
+
+@validated
+def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str) -> SynchronizationLimit:
+    """Return the range of a number of the scene in which a synchronous motion exists: the folds of the exact motion.
+
+    Along a branch of motions the number is a smooth function of the phase of an exciter, which is largest or smallest at a
+    fold. Each point of the branch is therefore solved for the number at a given phase, and the fold is the root of its slope:
+    nothing becomes singular there.
+
+    **Arguments**
+
+    - `scene` with two exciters or more, whose bodies are not all turned by ideal drives
+    - `regime`: a motion with `speed` and `phases`, such as a `SynchronousOrbit` of the scene
+    - `over`: name of the number, such as "exciters[1].drive.speed", "exciters[0].unbalance"
+
+    **Returns** `SynchronizationLimit`; an end without a fold is NaN and has the status "not_found".
+
+    **Raises** `InputError` for a name that the scene does not have and for scenes without a free phase; `ComputationError` if
+    the scene has no such motion.
+
+    >>> import jaxvib as jv
+    >>> springs = [jv.support(at=(x, 0.0), stiffness=(4e5, 4e5), damping=(2e3, 2e3)) for x in (-1.0, 1.0)]
+    >>> screen = jv.plane_body(mass=2000.0, inertia=600.0, supports=springs)
+    >>> motor = jv.DCMotor("1000 rpm", stall_torque=300.0, inertia=0.5)
+    >>> exciters = [jv.Exciter(drive=motor, unbalance=1.5, at=(x, 0.0), direction=d) for x, d in ((-0.3, 1), (0.3, -1))]
+    >>> scene = jv.Scene(screen, exciters=exciters)
+    >>> limit = jv.synchronization_limit(scene, jv.synchronous_orbit(scene, phases=[0.0, 3.1]), over="exciters[1].drive.speed")
+    >>> bool(limit.value[0] < motor.speed < limit.value[1])
+    True
+
+    Source: Blekhman 1988: a synchronous motion exists while the differences of the torques are below the vibrational torque.
+    """
+    number = find_number(scene, over, "over")
+    if number.size != 1:
+        raise InputError(f"over.{over}", f"has {number.size} entries; name one, for example {over}[0]")
+    counts, forced = body_counts(scene), is_forced(scene)
+    free = [k for k, count in enumerate(counts) if count][not forced :]
+    if not free:
+        raise InputError("scene", "has no exciter whose phase is free; give two exciters with motors, or with loads")
+    own = number.path[1] if number.path[0] == "exciters" else None
+    exciter = own if own in free else free[0]
+    orbit = synchronous_orbit(scene, regime)
+    points = 2 * orbit.displacement_harmonics.shape[1] - 1
+    value = float(np.ravel(np.asarray(number.leaf(scene)))[number.entry or 0])
+    start = _Point(np.asarray(value), np.asarray(orbit.speed), np.asarray(orbit.phases), np.asarray(0.0), np.asarray(True))
+
+    def at(point: _Point, phase: float) -> _Point:
+        phases = np.array(point.phases)
+        phases[exciter] = phase
+        found = _branch_point(scene, over, point.value, point.speed, phases, exciter, points)
+        return _Point(*map(np.asarray, found))
+
+    first = at(start, float(start.phases[exciter]))
+    rising = 1.0 if float(first.slope) > 0.0 else -1.0
+    ends = [_fold(at, first, exciter, towards) for towards in (-rising, rising)]
+    branch = [*reversed(ends[0][1]), first, *ends[1][1]]
+    return SynchronizationLimit(
+        status=member(LimitStatus, np.array(["not_found" if end is None else "found" for end, _ in ends])),
+        value=np.array([np.nan if end is None else float(end.value) for end, _ in ends]),
+        speed=np.array([np.nan if end is None else float(end.speed) for end, _ in ends]),
+        phases=np.stack([np.full_like(first.phases, np.nan) if end is None else end.phases for end, _ in ends]),
+        start=np.asarray(value),
+        branch_values=np.array([float(point.value) for point in branch]),
+        branch_phases=np.array([float(point.phases[exciter]) for point in branch]),
+        over=over,
+    )
+
+
+class _Point(NamedTuple):
+    """Point of a branch: `value` of the number, `speed` and `phases` (N,) of the motion; `slope` of the value over the phase;
+    `is_met`: True if the equations are met."""
+
+    value: np.ndarray
+    speed: np.ndarray
+    phases: np.ndarray
+    slope: np.ndarray
+    is_met: np.ndarray
+
+
+def _fold(
+    at: Callable[[_Point, float], _Point], first: _Point, exciter: int, towards: float
+) -> tuple[_Point | None, list[_Point]]:
+    """Return the fold in one direction of the phase, or None, and the points of the branch up to it."""
+    points, here, step = [], first, _PHASE_STEP
+    while len(points) < _MAX_BRANCH_POINTS and step > 1e-3 * _PHASE_STEP:
+        new = at(here, float(here.phases[exciter]) + towards * step)
+        if not new.is_met:
+            step /= 4.0
+            continue
+        points.append(new)
+        if float(new.slope) * float(first.slope) < 0.0:
+            return _refined(at, here, new, exciter), points
+        here = new
+    return None, points
+
+
+def _refined(at: Callable[[_Point, float], _Point], a: _Point, b: _Point, exciter: int) -> _Point | None:
+    """Return the point between two others at which the slope is zero, by the Illinois method."""
+    x, y = [float(p.phases[exciter]) for p in (a, b)], [float(p.slope) for p in (a, b)]
+    for _ in range(30):
+        middle = x[1] - y[1] * (x[1] - x[0]) / (y[1] - y[0])
+        b = at(b, middle)
+        if not b.is_met:
+            return None
+        if abs(middle - x[1]) < 1e-9:
+            return b
+        if float(b.slope) * y[1] < 0.0:
+            x[0], y[0] = x[1], y[1]
+        else:
+            y[0] *= 0.5
+        x[1], y[1] = middle, float(b.slope)
+    return b
+
+
+@cached
+def _branch_point(
+    scene: Scene,
+    over: str,
+    value: Array | np.ndarray,
+    speed: Array | np.ndarray,
+    phases: Array | np.ndarray,
+    exciter: int,
+    points: int,
+) -> tuple[Array, ...]:
+    """Solve for the motion in which an exciter has its given phase, and for the value of the number `over`.
+
+    `points`: number of collocation points on a period.
+
+    **Returns** the fields of `_Point`.
+    """
+    value, speed, phases = jnp.asarray(value), jnp.asarray(speed), jnp.asarray(phases)
+    number, grid, forced = find_number(scene, over, "over"), grid_of(points, False), is_forced(scene)
+    counts = body_counts(scene)
+    unit = jnp.maximum(jnp.abs(value), 1e-6)
+
+    def scene_at(share: Array) -> PeriodicScene:
+        return periodic_scene(put_numbers(scene, [number], (share * unit)[None]), phases)
+
+    start = value / unit
+    whole = scene_at(start)
+    x, nd, body = linear_start(whole, grid, speed), whole.coordinates, sum(counts[:exciter])
+    size, weight = x.size, jnp.minimum(whole.feedback, 1.0)
+    pin = np.zeros(x.shape)
+    pin[nd + body] = 1.0 / grid.theta.size
+
+    def equations(x: Array, w: Array, share: Array) -> tuple[Array, Array, Array]:
+        found = collocation(scene_at(share), grid, x, w, forced=forced)
+        by_value = jax.jvp(lambda s: residual_of(scene_at(s), grid, x, w), (share,), (jnp.ones_like(share),))[1]
+        rest = found.matrix.shape[0] - size
+        column = jnp.concatenate([by_value.ravel(), jnp.zeros(rest)])[:, None]
+        row = jnp.asarray(np.concatenate([pin.ravel(), np.zeros(rest + 1)]))[None]
+        matrix = jnp.concatenate([jnp.concatenate([found.matrix, column], axis=1), row])
+        return found.residual, found.scale, matrix
+
+    def linearize(x: Array, w: Array, share: Array) -> Linearized:
+        residual, scale, matrix = equations(x, w, share)
+        carrier, bodies = jnp.split(residual, [nd])
+        norm = jnp.sqrt((jnp.sum((weight * carrier) ** 2) + jnp.sum(bodies**2)) / size)
+        right = jnp.concatenate([residual.ravel(), jnp.zeros(matrix.shape[0] - size)])
+        return Linearized(norm, scale, lambda: -solve_in_turn(matrix, right))
+
+    def move(unknowns: tuple[Array, ...], change: Array, length: Array) -> tuple[Array, ...]:
+        x, w, share = unknowns
+        most = 1.0 / jnp.max(jnp.abs(change[:size].reshape(x.shape)[nd:]), initial=1e-30)
+        most = jnp.minimum(most, 0.5 / jnp.maximum(jnp.abs(change[-1]), 1e-30))
+        change = jnp.minimum(length, most) * change
+        return x + change[:size].reshape(x.shape), w if forced else w + change[size], share + change[-1]
+
+    change = jnp.zeros(size + (1 if forced else 2), x.dtype)
+    x, w, share = newton(linearize, move, (x, speed, start), change, jnp.ones_like(start))
+    residual, scale, matrix = equations(x, w, share)
+    slope = solve_in_turn(matrix, jnp.zeros(matrix.shape[0]).at[-1].set(1.0))[-1] * unit
+    means = jnp.mean(x[nd:], axis=1)
+    ends = np.cumsum([0, *counts])
+    moved = [jnp.mean(means[a:b]) if b > a else jnp.zeros_like(w) for a, b in itertools.pairwise(ends)]
+    met = jnp.max(jnp.abs(residual)) < 4096.0 * jnp.finfo(x.dtype).eps * scale
+    return share * unit, w, phases + jnp.stack(moved), slope, met
