@@ -51,7 +51,7 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
     """
     count, speed = balance.unbalance.size, np.asarray(balance.speed)
     if balance.is_prescribed.all():
-        return np.asarray(motion_of(balance, jnp.zeros(0)))[0][None], np.zeros((1, count), speed.dtype)
+        return np.asarray(motion_of(balance, jnp.zeros(0, speed.dtype))[0])[None], np.zeros((1, count), speed.dtype)
     exchanges, tolerance = exchanges_in(balance), tolerances(speed.dtype)
     sets, speeds = _sets_of_phases(balance.is_prescribed, speed.dtype), _speeds(balance)
     known = np.zeros(0, speed.dtype), np.zeros((0, count), speed.dtype), np.zeros(0, int)

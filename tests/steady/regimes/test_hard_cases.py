@@ -38,6 +38,37 @@ def test_no_damping_is_not_called_stable():
     np.testing.assert_allclose(found.speed, 100.0, rtol=1e-12)
 
 
+def test_ideal_drives_report_the_torque_they_give():
+    found = jv.synchronous_regimes(scene_of(PAIR, (1, 1), [jv.ConstantSpeed(80.0)] * 2))
+    regime = found.select(0)
+    assert found.speed.size == 1 and float(regime.speed) == 80.0 and regime.phases.tolist() == [0.0, 0.0]
+    carrier, velocity = body().carrier(), 80.0 * np.asarray(regime.displacement)
+    lost = 0.5 * np.real(velocity.conj() @ np.asarray(carrier.damping) @ velocity)
+    np.testing.assert_allclose(np.sum(regime.power), lost, rtol=1e-12)
+
+
+def test_undamped_resonance_is_named():
+    drive = jv.ConstantSpeed(float(np.sqrt(6e3 / 300.0)))
+    found = jv.synchronous_regimes(scene_of([(0.0, 0.0)], [1], [drive], body(damping=0.0)))
+    assert found.select(0).status_name == "unbounded" and "resonance" in found.summary()
+
+
+def test_single_precision_finds_the_same_regimes():
+    scene = scene_of(PAIR, (1, -1))
+    small = jax.tree.map(lambda x: x.astype(jnp.float32) if eqx.is_inexact_array(x) else x, scene)
+    with jax.enable_x64(False):
+        found = jv.synchronous_regimes(small)
+    expected = jv.synchronous_regimes(scene)
+    assert found.speed.dtype == jnp.float32 and found.stable.tolist() == expected.stable.tolist()
+    np.testing.assert_allclose(np.exp(1j * np.asarray(found.phases)), np.exp(1j * expected.phases), atol=1e-2)
+
+
+def test_motor_too_weak_for_its_unbalance_cannot_start():
+    weak = jv.DCMotor(100.0, stall_torque=3.0, inertia=0.05)
+    found = jv.synchronous_regimes(scene_of(PAIR, (1, -1), [weak, MOTOR], effects=(jv.Gravity(),)))
+    assert found.can_start[0].tolist() == [False, True]  # S g = 3.9 N m
+
+
 def test_derivatives_are_those_of_finite_differences():
     def ask(x):
         first = jv.InductionMotor(100.05, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
