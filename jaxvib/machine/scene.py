@@ -250,8 +250,9 @@ class Scene(Part):
     def exciter(self) -> Exciter:
         """Exciter of a scene that has one. **Raises** `InputError` if it has several."""
         if len(self.exciters) != 1:
-            problem = f"has {len(self.exciters)} exciters; this function needs a scene with one, use simulate for several"
-            raise InputError("scene", f"{problem} (their parts are scene.exciters[0].drive and so on)")
+            problem = f"has {len(self.exciters)} exciters; this function needs a scene with one"
+            instead = "for several use synchronous_regimes or simulate"
+            raise InputError("scene", f"{problem}, {instead} (their parts are scene.exciters[0].drive and so on)")
         return self.exciters[0]
 
     @property

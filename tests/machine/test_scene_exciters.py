@@ -76,7 +76,7 @@ def test_leaves_of_one_exciter_keep_their_order():
     ],
 )
 def test_theories_refuse_several_exciters(ask):
-    with pytest.raises(jv.InputError, match=r"has 2 exciters; this function needs a scene with one, use simulate"):
+    with pytest.raises(jv.InputError, match=r"has 2 exciters; this function needs a scene with one, for several use"):
         ask(two()) if ask is not jv.envelope else ask(two(), 1.0)
 
 
