@@ -194,7 +194,7 @@ of = [1, 2]                       # amplitude of platform 1 (y1) relative to pla
 [search]
 starts = 256
 seed = 0
-# iterations = 100                # iterations of the descent
+# iterations = 100                # number of iterations of the descent
 # rate = 0.05                     # first step of the descent, relative to the range of a free parameter
 # polishing = 12                  # steps of Newton's method at the end
 """

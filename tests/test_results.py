@@ -136,6 +136,11 @@ RESULTS = {
     "PhaseJam": lambda: RESULTS["PhaseJams"]().select(0),
     "SynchronousRegimes": cached(lambda: jv.synchronous_regimes(SCREEN)),
     "SynchronousRegime": lambda: RESULTS["SynchronousRegimes"]().select(0),
+    "Deck": lambda: RESULTS["SynchronousRegime"]().deck([(-1.0, 0.2), (1.0, 0.2)]),
+    "SynchronousOrbit": cached(lambda: jv.synchronous_orbit(SCREEN, RESULTS["SynchronousRegime"]())),
+    "SynchronizationLimit": lambda: jv.synchronization_limit(
+        SCREEN, RESULTS["SynchronousRegime"](), over="exciters[1].drive.speed"
+    ),
     "PhaseBranch": lambda: phase_branch(ROTOR, RESULTS["PhaseJams"]().select(0), jnp.array([150.0, 172.0])),
     "CharacteristicSpeeds": lambda: characteristic_speeds(SCENE),
     "Criterion": lambda: jv.criterion(SCENE),
@@ -172,7 +177,8 @@ RESULTS = {
 
 # fmt: off
 SEVERAL_PANELS = ["Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-                  "BalancedStates", "Swing", "Identified", "RunUps", "Audit", "SynchronousRegimes"]
+                  "BalancedStates", "Swing", "Identified", "RunUps", "Audit", "SynchronousRegimes",
+                  "SynchronousOrbit"]
 # fmt: on
 
 

@@ -43,7 +43,7 @@ def drag_diagram(
     >>> drag, speed = np.array([1.0, 2.0, 1.5]), np.array([5.0, 6.0, 7.0])
     >>> figure = drag_diagram([("together", drag, speed, drag < 1.8)], 8.0, label="drag, N s/m", at=1.2)
     >>> figure.axes[0].get_ylabel()
-    'speed of loads, rad/s'
+    'speed of loads, rpm'
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)

@@ -133,7 +133,7 @@ def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> 
     The error suggests a similar name or, if the names belong to another kind of file, names that kind.
 
     >>> str(misplaced_name("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
-    'machine is no part of a design file: this is a scene file'
+    'machine is not part of a design file: this is a scene file'
     """
     other = next((each for each, marks in _MARKS.items() if each != kind and any(mark in tables for mark in marks)), None)
     if other is None or any(mark in tables for mark in _MARKS[kind]):

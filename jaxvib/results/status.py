@@ -63,7 +63,7 @@ def sentence(status: eqx.Enumeration) -> str:
     """Return the sentence of a status; for several statuses, each sentence once with its number of occurrences.
 
     >>> sentence(Computed.done)
-    'the answer was computed'
+    'the result was computed'
     """
     names = status_names(status)
     enumeration = enumeration_of(status)

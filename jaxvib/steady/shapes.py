@@ -83,8 +83,8 @@ def mode_shapes(scene: Scene) -> ModeShapes:
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
     >>> print(jv.mode_shapes(form.scene()).summary())
-    0.333333 rad/s: y1 +1.000, y2 +1.000
-    1 rad/s: y1 +1.000, y2 -1.000
+    3.1831 rpm: y1 +1.000, y2 +1.000
+    9.5493 rpm: y1 +1.000, y2 -1.000
 
     Source: the antiphase paper, equations (19), (23).
     """

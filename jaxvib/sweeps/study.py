@@ -259,8 +259,9 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     return Quantity(name or function, str(table.get("unit", "")), found)
 
 
-TEMPLATE = """# A study: the numbers that vary from case to case, and the quantities measured in each case. Run: jaxvib sweep
-study.toml scene = "machine.toml"            # path of the scene file, relative to this file
+TEMPLATE = """# A study: the numbers that vary from case to case, and the quantities measured in each case.
+# Run: jaxvib sweep study.toml
+scene = "machine.toml"            # path of the scene file, relative to this file
 # tier = "exact"                  # method for quantities of a jam: leading (light loads), exact, time [leading]
 # chunk = 1024                    # number of cases computed and written together
 

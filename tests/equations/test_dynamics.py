@@ -155,7 +155,7 @@ def test_scene_without_effects_traces_as_if_there_were_none(monkeypatch):
 
     whole = program()
     monkeypatch.setattr(ExciterDynamics, "_add_friction", lambda self, drag, contact: (drag, contact.force, [{}]))
-    monkeypatch.setattr(ExciterDynamics, "_imbalance", lambda self, t, state: None)
+    monkeypatch.setattr(ExciterDynamics, "_imbalance_derivatives", lambda self, t, state: None)
     monkeypatch.setattr(
         ExciterDynamics, "_add_rotor", lambda self, motion, mass, reaction, drag, coupling: (mass, reaction, None)
     )

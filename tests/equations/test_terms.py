@@ -84,7 +84,7 @@ def test_theory_includes_exactly_the_terms_it_states(theory, term):
 def test_refusal_names_every_effect_and_term():
     loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0, ball_radius=0.01)
     both = jv.Scene(scene().machine, loads, scene().drive, (jv.CubicSupport(1e9), jv.Sliding(0.1)))
-    says = r"effects cubic_support and sliding are not part .*\(terms SupportForce and SlipRelease\); leave them out"
+    says = r"effects cubic_support and sliding are not included .*\(terms SupportForce and SlipRelease\); leave them out"
     with pytest.raises(jv.InputError, match=says):
         turning_loads(both)
 

@@ -26,7 +26,10 @@ WRONG = {
         lambda: changed(lambda s: s.machine.mass, jnp.asarray([120.0, -95.0])),
         "machine.mass[1] is -95 kg; it must be greater than 0",
     ),
-    "no number": (lambda: changed(lambda s: s.machine.damping, jnp.full(2, jnp.nan)), "scene.machine.damping is nan; a finite"),
+    "no number": (
+        lambda: changed(lambda s: s.machine.damping, jnp.full(2, jnp.nan)),
+        "scene.machine.damping is nan; it must be",
+    ),
     "no speed": (lambda: changed(lambda s: s.drive.speed, 0.0), "drive.speed is 0 rad/s; it must be greater than 0"),
     "a text": (lambda: changed(lambda s: s.drive.speed, "50 rpm"), "scene.drive.speed is '50 rpm', which is not a number"),
     "another shape": (lambda: changed(lambda s: s.machine.mass, jnp.ones(3)), "machine.mass has 3 values; 2 are needed"),
@@ -36,7 +39,7 @@ WRONG = {
         lambda: changed(lambda s: s.all_effects[0].g, -9.81, scene(effects=(jv.Gravity(),))),
         "effects.gravity.g is -9.81 m/s^2; it must be at least 0",
     ),
-    "an effect from outside": (lambda: rub(jnp.inf), "scene.effects[0].torque is inf; a finite number is needed"),
+    "an effect from outside": (lambda: rub(jnp.inf), "scene.effects[0].torque is inf; it must be finite"),
 }
 QUESTIONS = {
     "jam_modes": jv.jam_modes,

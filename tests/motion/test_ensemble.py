@@ -195,14 +195,14 @@ def test_single_precision_keeps_its_phase():
         (dict(values=(jnp.zeros(2), jnp.zeros(3))), "values has leading axes"),
         (dict(batch=0), "batch is 0"),
         (dict(stepsize_controller=jv.EqualSteps(0)), "steps is 0"),
-        (dict(make=lambda v: v), "make gives"),
+        (dict(make=lambda v: v), "make returns"),
         (dict(make=int), "make needs the value of a number that JAX traces"),
         (dict(make=lambda: None), "make cannot be called with"),
         (dict(equations=int), "equations cannot be called with"),
-        (dict(equations=lambda _: None), "equations gives None"),
+        (dict(equations=lambda _: None), "equations returns None"),
         (dict(values=iter([1.0, 2.0])), "values is"),
-        (dict(make=lambda v: (published().scene(), v)), "make gives"),
-        (dict(make=lambda v: (v, some_state(published().scene()))), "make gives"),
+        (dict(make=lambda v: (published().scene(), v)), "make returns"),
+        (dict(make=lambda v: (v, some_state(published().scene()))), "make returns"),
     ],
 )
 def test_ensembles_that_cannot_be(change, says):

@@ -182,7 +182,7 @@ def space_of(free, held=()):
         (lambda: space_of({"machine.stiffness": (1, 2), "machine.stiffness[0]": (1, 2)}), "is free already"),
         (lambda: space_of({"loads.drag": (1, 2)}, [hold(total("machine.stiffness"))]), "more free parameters than held"),
         (lambda: space_of({"machine.stiffness": (1, 2)}, [jam_frequency(mode=3)]), "wrap quantities in optimize.hold"),
-        (lambda: hold(jam_frequency(mode=3), 0.0), "other than 0"),
+        (lambda: hold(jam_frequency(mode=3), 0.0), "must differ from 0"),
         (lambda: hold(3.0), "must be a Quantity"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), 3.0), "must be a Quantity"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=9)), "numbered 1 to 5"),

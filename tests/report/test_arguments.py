@@ -18,6 +18,7 @@ UNITS = {
         "network": LINKED,
         "planar_rotor": PLATFORMS,
         "plane_body": {"mass": "kg", "inertia": "kg m^2"},
+        "plane_network": {},
         "rotor": PLATFORMS | INERTIA | TERMS | {"position": "m", "stations": "m"},
     },
     "loads": {
@@ -32,6 +33,7 @@ UNITS = {
         "run_up": {"speed": "rad/s", "acceleration": "rad/s^2"},
         "dc_motor": {"speed": "rad/s", "stall_torque": "N m", "inertia": "kg m^2"},
         "induction_motor": {"speed": "rad/s", "breakdown_torque": "N m", "inertia": "kg m^2"},
+        "switched_off": {"at": "s", "bearing": "N m s"},
     },
     "effects": {
         "gravity": {"g": "m/s^2"},

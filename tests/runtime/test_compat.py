@@ -225,7 +225,6 @@ def test_private_modules_are_used_in_one_file_only():
         "jax._src",
         "jax.extend",
         "jax.core",
-        "jax.custom_batching",
         "config.values",
         "eval_coeffs",
         "._enumeration",

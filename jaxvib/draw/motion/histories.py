@@ -84,7 +84,7 @@ def time_histories(
     >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
     >>> figure = time_histories(*[(t, q, one, one, one)] * 2, names=("y", "theta"), units=("m", "rad"))
     >>> [axes.get_ylabel() for axes in figure.axes][::2]
-    ['displacement, mm', 'tilt, mrad', 'speed, rad/s', 'foundation force, N']
+    ['displacement, mm', 'tilt, mrad', 'speed, rpm', 'foundation force, N']
     """
     units = ["m"] * len(names) if units is None else units
     unit, scale = speed_unit(unit)

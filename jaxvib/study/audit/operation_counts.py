@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drive import ConstantSpeed, DCMotor
 from jaxvib.machine.files import DRIVES, EFFECTS
 from jaxvib.machine.loads import Loads, balls, pendulums
 from jaxvib.machine.scene import Scene
@@ -102,9 +102,9 @@ def operation_counts() -> list[OperationCount]:
 
 
 def _build_with_halves(build: Callable[..., T]) -> T:
-    """Build an effect or a drive with the value 0.5 for each required argument."""
-    parameters = inspect.signature(build).parameters.values()
-    return build(**{each.name: 0.5 for each in parameters if each.default is each.empty})
+    """Build an effect or a drive with the value 0.5 for each required number, and with a DC motor where it needs a motor."""
+    required = [each.name for each in inspect.signature(build).parameters.values() if each.default is each.empty]
+    return build(**{name: DCMotor(1.0, 1.0, 1.0) if name == "motor" else 0.5 for name in required})
 
 
 def _rotor(stations: Numbers) -> Machine:

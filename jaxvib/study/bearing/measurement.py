@@ -39,7 +39,7 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
     >>> measurement_from_tables({"record": {"file": "swing.csv", "form": 1.0}, "pendulum": rod}, pathlib.Path())
     Traceback (most recent call last):
         ...
-    jaxvib.errors.InputError: record.form is no field here; did you mean 'from'? allowed: file, columns, angle_unit, from, until
+    jaxvib.errors.InputError: record.form is not a field here; did you mean 'from'? allowed: ...
     """
     names = ["record", "pendulum", "identify"]
     for name, table in tables.items():

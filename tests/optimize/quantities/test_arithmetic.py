@@ -173,7 +173,7 @@ def test_quantities_in_time():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: foundation_force(mode=3) + amplitude(mode=3), "puts together N and m; divide each"),
+        (lambda: foundation_force(mode=3) + amplitude(mode=3), "combines N and m; divide each"),
         (lambda: foundation_force(mode=3) < "3 kg", "is not in N"),
         (lambda: foundation_force(mode=3) < amplitude(mode=3), "is in N and compared with"),
         (lambda: 1.0 < foundation_force(mode=3) < 2.0, "is a demand, not True or False"),
@@ -189,7 +189,7 @@ def test_quantities_in_time():
         (lambda: peak_force(until=1.0, spin_up=2.0), "at most until"),
         (lambda: settling_time(until=3.0, spin_up=2.0, within=2.0), "less than 1"),
         (lambda: spring_cost([(1e4, 1.0)]), "at least two pairs"),
-        (lambda: spring_cost([(1e4, 1.0), (1e3, 1.0)]), "do not ascend"),
+        (lambda: spring_cost([(1e4, 1.0), (1e3, 1.0)]), "must have ascending stiffnesses"),
         (lambda: under(STIFFNESS, "x", {}), "give a dictionary"),
         (lambda: under(STIFFNESS, "x", {"drive.speed": "3 kg"}), "is not in rad/s"),
         (lambda: expected(STIFFNESS, {"machine.stiffness": 5.0}), "give a share such as 0.05"),

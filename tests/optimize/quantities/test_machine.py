@@ -108,8 +108,8 @@ def test_springs_cost_what_the_list_says():
         ([(1e4, 1.0), (2e4, -1.0)], r"prices\[1\] has the price -1"),
         ([(1e4, 1.0), (2e4, np.nan)], r"prices\[1\] is nan; a finite"),
         ([(1e4, np.inf), (2e4, 1.0)], r"prices\[0\] is inf; a finite"),
-        ([(0.0, 1.0), (2e4, 1.0)], "do not ascend"),
-        ([(1e4, 1.0), (1e4, 2.0)], "do not ascend"),
+        ([(0.0, 1.0), (2e4, 1.0)], "must have ascending stiffnesses"),
+        ([(1e4, 1.0), (1e4, 2.0)], "must have ascending stiffnesses"),
         (3.0, "it must be a list of values"),
     ],
 )
