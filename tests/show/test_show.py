@@ -166,7 +166,7 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
         ),
         (lambda run, orbit: run.plot_path(), "machine.kind is 'one_mass', which moves only up and down"),
         (lambda run, orbit: run.spectrum(0), "parts is 0; it must be a whole number, at least 1"),
-        (lambda run, orbit: run.spectrum(900), "parts is 900, which leaves 9 samples for each part"),
+        (lambda run, orbit: run.spectrum(900), "parts is 900, which leaves 9 samples for each segment"),
         (lambda run, orbit: run.spectrum().plot(show="power"), "show is 'power'; it must be"),
         (lambda run, orbit: run.spectrum().plot(coordinate="z"), "coordinate is 'z'; there are y1"),
     ],

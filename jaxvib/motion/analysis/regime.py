@@ -127,7 +127,7 @@ class Regime(Result):
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
             evidence += [self._remainder(), pattern]
         if bool(self.caught):
-            evidence.append("the rotor itself is stuck at a resonance, below the speed of its motor")
+            evidence.append("the rotor itself is caught at a resonance, below the speed of its motor")
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
 

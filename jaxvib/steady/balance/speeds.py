@@ -219,13 +219,10 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
     if np.sum(squares <= rounding * squares[-1]) > free:
         stiff = int(np.argmax(np.diag(stiffness) / np.diag(mass)))
         name = scene.machine.structure().coordinates[stiff]
-        cannot = (
-            "is too stiff to be computed together with the others in this precision; use a softer spring, "
-            "or leave it out of the machine"
-        )
+        cannot = "cannot be computed with the others in this precision; use a softer spring or leave it out of the machine"
         if np.any(port[:, stiff]):
             raise InputError("machine.exciter", f"stands on {name}, which {cannot}")
-        raise InputError("machine.stiffness", f"is so high at {name} that it {cannot}")
+        raise InputError("machine.stiffness", f"is so high at {name} that this coordinate {cannot}")
 
 
 def _inverse_root(values: Array) -> Array:

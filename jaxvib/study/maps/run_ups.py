@@ -154,7 +154,7 @@ def run_ups(
     >>> print(found.summary())
     of 6 starts at each drag
     drag 0.05 N s/m: 100 % unsettled
-    drag 5 N s/m: 100 % jammed at 41... rad/s
+    drag 5 N s/m: 100 % jammed at 39... rpm
 
     Source: Artyunin 2013, section V, where one set of angles stands for all.
     """

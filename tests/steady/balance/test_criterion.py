@@ -289,7 +289,7 @@ def test_table_is_ready_for_json_and_covers_all_speeds():
         ends = sorted([*table["balancing"], *table["gathering"]])
         assert ends[0][0] == 0.0 and ends[-1][1] is None
         assert [a[1] for a in ends[:-1]] == [b[0] for b in ends[1:]]
-        assert table["status"].startswith("every rotor speed")
+        assert table["status"].endswith("every rotor speed")
 
 
 def test_free_machine_balances_at_all_speeds():
@@ -318,11 +318,11 @@ def test_exciter_that_cannot_move_is_refused():
         jv.criterion(s)
     with pytest.raises(jv.InputError, match=r"machine\.stiffness.* is inf"):
         jv.one_mass(mass=1.0, stiffness=float("inf"), damping=0.0)
-    for exciter, field in ((2, "exciter stands on y2, which"), (1, "stiffness is so high at y2 that it")):
+    for exciter, field in ((2, "exciter stands on y2, which"), (1, "stiffness is so high at y2 that this coordinate")):
         machine = jv.two_mass(
             mass=(4.0, 3.0), stiffness=(1e4, 1e20), damping=(3.0, 3.0), link_stiffness=2e4, link_damping=1.0, exciter=exciter
         )
-        with pytest.raises(jv.InputError, match=rf"machine\.{field} cannot move"):
+        with pytest.raises(jv.InputError, match=rf"machine\.{field} cannot be computed with the others"):
             jv.criterion(eqx.tree_at(lambda x: x.machine, scene("two_mass"), machine))
 
 

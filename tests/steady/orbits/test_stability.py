@@ -130,7 +130,7 @@ def test_bands_of_the_stability_map_are_its_rows():
         omega > np.array([[2.75], [3.75]]),
         ((SpecialPoint("torus", 2.75, 9.0),), ()),
     )
-    axes = found.plot().axes[0]
+    axes = found.plot(unit="rad/s").axes[0]
     boxes = [band.get_paths()[0].get_extents() for band in axes.collections]
     edge = np.sqrt(0.1)
     np.testing.assert_allclose([[b.x0, b.x1, b.y0, b.y1] for b in boxes], [[3, 5, edge / 10, edge], [4, 5, edge, edge * 10]])
