@@ -88,8 +88,8 @@ class AbstractSynchronousRegime(Result):
     - `speed` Omega, rad/s
     - `phases` (mass,), rad, in the direction of rotation; 0 for the first mass, or for unbalances under ideal drives
     - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative
-    - `quasi_static`, 1/s: the same by the usual quasi-static criterion, which takes the ringing of the machine for infinitely
-      fast and calls some growing regimes stable; -inf if all speeds are prescribed
+    - `quasi_static`, 1/s: the same according to the usual quasi-static criterion, which assumes that free vibrations of the
+      machine decay infinitely fast; -inf if all speeds are prescribed
     - `margin`: the factor by which all differences of the driving torques can grow until the regime ends in a fold; inf if it
       does not end
     - `torque` (mass,), N m: driving torque of the motor or of the drag, of an ideal drive the torque that it has to give
