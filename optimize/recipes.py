@@ -1,4 +1,4 @@
-"""Frequent design tasks, each in one call: a space, an objective, demands."""
+"""Frequent design tasks, each in one call: a design space, an objective, and demands (constraints)."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[
 
 
 def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
-    """Return the design of an antiphase machine of two masses: least foundation force per relative amplitude.
+    """Return the design task for an antiphase machine of two masses: least foundation force per relative amplitude.
 
-    The frequency of the jam and the stiffness budget of the supports keep their values; all springs are free within a factor
-    `range_`.
+    The frequency of the jam and the stiffness budget of the supports (the sum of k_i/M_i over the platforms) keep their values;
+    all springs are free within a factor `range_`.
 
-    **Returns** `Design`; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 
     >>> import jaxvib as jv
     >>> from optimize.recipes import antiphase
@@ -62,12 +62,13 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
 
 
 def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
-    """Return the design of an anti-resonance machine of three masses: least middle amplitude per outer amplitude.
+    """Return the design task for an anti-resonance machine of three masses: least middle amplitude per outer amplitude.
 
     The springs of the links are free, and the frequency of the jam keeps its value. Without damping the middle platform (2) is
-    at rest if k12/M1 = k23/M3 = w^2; the amplitude of the outer ones is that of platform 1 relative to platform 3.
+    at rest if k12/M1 = k23/M3 = w^2; the outer amplitude is the amplitude of the displacement of platform 1 relative to
+    platform 3.
 
-    **Returns** `Design`. **Raises** `InputError` for a machine of fewer platforms.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 
     Source: Filimonikhin et al., cited in the antiphase paper as [21].
     """
@@ -79,7 +80,9 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
 
 
 def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: int = 16) -> list[tuple[str, Synthesis]]:
-    """Find the spring of an existing machine to exchange: search for the best machine that differs in one spring, for each.
+    """Find out which spring of an existing machine should be exchanged.
+
+    For each spring, search for the best machine that differs in this spring only.
 
     **Arguments**: `objective`: the quantity to minimize; `range_`: the factor by which a spring may differ; `starts` of each
     search.
@@ -96,11 +99,11 @@ def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: in
 
 
 def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[int, int] | None = None) -> Design:
-    """Return the design with the lightest loads that shake a platform by at least the amplitude `least` (m or text).
+    """Return the design task: the lightest loads that shake a platform by at least the amplitude `least` (m or text).
 
     The mass of the loads is free, from a tenth to ten times its value; the radius of the track keeps its value.
 
-    **Returns** `Design`.
+    **Returns** `Design`, not yet searched; `design.run()` searches.
     """
     machine = _platforms(scene, 1)
     del machine
@@ -112,11 +115,13 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
 
 
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
-    """Return the design with the springs for which a jam mode exists over the widest range of rotor speeds about the present.
+    """Return the design task: springs for which a jam mode exists over the widest range of rotor speeds.
 
-    The objective is the distance to the fold; the amplitude must be at least the share `keep` of the present one.
+    The range lies about the present rotor speed. The objective is its distance to the nearer fold, above or below;
+    the amplitude must be at least the share `keep` of the present amplitude.
 
-    **Returns** `Design`. **Raises** `InputError` for a share that is not between 0 and 1.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a share that is not between 0
+    and 1.
     """
     count(mode, "mode")
     if not 0.0 < keep <= 1.0:

@@ -159,13 +159,20 @@ class FrontView(RotorView):
         return [(0.0, -2.4), (-2.7, 0.0)]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return T_K q + T_C q': the force up on the foundation, across on the wall."""
+        """Return the components of T_K q + T_C q', up on the foundation and across on the wall.
+
+        T_K is `foundation_stiffness`, T_C is `foundation_damping`.
+        """
         force = self.foundation_stiffness @ pose.displacement + self.foundation_damping @ pose.velocity
         return np.array([[0.0, force[1]], [force[0], 0.0]])
 
 
 class ShaftView(RotorView):
-    """Rotor with tilt: the shaft from the side, with distances from the centre of mass, and on the right along the axis."""
+    """Rotor with tilt in two views.
+
+    On the left the shaft is seen from the side, with distances from the centre of mass; on the right the rotor is seen along
+    its axis.
+    """
 
     def __init__(self, scene: Scene):
         super().__init__(scene, 0.8)
@@ -245,7 +252,7 @@ class ShaftView(RotorView):
 
 
 def view_of(scene: Scene) -> View:
-    """Return the drawing of a scene, chosen by the kind of places of its machine."""
+    """Return the drawing of a scene, chosen by the way in which places on its machine are named (`Machine.places`)."""
     machine = scene.machine
     views = {"platform": PlatformView, "shaft": ShaftView, "point": FrontView, "plane": PlaneView}
     not_drawn = machine.places == "point" and machine.mounting().axes != (0, 1)

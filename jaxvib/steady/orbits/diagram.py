@@ -122,12 +122,21 @@ def exact_branches(
     """Compute the branch n(Omega) of exact jams with its stability and the points of stability changes.
 
     Each point is solved separately at its own load speed; therefore folds need no continuation. Special points are bracketed by
-    the points of the diagram and then found as roots: of dn/dOmega (fold), of prod (1 - s_i s_j) over pairs of multipliers
-    (torus), of prod (1 + s_i) (period doubling, or the loss of symmetry if s is the growth over half a period with the
-    half-turn), of prod (1 - s_i) for loads that separate (loss of symmetry).
+    the points of the diagram and then computed as roots. The multipliers s_i are those over a period; for motions with the
+    half-turn symmetry, s_i is instead the growth over half a period followed by the half-turn. The special points are the roots
 
-    **Arguments**: `points` along Omega, crowded about the resonances; `least`, `most` load speeds, rad/s or text (a fifth of
-    the lowest resonance, a third above the scene's rotor speed); `accuracy` of the rotor speeds, relative.
+    - of dn/dOmega: fold
+    - of prod (1 - s_i s_j) over pairs: torus
+    - of prod (1 + s_i), for all loads together or for loads that separate: loss of symmetry if the motion has the half-turn
+      symmetry, otherwise period doubling
+    - of prod (1 - s_i), for loads that separate: loss of symmetry
+
+    **Arguments**
+
+    - `points`: number of points along Omega, crowded about the resonances
+    - `least`, `most`: limits of the load speed, rad/s or text; default: a fifth of the lowest resonance, and 4/3 of the scene's
+      rotor speed
+    - `accuracy` of the rotor speeds, relative
 
     **Returns** `ExactBranches`; a point that could not be solved has NaN and a status. **Raises** `InputError`.
 
@@ -180,7 +189,8 @@ class _Solver:
 
     def __init__(self, scene: Scene, accuracy: float, slowest: float):
         self.scene, self.accuracy = scene, accuracy
-        # Decay is fastest for the slowest loads. All points use one method, so that no test changes sign between methods.
+        # In comparison with the speed of the loads, decay is fastest for the slowest loads. All points use the same integration
+        # method (explicit or implicit), so that no test function changes sign only because the method changes.
         self.implicit = bool(_is_stiff(scene, jnp.asarray(slowest, scene.drive.speed.dtype)))
 
     def __call__(self, omega: np.ndarray) -> _Values:
@@ -199,7 +209,10 @@ class _Solver:
 
 
 def _points(scene: Scene) -> list[int]:
-    """Return numbers of collocation points to try in turn, on half a period if the motion has that symmetry."""
+    """Return the numbers of collocation points to try one after the other.
+
+    The points lie on half a period if the motion has the half-turn symmetry, otherwise on a period.
+    """
     return [p if has_half_turn(scene.all_effects) else 2 * p + 1 for p in _COLLOCATION_POINTS]
 
 
@@ -211,6 +224,7 @@ def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.nd
 
 @cached
 def _fold_points(scene: Scene) -> tuple[Array, Array]:
+    """Return the grid of load speeds for the search for folds, and the resonances."""
     return fold_points(jammed_model(scene), 64)
 
 
@@ -234,8 +248,13 @@ _KINDS_OF_TESTS = ("torus", "half_turn", "half_turn", "symmetry")
 
 
 def _tests(growth: Floquet) -> Array:
-    """Return test functions (P, 4) of the growths s over a turn of the grid: prod (1 - s_i s_j) over pairs, prod (1 + s_i); for
-    loads that separate prod (1 + s_i), prod (1 - s_i)."""
+    """Return four test functions (P, 4) of the growth factors s.
+
+    - Two for all loads together, with the `roots` of `Floquet` as s: prod (1 - s_i s_j) over pairs, and prod (1 + s_i)
+    - Two for loads that separate, with its `inner` as s: prod (1 + s_i), and prod (1 - s_i)
+
+    The growth is that over half a period followed by the half-turn if the motion has this symmetry, otherwise over a period.
+    """
     s = growth.roots
     first, second = np.triu_indices(s.shape[0], 1)
     tests = [jnp.prod(1.0 - s[first] * s[second], axis=0), jnp.prod(1.0 + s, axis=0)]
@@ -279,7 +298,7 @@ def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
     points = []
     for k in range(row.size):
         s = values.multipliers[k]
-        # Two real multipliers with product 1 pass the torus test without being a bifurcation.
+        # Two real multipliers with product 1 are a root of the torus test, but not a bifurcation: such a point is left out.
         real = which[k] == 1 and not np.any((np.abs(np.abs(s) - 1.0) < 1e-4) & (np.abs(s.imag) > 1e-6))
         if np.isfinite(values.rotor_speed[k]) and not real:
             points.append(SpecialPoint(kinds[which[k]], float(a[k]), float(values.rotor_speed[k])))

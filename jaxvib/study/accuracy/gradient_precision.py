@@ -36,7 +36,10 @@ _Way: TypeAlias = tuple[str, str, str, Callable[[Array], Array | np.ndarray]]
 
 
 def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: int) -> Cost:
-    """Return the cost of the gradient of a jam's largest amplitude by the supports' stiffnesses; see `work_precision`."""
+    """Return the cost of the gradient of a jam's largest amplitude with respect to the stiffnesses of the supports.
+
+    See `work_precision`.
+    """
     mode, supports = jam.mode, _supports(scene)
     stiffness = jnp.ravel(supports)
     few, more, most = (collocation_points(scene, points) for points in (16, 24, 32))
@@ -73,7 +76,7 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
 
 
 def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
-    """Return gradients by runs of the scene `at` some stiffnesses, which start near a stable jam."""
+    """Return the ways to compute the gradient from runs that start near a stable jam; `at(k)`: scene with stiffnesses k."""
     until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
     max_steps = min(enough_steps(frequency_bounds(scene)[0], jnp.asarray(until)), _MAX_RECORDED_STEPS)
 
@@ -101,7 +104,10 @@ def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: flo
 
 
 def _differences(value: Callable[[Array], Array], at: Array) -> np.ndarray:
-    """Return central differences with relative steps of 1e-5; 0 for numbers that are 0."""
+    """Return central differences with relative steps of 1e-5.
+
+    The entry of a stiffness that is 0 is 0, because its step would be 0.
+    """
     steps = 1e-5 * np.asarray(at)
     whole = np.zeros(len(steps))
     for k in np.flatnonzero(steps):

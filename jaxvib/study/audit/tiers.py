@@ -24,8 +24,9 @@ class TierRow(NamedTuple):
     **Attributes**
 
     - `tier`: its name; `answers`: True if it can compute the audit's quantities for the scene
-    - error relative to the best tier, in `amplitude` (of the coordinate with the largest error, in units of the largest
-      amplitude), `foundation_force` and `omega`, NaN if `answers` is False
+    - `amplitude`, `foundation_force`, `omega`: the error of this quantity relative to the best tier, not the quantity itself;
+      for `amplitude` that of the coordinate with the largest error, in units of the largest amplitude; NaN if `answers` is
+      False
     - `seconds` of a computation, and additional seconds of the first one, `compile`; NaN without timings
     - `says`: its purpose, or the reason why it cannot compute the quantities
     """
@@ -49,7 +50,7 @@ class TierRow(NamedTuple):
 
 
 def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues, repeats: int) -> list[TierRow]:
-    """Return a row for each of `TIERS`, compared with the values `own` of the best tier; without times if `repeats` is 0."""
+    """Return a row for each of `TIERS`. The reference is `own`, the values of the best tier; no timings if `repeats` is 0."""
     return [_row(tier, scene, comparison, own, repeats) for tier in TIERS]
 
 

@@ -26,8 +26,11 @@ TOLERANCE = 1e-9
 
 
 class Unknowns(NamedTuple):
-    """Parameters of a fit: `angle` rad and `rate` rad/s at the first sample, counted from hanging; `offset` rad of the record's
-    zero; `frequency` rad/s of small swings; `viscous` mu1 N m s; `dry` mu2 or None."""
+    """Parameters of a fit.
+
+    **Attributes**: `angle` rad and `rate` rad/s at the first sample, measured from the hanging position; `offset` rad: the
+    recorded angle of the hanging position; `frequency` rad/s of small swings; `viscous` mu1 N m s; `dry` mu2 or None.
+    """
 
     angle: Array
     rate: Array
@@ -81,7 +84,10 @@ def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints,
 
 
 def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
-    """Return an upper bound of the integration steps, a power of 2, with which records of many lengths share few programs."""
+    """Return an upper bound of the number of integration steps.
+
+    It is rounded up to a power of 2, so that records of many different lengths share a few compiled programs.
+    """
     return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
 
 
@@ -106,6 +112,7 @@ def fit_swing(
     )
 
     def states(at: Unknowns) -> tuple[Array, Array]:
+        # Give the pendulum the gravity with which its small swings have the trial frequency.
         pull = at.frequency**2 * inertia / (pendulum.mass * length)
         freed = eqx.tree_at(lambda p: p.g, pendulum, pull)
         solver, adjoint = diffrax.Tsit5(), diffrax.ForwardMode()
@@ -144,10 +151,12 @@ def _least_squares(
 ) -> tuple[Array, Array, Array, tuple[Array, Array], Array]:
     """Minimize the sum of squares of `residual`, of which `n` entries count, by the method of Levenberg and Marquardt.
 
-    The program contains the integration once, since that takes long to compile. The iteration ends if the next full step is
-    below 0.01 standard errors, and has converged below 0.1, since the steps of the integration limit the resolution.
+    The integration appears only once in the program, because its compilation takes long. The iteration ends if the next
+    undamped (Gauss-Newton) step is below 0.01 standard errors. The fit counts as converged if that step is below 0.1 standard
+    errors, because the time steps of the integration limit the resolution. The code compares the squares, 1e-4 and 1e-2.
 
-    **Returns** x (p,), residual, slopes, the rest, success.
+    **Returns** x (p,), the residual (n,), its Jacobian (n, p), the other two outputs of `residual` (`stopped_at` and the fitted
+    angles (n,)), and True if the fit converged.
     """
     slopes_of = jax.jacfwd(residual, has_aux=True)
     size, p = jax.eval_shape(residual, start)[0].shape[0], start.shape[0]
@@ -170,7 +179,8 @@ def _least_squares(
         normal = triangle.T @ triangle
         damped = normal + damping * jnp.diag(jnp.diagonal(normal))
         trial = x - jnp.linalg.solve(damped, triangle.T @ reached)
-        # The full next step in standard errors, from the best point so far, since the sum may not decrease further at a kink.
+        # The square of the next undamped step in standard errors, from the best point so far, because the sum of squares may
+        # not decrease further at a kink.
         left_to_go = jnp.sum(reached**2) / (cost / (n - p) + floor)
         return count + 1, trial, damping, *best, left_to_go
 
