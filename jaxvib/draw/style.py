@@ -25,8 +25,8 @@ Look: TypeAlias = dict[str, Any]
 """Drawing style: options of matplotlib, which have various types."""
 
 COLORS = ("#004488", "#d55e00", "#44aa99", "#e69f00", "#882255", "#88ccee", "#000000", "#b3b3b3")
-"""Colours that readers with any colour vision can distinguish, with different grey levels of neighbours; further series start
-again with the first."""
+"""Colours that readers with any colour vision can distinguish; neighbours in this list have different grey levels. Further
+series start again with the first."""
 
 MARKERS = "osD^vPX*"
 STROKES = ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
@@ -98,7 +98,8 @@ def panels(
 def log_places(low: float, high: float, most: int = 9) -> LogLocator:
     """Return the tick positions of a logarithmic axis.
 
-    They are powers of ten, at most `most`, over three decades or more, and also values between them over a smaller range.
+    On an axis of three decades or more they are at most `most` powers of ten; on a shorter axis also values between powers of
+    ten.
 
     >>> [float(x) for x in log_places(0.4, 3.0).tick_values(0.4, 3.0) if 0.4 < x < 3.0]
     [0.5, 1.0, 2.0]
@@ -138,7 +139,10 @@ def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:
 
 
 def load_names(count: int) -> list[str | None]:
-    """Return the names of loads for a legend; more than eight loads, whose colours repeat, share the label of the first."""
+    """Return the names of loads for a legend.
+
+    More than eight loads, whose colours repeat, have one common label, which is attached to the first.
+    """
     if count == 1:
         return ["load"]
     return [f"load {k + 1}" for k in range(count)] if count <= len(COLORS) else [f"{count} loads", *[None] * (count - 1)]

@@ -31,9 +31,13 @@ class CoincidentModel(eqx.Module):
 
     - `linear`: carrier with its loads
     - `loads` and `effects` of the scene
-    - `unbalance` S, kg m, `inertia` I = sum kappa m R^2 and `drag` sum b_W R^2 of each body, (G,)
+    - `unbalance` S, kg m, `inertia` I = sum kappa m R^2 (kappa: inertia factor, 7/5 for balls) and `drag` sum b_W R^2 of each
+      body, (G,)
     - `offsets` (count,) rad: angle of each load minus the angle of its body
-    - `half_turn`: see `has_half_turn` of effects
+    - `half_turn`: True if phi -> phi + pi, q -> -q leaves the equations unchanged, see `has_half_turn` of effects
+
+    In the methods, `rate` is the angular velocity of the bodies or loads and `speed` that of the rotor, rad/s; M is the number
+    of samples and np the number of directions of the port.
     """
 
     linear: JammedModel
@@ -76,7 +80,7 @@ class CoincidentModel(eqx.Module):
         return torque
 
     def torque(self, phi: Points, rate: Array, speed: Array, a: Array, of_each: Callable[..., Array] | None = None) -> Array:
-        """Return the torque on the bodies at the angles `phi` (G, M), (G, M) N m.
+        """Return the torque on the bodies (G, M), N m, at their angles `phi` (G, M).
 
         It is the sum over the loads of each body of `of_each`, by default `torque_of_each`. `a` is (np, M).
         """
@@ -133,7 +137,8 @@ def _require_balance(effects: tuple[Effect, ...]) -> None:
 def light_friction(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
     """Return the sum of the torques of dry friction on light loads that turn at `omega`, N m.
 
-    The motion of the carrier is too small to change the radial load, and the mean contribution of the weight over a turn is 0.
+    The motion of the carrier is too small to change the normal force on the loads, and the mean contribution of the weight over
+    a turn is 0.
     """
     phi, rate = (jnp.zeros((loads.count,)),), (jnp.full((loads.count,), omega),)
     found = (term.friction(loads, phi, rate, speed, {}) for term in terms_of(effects, ContactFriction))

@@ -33,14 +33,16 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     with s the time in steps: 4e-9 of the amplitude for 16 samples a period, and 256 times less for twice as many.
 
     **Arguments**: x, v (n,), n >= 4: samples, and their slopes times the sampling step. **Returns** the extrema, the index of
-    the first of the four samples, and the place relative to it, in steps from 0 to 3; (2, 3) each.
+    the first of the four samples, and the place relative to it, in steps from 0 to 3; each is (2, 3): the minimum and the
+    maximum, over the first half, the second half and all samples.
     """
     n, half = len(x), len(x) // 2
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
     before = jnp.asarray(np.arange(n - 1) - first, x.dtype)
     polynomial = _polynomial(jnp.stack([x[first + k] for k in range(NODES)]), jnp.stack([v[first + k] for k in range(NODES)]))
     slope = _derivative(polynomial)
-    bend = _derivative(slope)
+    bend = _derivative(slope)  # the second derivative
+    # `turns`: True if an extremum lies between two samples.
     turns = v[:-1] * v[1:] < 0.0
 
     def nearer(_: int, share: Array) -> Array:
@@ -55,7 +57,10 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     inner = jax.lax.optimization_barrier(jnp.where(turns, _at(polynomial, before + share), x[:-1]))
 
     def greatest(sign: Array) -> tuple[Array, Array, Array]:
-        """Extrema over the first half of the samples, the second half and the step between them; the first of equal ones."""
+        """Maxima of `sign` times the motion over the first half of the samples, the second half and the step between them.
+
+        Of equal maxima the first is returned.
+        """
         samples, between = sign * x, sign * inner
         reached = jnp.maximum(between, samples[:-1])
         spans = (0, half), (half, n), (half - 1, half + 1)
@@ -84,7 +89,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
 
 
 def extremum_value(x: Array, v: Array, place: Array) -> Array:
-    """Return the value at an extremum, whose place between samples is differentiated as well.
+    """Return the value at an extremum. Its derivatives include the change of the place between samples.
 
     x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` counts from the first, in steps.
     """

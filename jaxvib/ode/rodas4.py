@@ -48,7 +48,7 @@ _DENSE = (
 
 
 class _Interpolation(StepInterpolation):
-    """Continuous extension of the method of order 3, a cubic in the fraction s of the step with `coefficients` c (2, n):
+    """Continuous extension, of order 3, of the method: a cubic in the fraction s of the step with `coefficients` c (2, n).
 
         y = (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1))
 
@@ -65,8 +65,8 @@ class _Interpolation(StepInterpolation):
 
 
 class Rodas4(diffrax.AbstractAdaptiveSolver):
-    """Hairer and Wanner's RODAS: a Rosenbrock method of order 4 with 6 stages, an error estimate of order 3 and its own
-    interpolant. L-stable and stiffly accurate.
+    """Hairer and Wanner's RODAS: a Rosenbrock method of order 4 with 6 stages, an embedded method of order 3 for the error
+    estimate, and its own interpolant. The method is L-stable and stiffly accurate.
 
         (1/(gamma h) - J) k_i = f(t + c_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
 
@@ -84,7 +84,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         return 4
 
     def error_order(self, terms: Terms) -> int:
-        """4: the error estimate falls with the fourth power of the step."""
+        """4: the estimated error of a step (embedded method of order 3) is proportional to the fourth power of its length."""
         return 4
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Array, args: Args) -> None:
@@ -106,7 +106,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     ) -> StepResult:
         """One step from t0 to t1."""
         h = t1 - t0
-        # A padded step has the length 0; its inverse must not divide by 0.
+        # A step that only fills up an array has the length 0; 1/h must not divide by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
         jacobian, time_derivative = _jacobian(terms, t0, y0, args)
         inverse = unrolled_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
@@ -130,7 +130,10 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
 
 
 def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Array, Array]:
-    """df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis, padded to whole vectors."""
+    """df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis.
+
+    This axis is padded to a multiple of the processor's vector width.
+    """
     n = y.shape[0]
     directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)
 

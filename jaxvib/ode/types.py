@@ -1,4 +1,4 @@
-"""Types of diffrax's methods and controllers, by the names of diffrax."""
+"""Type aliases for diffrax's solvers and step size controllers, with the names that diffrax uses."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from jax import Array
 from jaxtyping import PyTree
 
 RealScalarLike: TypeAlias = int | float | Array | np.ndarray
-"""A time, a tolerance, an order: a number, or an array ()."""
+"""Real number, or an array of shape (); for example a time, a tolerance or an order."""
 
 IntScalarLike: TypeAlias = int | Array | np.ndarray
-"""A direction, a whole number."""
+"""Integer, or an integer array of shape (); for example a direction."""
 
 BoolScalarLike: TypeAlias = bool | Array | np.ndarray
-"""Boolean: a Python value, or an array ()."""
+"""Boolean: a Python value, or an array of shape ()."""
 
 Y: TypeAlias = PyTree[Array]
 """State of the integration, as any tree of arrays; its errors and changes are trees of the same structure."""
@@ -32,7 +32,7 @@ Terms: TypeAlias = PyTree[diffrax.AbstractTerm]
 """The equations; all methods here take a single term."""
 
 DenseInfo: TypeAlias = dict[str, PyTree[Array]]
-"""Data of the interpolation of a step, by the names of its attributes."""
+"""Data of the interpolation of a step: a dictionary whose keys are the attribute names of the interpolation."""
 
 StepResult: TypeAlias = tuple[Y, Y, DenseInfo, VF | None, diffrax.RESULTS]
 """The state at the end of a step, its error, its interpolation, the method's own state, whether the step succeeded."""
@@ -44,4 +44,5 @@ Tangents: TypeAlias = PyTree[Array | None]
 """A tree like that of primal values, each array with a last axis over the tangent directions; None where all of them are 0."""
 
 Mapped: TypeAlias = PyTree[bool]
-"""A tree like that of values: whether each of them has an axis over the batch."""
+"""A tree like that of values, with True for each value that has an axis over the batch (`in_batched` of
+`jax.custom_batching.custom_vmap`)."""

@@ -36,7 +36,7 @@ class ModeShapes(Result):
     - `frequency` (nd,), rad/s
     - `shape` (nd, nd), a row for each mode: the amplitude of each coordinate relative to the largest, tilts in rad times their
       `lever`
-    - `lever` (nd,), m: the radius of gyration of a tilt (1 for lengths)
+    - `lever` (nd,), m: for a tilt its radius of gyration, for a displacement 1
     - `coordinates` (nd,): their names
     """
 

@@ -9,13 +9,16 @@ import numpy as np
 _MAX_NEWTON_STEPS = 60
 
 _STEPS_WITHOUT_PROGRESS, _NEAR_OPTIMUM = 8, 1e-6
-"""Number of steps in which the residual has not halved, and residual, at which the iteration ends because only rounding errors
-are left."""
+"""The iteration ends if the residual is below `_NEAR_OPTIMUM` and has not halved in `_STEPS_WITHOUT_PROGRESS` steps, because
+then only rounding errors are left."""
 
 
 class Solved(NamedTuple):
-    """Solutions `p` (s, d) and multipliers: of `held` equalities (s, me), of `demands` (s, mi), not negative, and of `bounds`
-    (s, d), positive at the upper one."""
+    """Solutions `p` (s, d) of s problems with d unknowns, and their multipliers.
+
+    The multipliers are those of the me equalities, `held` (s, me); of the mi inequalities, `demands` (s, mi), never negative;
+    and of the `bounds` (s, d), positive at an upper bound and negative at a lower one.
+    """
 
     p: np.ndarray
     held: np.ndarray
@@ -43,8 +46,8 @@ def elastic(
     Method: Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers have an
     error of at most about a millionth of the penalty.
 
-    **Arguments** (s problems): `hessian` B (s, d, d), not indefinite; `slope` g (s, d); `held` A (s, me, d) and a (s, me);
-    `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `penalty` (s,).
+    **Arguments** (s problems): `hessian` B (s, d, d), positive semidefinite; `slope` g (s, d); `held` A (s, me, d) and
+    a (s, me); `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `penalty` (s,).
 
     >>> import numpy as np
     >>> no = np.zeros((1, 0, 1)), np.zeros((1, 0))
@@ -56,7 +59,8 @@ def elastic(
     (a_rows, a), (c_rows, c), (low, high) = held, demands, box
     me, mi, d = a.shape[1], c.shape[1], slope.shape[1]
     program = _with_slacks(hessian, slope, held, demands, box, penalty)
-    # Start in the middle of the box with equal products of slacks and duals.
+    # Start in the middle of the box with equal products of slacks and duals. `broken` are the values of the constraints there,
+    # `wide` is the first value of all violations.
     p = (low + high) / 2.0
     broken = np.concatenate([_times(a_rows, p) + a, _times(c_rows, p) + c], axis=1)
     wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
@@ -85,7 +89,7 @@ def _with_slacks(
     box: tuple[np.ndarray, np.ndarray],
     penalty: np.ndarray,
 ) -> _Program:
-    """Return the programs of `elastic` with x = (p, the violation of each constraint), which is not negative."""
+    """Return the programs of `elastic` with x = (p, violations): one violation, never negative, for each constraint."""
     (a_rows, a), (c_rows, c), (low, high) = held, demands, box
     (s, d), me, mi = slope.shape, a.shape[1], c.shape[1]
     n = d + me + mi
@@ -137,7 +141,7 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
             break
         dx, ds, dl = _predicted_and_corrected(program, stationary, primal, gap, slack, dual)
         keep = np.where(done, 0.0, 0.995)
-        # One step length for both, since the equation of the duals contains the quadratic term.
+        # One step length for x and the duals, because the equation of the duals contains the quadratic term.
         by = keep * np.minimum(_longest(slack, ds), _longest(dual, dl))
         x = x + by[:, None] * dx
         slack = np.maximum(slack + by[:, None] * ds, 1e-300)

@@ -1,4 +1,4 @@
-"""Freedoms of the contacts of rolling loads: drilling spin about the normal, and sliding."""
+"""Additional degrees of freedom at the contacts of rolling loads: drilling spin about the normal, and sliding."""
 
 from __future__ import annotations
 
@@ -21,18 +21,21 @@ class FreeSpin(Effect):
 
         J s' = J a' (w B - R f') / r,    Q = (2/5) m r s (B a', - rho sin a f'),    J = (2/5) m r^2
 
+    - The symbols f, a, B, R, rho, r, w and n (the normal, from the tube's middle to the ball) are those of `TorusBalls`; Omega
+      is here the angular velocity of the ball, a vector
     - s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.drilling`, default:
       0 at the start); typical: up to the rotor speed, 140 rad/s
     - The forces Q act on the ball's two coordinates in addition to those of `TorusBalls`, whose contact keeps s = 0
     - A point contact exerts no moment about its normal. The ball's angular velocity about the normal therefore changes only
       with the direction of the normal, s' = Omega . n' + (w cos a)'
-    - While f' is constant, s grows by (w B - R f')/r per radian up the wall. A ball that left the equator with s = 0 then
-      returns to it like a point mass, but with kappa in its inertia: the restoring torque is m rho B f'^2 per radian instead of
-      m rho B (7/5 f'^2 - 2/5 w f'). Real contacts lie between the two
+    - While f' is constant, s grows by (w B - R f')/r per radian of a, the angle up the wall. On a ball that left the equator
+      with s = 0 the restoring torque is then that of a point mass, m rho B f'^2 per radian, instead of
+      m rho B (7/5 f'^2 - 2/5 w f'); only its inertia contains kappa. Real contacts lie between the two
 
     The effect needs an ideal drive; the acceleration of the wall when w changes is neglected, as in `TorusBalls`.
 
-    **Raises** `InputError`, by the scene, for loads that are not coupled to such a spin, as on a plane track, and for a motor.
+    **Raises** nothing itself. A scene with it raises `InputError` for loads that are not coupled to such a spin, such as those
+    on a plane track, and for a motor.
 
     >>> import jaxvib as jv
     >>> jv.FreeSpin().terms()
@@ -48,11 +51,11 @@ class FreeSpin(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Return the effect, which has no numbers."""
+        """Return the effect, which has no parameters."""
         return Typical(cls(), "no moment about the normal of a point contact")
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the freedom to spin."""
+        """Return the degree of freedom of the spin."""
         return (DrillingSpinRelease(),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
@@ -68,20 +71,22 @@ class Sliding(Effect):
 
         |F_t| <= mu max(N, 0);    while it slides F_t = - mu N c/|c|,    (kappa - 1) m (c')_t = F_t - F_r
 
-    - F_r is the force that rolling would need
+    - F_t is the force of the contact on the load along the track; the index t denotes the part tangential to the track
+    - F_r is here the force with which the load would roll at the actual acceleration of its centre
     - c is the velocity of the point of contact relative to the track along each coordinate of a load (`State.spin.slip`,
       default: 0 at the start; `with_spin(scene, state, "still")` for loads that do not rotate yet)
     - A sliding load moves like a mass without rotation. Friction accelerates its rotation until it rolls; a ball from rest then
       has 2/7 of the track's speed
     - Rolling is exact: below the limit there is no creep
 
-    If |c| is below `width`, the force is the one within the limit that is nearest to
+    If |c| is below `width`, the force is
 
         F_t = F_r - mu N c/width
 
-    The remaining slip then decays as exp(- kappa/(kappa-1) mu N t/(m width)). Steps must resolve this decay: about
-    kappa/(kappa-1) mu R w^2/width steps per second. `RollingFriction` still acts against the motion of the centre of a sliding
-    load.
+    with F_r that of the motion in which the load rolls. If F_t exceeds the limit, its size is reduced to the limit and its
+    direction is kept. The remaining slip then decays as exp(- kappa/(kappa-1) mu N t/(m width)). Steps must resolve this decay:
+    about kappa/(kappa-1) mu R w^2/width steps per second. `RollingFriction` still acts against the motion of the centre of a
+    sliding load.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -112,7 +117,7 @@ class Sliding(Effect):
         return kappa / (kappa - 1.0) * self.coefficient * loads.arm()[0] * speed**2 / self.width
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the freedom to slide, with mu and the width."""
+        """Return the degree of freedom of sliding, with mu and the width."""
         return (SlipRelease(self.coefficient, self.width),)
 
     @classmethod

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn
 
 _PHASE_JUMP = 0.3
-"""Change of a phase, rad, from one load speed to the next above which a figure shows another pattern."""
+"""If a phase changes by more than this, rad, between neighbouring load speeds, a figure shows another pattern."""
 
 
 class PhaseBranch(Result):
@@ -61,8 +61,9 @@ class PhaseBranch(Result):
         )
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the speeds of loads and rotor over the drag (N s/m, or relative to the scene's if loads differ in it); stable
-        solid, unstable dashed.
+        """Plot the speeds of loads and rotor over the drag; stable solid, unstable dashed.
+
+        The drag is in N s/m, or a multiple of the scene's drag if the loads have different drags.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """

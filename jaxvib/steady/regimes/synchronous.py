@@ -53,7 +53,7 @@ _REGIMES_PER_PROGRAM = 16
 """Number of regimes in one program; typical scenes have 2 to 20."""
 
 _MIN_DAMPING = 1e-9
-"""Growth, relative to the speed, above which a motion is not called stable: rounding hides weaker damping."""
+"""Decay rate, relative to the speed, below which a motion is not called stable, because rounding hides weaker damping."""
 
 
 class RegimeStatus(eqx.Enumeration):
@@ -86,17 +86,18 @@ class AbstractSynchronousRegime(Result):
 
     - `status`: a `RegimeStatus`
     - `speed` Omega, rad/s
-    - `phases` (mass,), rad, in the direction of rotation; 0 for the first mass, or for unbalances under ideal drives
+    - `phases` (mass,), rad, in the direction of rotation. If unbalances have ideal drives, their phases are 0; otherwise that
+      of the first mass is 0
     - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative
     - `quasi_static`, 1/s: the same according to the usual quasi-static criterion, which assumes that free vibrations of the
       machine decay infinitely fast; -inf if all speeds are prescribed
     - `margin`: the factor by which all differences of the driving torques can grow until the regime ends in a fold; inf if it
       does not end
-    - `torque` (mass,), N m: driving torque of the motor or of the drag, of an ideal drive the torque that it has to give
+    - `torque` (mass,), N m: driving torque, by the motor or by the drag; for an ideal drive the torque that it must exert
     - `vibrational_torque` (mass,), N m: mean torque of the vibration on each mass; it balances `torque`
-    - `power` (exciter,), W, that each drive gives in the mean
+    - `power` (exciter,), W: mean power of each drive
     - `can_start` (exciter,): False if gravity keeps an unbalance at the bottom against its motor at rest, S g > T(0)
-    - `displacement` (nd,): complex amplitudes, m, of rotations rad, and `amplitude` (nd,): their moduli, zero to peak
+    - `displacement` (nd,): complex amplitudes, in m, or in rad for rotations; `amplitude` (nd,): their moduli, zero to peak
     - `foundation_force`, N, zero to peak (for two directions the root of the summed squares of their peaks)
     - `residual` of the balance, relative to the largest vibrational torque that is possible
     - `scene`
@@ -209,10 +210,10 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = Non
         V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
         H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k,    e_k = (1, -i direction_k),    D = K - Omega^2 M + i Omega C
 
-    - The masses are the unbalances of the exciters, whose motors give L, and loads, whose drag gives L; an ideal drive turns
-      its unbalance at its speed, which is then Omega, at the angle Omega t
-    - Regimes that differ by a common turn or by an exchange of equal exciters, such as mirror images, are listed once; of a
-      family of regimes one member is listed, with the status `degenerate`
+    - The masses are the unbalances of the exciters, whose motors give L, and loads, whose drag gives L; an ideal drive
+      prescribes the angle Omega t of its unbalance, and Omega is then the speed of this drive
+    - Regimes that differ by the same shift of all phases or by an exchange of equal exciters, such as mirror images, are listed
+      once; of a family of regimes one member is listed, with the status `degenerate`
     - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
     - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; phases are off by tenths of a
       radian close to where two regimes exchange stability
@@ -221,10 +222,11 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = Non
 
     **Arguments**
 
-    - `scene`, with gravity or without effects; exciters have an unbalance, or loads and an ideal drive; typical: 2 to 6
-      rotating masses
-    - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime; `jit`, `vmap` and `grad` go
-      through it then. Derivatives are those of the implicit function theorem, of all but stability
+    - `scene`, with gravity as its only effect or without effects; exciters have an unbalance, or loads and an ideal drive;
+      typical: 2 to 6 rotating masses
+    - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime. The function can then be used
+      under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem; `growth`, `quasi_static`
+      and `stable` have none
 
     **Returns** `SynchronousRegimes`, or `SynchronousRegime` with `near`.
 
@@ -350,7 +352,10 @@ def _can_start(scene: Scene) -> Array:
 
 
 def _has_one_speed(balance: TorqueBalance) -> Array:
-    """Return True if all prescribed speeds of unbalances are equal, which known speeds are checked for beforehand."""
+    """Return True if all prescribed speeds of unbalances are equal.
+
+    `_require_one_speed` has already checked speeds that are known (not traced).
+    """
     field = balance.averaged
     speeds = [drive.speed for count, drive in zip(field.counts, field.drives, strict=True) if count == 0 and drive.ideal]
     return jnp.all(jnp.stack([speed == speeds[0] for speed in speeds])) if speeds else jnp.asarray(True)

@@ -35,7 +35,7 @@ class ExactJam(NamedTuple):
 
 
 def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
-    """Return the exact jam of a mode (default: the last but one that is stable by its slope).
+    """Return the exact jam of a mode (default: that of `usual_mode`).
 
     **Raises** `InputError` for a drive whose speed is not constant, and if no mode is stable.
     """
@@ -46,7 +46,7 @@ def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
 
 
 def usual_mode(scene: Scene) -> int:
-    """Return the default jam mode: the last but one that is stable by its slope.
+    """Return the default jam mode: the second-highest of the modes that are stable by slope, or the only one.
 
     **Raises** `InputError` if no mode is stable, and for the same scenes as `jam_modes`.
     """

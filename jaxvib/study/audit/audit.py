@@ -49,9 +49,9 @@ class Audit(Result):
 
     - `accuracy` that was requested, relative
     - `motion` that was compared, as text
-    - `kind` of the scene's own motion, `omega`, rad/s, `amplitude` (nd,), m (rad for tilts), `foundation_force`, N, and `fold`,
-      rad/s
-    - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if no time was taken)
+    - `kind` of the motion of the scene as given, before any effect is taken out or put in; its `omega`, rad/s, `amplitude`
+      (nd,), m (rad for tilts), and `foundation_force`, N; `fold`: the rotor speed at which the jam ends, rad/s
+    - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if times were not measured)
     - `effects`, `tiers` and `numbers`: lists of `EffectRow`, `TierRow`, `NumberRow`
     - `coordinates`: their names
     """
@@ -122,8 +122,9 @@ def audit(
 
     - Each effect of the scene is taken out; each that it lacks and could have is put in, with typical values
       (`Effect.typical`). The same quantities of both scenes are computed
-    - For a scene that jams at a constant rotor speed this is its jam, by the exact orbit or, if that is refused, by the full
-      equations until nothing changes. For any other scene it is the end of a run. That motion is judged, not the way to it
+    - The compared motion of a scene that jams at a constant rotor speed is its jam, by the exact orbit or, if that is refused,
+      by the full equations until nothing changes. The compared motion of any other scene is the end of a run. The transient
+      before it is not compared
     - The coupling of a rotor's tilts and the limit of a motor's power are taken out in the same way
     - Effects are characterized by their properties, so that one of your own is audited as the package's are
 
@@ -131,9 +132,9 @@ def audit(
 
     - `scene` to audit
     - `accuracy`: the relative change below which an effect is negligible; typical: 0.001 to 0.05 (default 0.01)
-    - `mode`: the jam mode; default: the last but one that is stable by its slope
-    - `until`, s or text: the end of a run; default: 100 slow periods, and also twice the time at which the drive's acceleration
-      jumps last
+    - `mode`: the jam mode; default: the second-highest of the modes that are stable by slope, or the only one
+    - `until`, s or text: the end of a run; default: 100 times the longest natural period of the carrier, plus twice the time of
+      the last jump of the drive's acceleration
     - `start` of the run: "rest", "turning" (loads evenly spread, as fast as the rotor) or a `State`. With it a run is computed
       in any case; default: "turning" if the rotor's speed is constant, otherwise "rest"
     - `possible`: effects to put in, in place of those that the package knows; `()` for none
@@ -196,7 +197,7 @@ def audit(
 
 
 def _with_computed_advice(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
-    """Return the row of a number with the advice on its effect, if that was computed."""
+    """Return the row of a dimensionless number. If the audit of its effect has a clear result, it has that advice."""
     for effect in effects:
         if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
             return row._replace(advice=effect.advice, says=f"{row.says}; the advice is that of the computed effect")

@@ -148,7 +148,10 @@ class RunComparison(NamedTuple):
 
     @classmethod
     def of_arguments(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunComparison:
-        """Return a comparison by a run; by default it ends `SLOW_PERIODS` slow periods after the last jump of the drive."""
+        """Return a comparison by a run.
+
+        By default it ends at 5 `SLOW_PERIODS` slow periods plus twice the time of the last jump of the drive's acceleration.
+        """
         if start is None:
             start = "turning" if scene.drive.constant else "rest"
         elif isinstance(start, State):
