@@ -293,7 +293,7 @@ def test_numbers_are_those_of_the_equations():
     np.testing.assert_allclose(rows["lift"].value, 600.0 / (9.81 * 55.0), rtol=1e-9)
     full = jv.Scene(SCENE.machine, jv.balls(count=12, mass=1.0, radius=0.1, drag=0.5), SCENE.drive)
     crowded = {row.name.partition(":")[0]: row for row in dimensionless_numbers(full, values, 0.01)}
-    assert crowded["crowding"].value > 1.0 and "no room" in crowded["crowding"].says
+    assert crowded["crowding"].value > 1.0 and "do not fit" in crowded["crowding"].says
     assert "gravity" not in {row.name.partition(":")[0] for row in dimensionless_numbers(SCENE, values, 0.01)}
     near = values._replace(closest=0.5)
     meets = [row for row in dimensionless_numbers(scene, near, 0.01) if row.name.startswith("contact")]
