@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.display import speed_text
 from jaxvib.draw.machine.parts import Part, circle, sector
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.machine.loads import Loads
@@ -115,9 +116,8 @@ def _words_of(exciter: Exciter) -> list[str]:
         drag = getattr(loads, "drag", None)
         if drag is not None:
             words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")
-    speed = float(drive.speed)
     turning = ", clockwise" if exciter.direction == -1 else ""
-    return [", ".join(words), f"{drive.kind.replace('_', ' ')}: {30.0 / np.pi * speed:.5g} rpm ({speed:.5g} rad/s){turning}"]
+    return [", ".join(words), f"{drive.kind.replace('_', ' ')}: {speed_text(drive.speed)}{turning}"]
 
 
 class Wheel:

@@ -17,6 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import quantity_text
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.mount import Place, on_body, read_place
@@ -79,7 +80,7 @@ class Ellipse(eqx.Module):
     def summary(self) -> str:
         """Return the ellipse as a line of text."""
         turn = {1: ", anticlockwise", -1: ", clockwise", 0: ""}[int(self.sense)]
-        axes = f"semi-axes {1e3 * float(self.semi_major):.4g} and {1e3 * abs(float(self.semi_minor)):.4g} mm{turn}"
+        axes = f"semi-axes {quantity_text([self.semi_major, abs(self.semi_minor)], 'm', 4, ' and ')}{turn}"
         along = "a circle" if bool(self.is_circle) else f"long axis at {np.rad2deg(float(self.direction)):.4g} deg"
         numbers = f"{float(self.acceleration):.4g} g, throw number {float(self.throw_number):.4g}"
         rest = f", remainder {float(self.remainder):.2g}" if float(self.remainder) > 0.0 else ""

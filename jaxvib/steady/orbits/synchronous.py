@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.forces import drive_torques
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
@@ -141,13 +142,13 @@ class SynchronousOrbit(PointAnswers, Result):
     def summary(self) -> str:
         """Return the result as a few lines of text; amplitudes zero to peak."""
         units = self.scene.machine.structure().units
-        amplitudes = ", ".join(f"{float(a):.6g} {unit}" for a, unit in zip(self.amplitude, units, strict=True))
+        amplitudes = ", ".join(quantity_text(a, unit, 6) for a, unit in zip(self.amplitude, units, strict=True))
         phases, torques = (", ".join(f"{float(x):.6g}" for x in each) for each in (self.phases, self.torque))
         return (
-            f"{self.message}\nspeed {float(self.speed):.9g} rad/s, phases {phases} rad, "
+            f"{self.message}\nspeed {speed_text(self.speed, 9)}, phases {phases} rad, "
             f"{self.judgement} (largest multiplier {float(self.multiplier):.6g})\n"
             f"torques {torques} N m, power {float(jnp.sum(self.power)):.6g} W\n"
-            f"amplitude {amplitudes}, foundation force {float(self.foundation_force):.6g} N\n"
+            f"amplitude {amplitudes}, foundation force {quantity_text(self.foundation_force, 'N', 6)}\n"
             f"{self.displacement_harmonics.shape[-1] - 1} harmonics leave an error of {float(self.error):.1e}"
         )
 
