@@ -109,6 +109,9 @@ from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
 
+# Recorded runs of a machine
+from jaxvib.identification.run import Channel, MeasuredRun
+
 # Capture in a torus
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
@@ -298,6 +301,9 @@ __all__ = [
     "identify",
     "Identified",
     "IdentifyStatus",
+    # Recorded runs of a machine
+    "Channel",
+    "MeasuredRun",
     # Capture in a torus
     "capture",
     "Capture",

@@ -12,6 +12,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 FLOORS = (
     ("jaxvib.cli",),
     ("jaxvib.sweeps", "jaxvib.report", "jaxvib.explore", "jaxvib.exchange"),
+    ("jaxvib.identification",),
     ("jaxvib.study", "jaxvib.show", "optimize"),
     ("jaxvib.motion",),
     ("jaxvib.steady",),

@@ -1,0 +1,1 @@
+"""Identification of machines from recorded runs."""
