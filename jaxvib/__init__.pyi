@@ -24,7 +24,17 @@ from jaxvib.machine.loads import Loads, balls, pendulums, rollers
 from jaxvib.machine.torus import torus_balls
 
 # Drives
-from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp, SwitchedOff
+from jaxvib.machine.drives.drive import (
+    ConstantSpeed,
+    DCMotor,
+    Drive,
+    IdealDrive,
+    InductionMotor,
+    Motor,
+    RunUp,
+    SpinUp,
+    SwitchedOff,
+)
 
 # Effects
 from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, StaticImbalance

@@ -32,7 +32,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     **Raises** `InputError` for an effect that the scene does not have, and for a string that is not a speed.
     """
     from jaxvib.display import speed_text  # slow imports, which --help does not need
-    from jaxvib.machine.drive import ConstantSpeed
+    from jaxvib.machine.drives.drive import ConstantSpeed
     from jaxvib.machine.files import load_scene
 
     scene = load_scene(path)

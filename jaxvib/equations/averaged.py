@@ -59,7 +59,7 @@ from jax import Array
 from jaxvib.equations.linear import LinearModel, linear_model, require_circular, require_terms, turning_loads
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, within
-from jaxvib.machine.drive import Drive
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.terms import GravityField, LoadPotential
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.mount import Mount

@@ -30,7 +30,7 @@ from jaxvib.equations.sliding import (
 )
 from jaxvib.equations.state import ExciterState, Spin
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import Drive
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
     ContactFriction,

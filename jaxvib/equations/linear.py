@@ -15,7 +15,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.modal import ModalResponse, modal_response
 from jaxvib.equations.model import Model, assemble
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drive import Drive
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import (
     ContactFriction,

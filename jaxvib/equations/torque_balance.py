@@ -22,7 +22,7 @@ from jax import Array
 
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
 from jaxvib.equations.linear import LinearModel, linear_model, turning
-from jaxvib.machine.drive import ConstantSpeed, Drive
+from jaxvib.machine.drives.drive import ConstantSpeed, Drive
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve, times
 

@@ -17,7 +17,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import IdealDrive, Motor
+from jaxvib.machine.drives.drive import IdealDrive, Motor
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import SupportForce, Term
 from jaxvib.machine.numbers.named import NamedNumber, numbers_of

@@ -18,7 +18,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted, written
 from jaxvib.exchange.optional import optional_module, require_writable
 from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces, signals_of
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import SupportForce
 from jaxvib.machine.scene import Scene

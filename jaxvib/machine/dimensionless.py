@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import Platforms

@@ -15,7 +15,7 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, written
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp, SwitchedOff
+from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp, SwitchedOff
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers

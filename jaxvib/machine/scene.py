@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.carrier import Machine, shapes_of
-from jaxvib.machine.drive import Clockwise, Drive
+from jaxvib.machine.drives.drive import Clockwise, Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
 from jaxvib.machine.loads import Loads

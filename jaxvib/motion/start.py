@@ -16,7 +16,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.sliding import dot, kinematics
 from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError, quoted, within
-from jaxvib.machine.drive import SpinUp
+from jaxvib.machine.drives.drive import SpinUp
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, LoadInteraction, SlipRelease
 from jaxvib.machine.loads import Loads

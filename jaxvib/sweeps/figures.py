@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvib.display import shown_unit
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.files import scene_from_toml, suggest_name
 from jaxvib.steady.orbits.diagram import exact_branches
 from jaxvib.sweeps.axes import SAMPLE, axis_of, put

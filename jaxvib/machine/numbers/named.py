@@ -18,7 +18,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import Drive
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.files import EFFECTS, suggest_name
 from jaxvib.machine.loads import Loads

@@ -17,7 +17,7 @@ from jax import Array
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag, require_terms
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drive import SwitchedOff
+from jaxvib.machine.drives.drive import SwitchedOff
 from jaxvib.machine.effects.base import has_half_turn, has_term
 from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadPotential, RotorImbalance, SupportForce
 from jaxvib.machine.loads import CircularLoads

@@ -15,7 +15,7 @@ from jaxvib.equations.dynamics import Dynamics, dynamics_of
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.state import ExciterState, State
-from jaxvib.machine.drive import Motor
+from jaxvib.machine.drives.drive import Motor
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics import radau

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import ConstantSpeed, DCMotor
+from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor
 from jaxvib.machine.files import DRIVES, EFFECTS
 from jaxvib.machine.loads import Loads, balls, pendulums
 from jaxvib.machine.scene import Scene

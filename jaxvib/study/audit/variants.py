@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.drive import ConstantSpeed, SpinUp
+from jaxvib.machine.drives.drive import ConstantSpeed, SpinUp
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.files import EFFECTS
 from jaxvib.machine.mount import Mount, Place

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.drive import Motor
+from jaxvib.machine.drives.drive import Motor
 
 
 class Turbine(Motor):

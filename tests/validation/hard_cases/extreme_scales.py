@@ -13,7 +13,7 @@ from hard_cases.case import Answer, Case, Reference
 from hard_cases.reference_integration import run_out
 from hard_cases.reference_model import light_modes, light_speed, platforms, reference_model
 from hard_cases.shared import away, compared_state, final_state, jam_case, published, run_case
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.loads import pendulums
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import two_mass

@@ -16,7 +16,7 @@ from hard_cases.nonsmooth import stop_law
 from hard_cases.reference_integration import orbit_rotor_speed, orbit_speed
 from hard_cases.reference_model import ReferenceModel, light_speed, platforms, reference_model
 from hard_cases.shared import away, final_state, published, run_case, state_of
-from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, RunUp
+from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, RunUp
 from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 from jaxvib.machine.loads import pendulums

@@ -10,7 +10,7 @@ from hard_cases.case import Case, Reference
 from hard_cases.reference_integration import Event, by_events, natural_sizes
 from hard_cases.reference_model import number_of, reference_model
 from hard_cases.shared import away, compared_state, final_state
-from jaxvib.machine.drive import ConstantSpeed, Drive, RunUp
+from jaxvib.machine.drives.drive import ConstantSpeed, Drive, RunUp
 from jaxvib.machine.effects.base import Effect, Gravity
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction

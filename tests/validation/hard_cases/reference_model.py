@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar, root_scalar
 
-from jaxvib.machine.drive import Drive
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene

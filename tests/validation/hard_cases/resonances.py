@@ -13,7 +13,7 @@ from hard_cases.reference_integration import orbit_speed
 from hard_cases.reference_model import light_modes, light_speed, platforms, reference_model
 from hard_cases.shared import away, final_state, jam_case, light_force_slope, published, run_case
 from jaxvib.equations.linear import natural_frequencies
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.loads import balls
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import three_mass

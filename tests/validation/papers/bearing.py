@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.forces import normal_force
 from jaxvib.equations.state import State
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import Effect, Gravity
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.loads import pendulums

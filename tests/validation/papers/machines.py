@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from jax import Array
 
-from jaxvib.machine.drive import ConstantSpeed, RunUp
+from jaxvib.machine.drives.drive import ConstantSpeed, RunUp
 from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.loads import pendulums

@@ -10,7 +10,7 @@ from typing import cast
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.rotor import Rotor, rotor
 from jaxvib.steady.jams.phase_branch import PhaseBranch

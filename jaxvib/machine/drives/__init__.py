@@ -1,0 +1,1 @@
+"""Drives: prescribed speeds, motors, converters and speed control."""
