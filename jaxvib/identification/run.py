@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, require_one_of
-from jaxvib.units import Number, number, unit_ratio
+from jaxvib.results.table import is_number
+from jaxvib.units import Number, number
+from jaxvib.units.columns import unit_factor
 
 Kind = Literal["acceleration", "velocity", "displacement", "force", "pulses", "speed", "angle", "torque", "current"]
 
@@ -34,25 +36,6 @@ _GAIN_ERROR = {"acceleration": 0.01}
 
 _DIRECTIONS = {"up": (0.0, 1.0), "down": (0.0, -1.0), "across": (1.0, 0.0), "-across": (-1.0, 0.0)}
 
-_G = {"g", "gn", "g0", "G", "g_n", "g_0"}
-"""Spellings of the standard acceleration of gravity as a unit of acceleration; pint would read "g" as gram."""
-
-STANDARD_GRAVITY = 9.80665
-
-
-def unit_factor(unit: str, kind: str) -> float | None:
-    """Return the factor from a unit to the SI unit of a kind of channel; None for a unit of another dimension.
-
-    >>> unit_factor("g", "acceleration"), unit_factor("mm/s", "velocity"), unit_factor("mm", "force")
-    (9.80665, 0.001, None)
-    """
-    unit = unit.strip()
-    if kind == "pulses":
-        return 1.0
-    if kind == "acceleration" and unit in _G:
-        return STANDARD_GRAVITY
-    return 1.0 if unit == UNITS[kind] else unit_ratio(unit, UNITS[kind])
-
 
 class Channel(eqx.Module):
     """Channel of a recorded run: a sensor with its place, or a quantity that the recorder computed.
@@ -62,8 +45,8 @@ class Channel(eqx.Module):
     - `name` of the column or channel in the file
     - `kind`: "acceleration", "velocity", "displacement", "force" (on the foundation), "pulses" (of a tachometer), "speed",
       "angle" or "torque" of the rotor, "current" of the motor
-    - `at`: number of the platform, or (x, y), m, of a point of a body, for kinds that measure a motion; default: the place of
-      the exciter
+    - `at`: number of the platform, from 1, or (x, y), m, of a point of a body, for kinds that measure a motion; default: the
+      place of the exciter
     - `direction` in which a positive reading points: "up", "down", "across", "-across", or a pair (across, up) of any length;
       default: up
     - `unit` of the samples, such as "g", "mm/s" or "rpm"; default: the unit stated in the file, otherwise the SI unit
@@ -79,7 +62,7 @@ class Channel(eqx.Module):
     **Raises** `InputError` for an unknown kind or direction, a unit of another dimension, and numbers that are not allowed.
 
     >>> import jaxvib as jv
-    >>> jv.Channel("frame", "acceleration", at=0, unit="g", range="50 g").range
+    >>> jv.Channel("frame", "acceleration", at=1, unit="g", range="50 g").range
     490.3325
     """
 
@@ -110,7 +93,7 @@ class Channel(eqx.Module):
     ):
         where = f"channel {quoted(name)}"
         require_one_of(kind, get_args(Kind), f"{where}: kind")
-        if unit is not None and unit_factor(unit, kind) is None:
+        if unit is not None and kind != "pulses" and unit_factor(unit, UNITS[kind]) is None:
             raise InputError(
                 f"{where}: unit", f"is {quoted(unit)}, which is not a unit of {kind}; write for example {UNITS[kind]}"
             )
@@ -127,19 +110,17 @@ class Channel(eqx.Module):
         """Return the largest reading in SI units."""
         if isinstance(value, str):
             text, _, unit = value.strip().partition(" ")
-            factor = unit_factor(unit, self.kind) if unit and self.kind != "pulses" else None
-            if factor is not None and _is_number(text):
-                value = float(text) * factor
-            elif _is_number(value):
-                value = float(value) * self.factor
-        elif isinstance(value, (int, float)):
-            value = value * self.factor
-        return float(number(value, UNITS[self.kind], field, low=0.0, open_low=True))
+            factor = unit_factor(unit, UNITS[self.kind]) if unit else self.factor
+            if factor is not None and is_number(text, ","):
+                return float(number(float(text) * factor, UNITS[self.kind], field, low=0.0, open_low=True))
+        return float(number(value, UNITS[self.kind], field, low=0.0, open_low=True)) * (
+            1.0 if isinstance(value, str) else self.factor
+        )
 
     @property
     def factor(self) -> float:
         """Factor from the channel's unit to SI; 1 for a channel without a unit."""
-        return 1.0 if self.unit is None else unit_factor(self.unit, self.kind) or 1.0
+        return 1.0 if self.unit is None or self.kind == "pulses" else unit_factor(self.unit, UNITS[self.kind]) or 1.0
 
 
 class Change(NamedTuple):
@@ -204,7 +185,7 @@ class MeasuredRun(eqx.Module):
 
         >>> import numpy as np, jaxvib as jv
         >>> t = np.arange(0.0, 2.0, 1e-3)
-        >>> frame = jv.Channel("frame", "acceleration", at=0, unit="g")
+        >>> frame = jv.Channel("frame", "acceleration", at=1, unit="g")
         >>> reading = {"frame": 0.1 * np.sin(50.0 * t)}
         >>> run = jv.MeasuredRun.from_arrays([frame], t, reading, change={"machine.mass[0]": "+10 kg"})
         >>> run.change["machine.mass[0]"].action, round(float(np.max(run.values["frame"])), 3)
@@ -259,20 +240,13 @@ def parse_change(value: Number, field: str) -> Change:
         return Change("set", float(number(value, "", field)))
     text = value.strip()
     if text[:1] in ("+", "-"):
-        if text.endswith("%") and _is_number(text[1:-1]):
+        if text.endswith("%") and is_number(text[1:-1], ","):
             return Change("scale", 1.0 + float(text[:-1]) / 100.0)
         rest = text[1:].strip()
         return Change("add", f"-{rest}" if text[0] == "-" else rest)
     if not text:
         raise InputError(field, "is empty; write for example '+10 kg' or '95 kg'")
     return Change("set", text)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
 
 
 def _samples(values: ArrayLike, where: str) -> np.ndarray:
@@ -291,8 +265,8 @@ def _known(value: Number, unit: str, field: str) -> float:
 
 def _place(at: int | Sequence[Number] | None, where: str) -> int | tuple[float, float] | None:
     if at is None or isinstance(at, (int, np.integer)):
-        if at is not None and at < 0:
-            raise InputError(f"{where}: at", f"is {at}; it must be the number of a platform, from 0, or a pair (x, y)")
+        if at is not None and at < 1:
+            raise InputError(f"{where}: at", f"is {at}; it must be the number of a platform, from 1, or a pair (x, y)")
         return None if at is None else int(at)
     if len(at) != 2:
         raise InputError(f"{where}: at", f"is {quoted(at)}; it must be the number of a platform, or a pair (x, y)")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,37 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxvib.boundary import validated
-from jaxvib.errors import InputError, quoted, read_text
+from jaxvib.errors import InputError, quoted
 from jaxvib.results.fields import in_unit
-
-_MAX_BYTES, _MAX_LINE = 2**26, 10_000
-"""Largest number of bytes of a record (some million samples), and of characters of a line."""
+from jaxvib.results.table import TextTable, read_table
+from jaxvib.units.columns import split_head, unit_factor
 
 _MIN_SAMPLES = 16
 """Smallest number of samples of a record; fewer do not contain a swing."""
 
 _NAMES = {"time": ("time", "t", "zeit", "время"), "angle": ("angle", "phi", "theta", "f", "winkel", "угол")}
 
-_UNITS = {
-    "time": {
-        **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "с"), 1.0),
-        **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds", "мс"), 1e-3),
-        **dict.fromkeys(("us", "µs", "μs", "usec", "microsecond", "microseconds"), 1e-6),
-        **dict.fromkeys(("min", "minute", "minutes"), 60.0),
-    },
-    "angle": {
-        **dict.fromkeys(("rad", "rads", "radian", "radians", "рад"), 1.0),
-        **dict.fromkeys(("mrad", "milliradian", "milliradians"), 1e-3),
-        **dict.fromkeys(("deg", "degs", "degree", "degrees", "°", "град"), np.pi / 180.0),
-        **dict.fromkeys(("mdeg", "millidegree", "millidegrees"), np.pi / 180e3),
-        **dict.fromkeys(("gon", "gradian", "gradians"), np.pi / 200.0),
-        **dict.fromkeys(("turn", "turns", "rev", "revs", "revolution", "revolutions"), 2.0 * np.pi),
-    },
-}
-"""Units of columns in SI, in lower case; headers may be in upper or lower case."""
+_SI = {"time": "s", "angle": "rad"}
 
-_HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[{]\s*(?P<unit>[^)\]}]*?)\s*[)\]}]|/\s*(?P<per>\S+))$")
-_TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
+_EXAMPLES = {"time": "s, ms, us or min", "angle": "rad, mrad, deg, gon or turn"}
 
 
 class Record(eqx.Module):
@@ -138,52 +119,20 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
     """
     if columns is not None and (len(columns) != 2 or not all(isinstance(name, str) for name in columns)):
         raise InputError("columns", f"is {quoted(columns)}; give the names of two columns, time first, such as ['t', 'phi']")
-    path = Path(path)
-    lines = read_text(path, "a CSV file", most=_MAX_BYTES).splitlines()
-    for k, line in enumerate(lines, 1):
-        if len(line) > _MAX_LINE:
-            raise InputError(
-                f"{path} line {k}", f"has {len(line)} characters; a record has one time and its angle in each line"
-            )
-    rows = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
-    if not rows:
-        raise InputError(str(path), "contains no lines of numbers; it needs two columns, time and angle")
-    mark = next((m for m in (";", "\t", ",") if m in rows[0][1]), None)
-    cells = [(k, [cell.strip().strip('"') for cell in line.split(mark)]) for k, line in rows]
-
-    heads: list[list[str]] = []
-    while cells and len(heads) < 2 and not any(_is_number(cell, mark) for cell in cells[0][1]):
-        heads.append(cells.pop(0)[1])
-    if not cells:
-        raise InputError(str(path), "contains no lines of numbers below its header")
-    places, factors = _columns(heads, len(cells[0][1]), columns, angle_unit, path)
-
-    width = len(heads[0]) if heads else len(cells[0][1])
-    values = np.empty((len(cells), 2))
-    for n, (k, row) in enumerate(cells):
-        where = f"{path} line {k}"
-        if len(row) != width:
-            raise InputError(where, f"has {len(row)} columns; the lines above have {width}")
-        for m, (place, what) in enumerate(zip(places, _NAMES, strict=True)):
-            if not _is_number(row[place], mark):
-                raise InputError(where, f"has {quoted(row[place])} where the {what} should be; a finite number is needed")
-            values[n, m] = float(row[place].replace(",", ".")) * factors[m]
-        if n and values[n, 0] <= values[n - 1, 0]:
-            raise InputError(where, f"has the time {values[n, 0]:g} s after {values[n - 1, 0]:g} s; times must ascend")
-    return Record(values[:, 0], values[:, 1], str(path))
+    table = read_table(path, "two columns, time and angle")
+    places, factors = _columns(table, columns, angle_unit)
+    values = table.values(places, list(_NAMES)) * factors
+    wrong = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
+    if wrong.size:
+        n = int(wrong[0]) + 1
+        pair = f"{values[n, 0]:g} s after {values[n - 1, 0]:g} s"
+        raise InputError(f"{table.path} line {table.line(n)}", f"has the time {pair}; times must ascend")
+    return Record(values[:, 0], values[:, 1], str(table.path))
 
 
-def _is_number(cell: str, mark: str | None) -> bool:
-    try:
-        return bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))
-    except ValueError:
-        return False
-
-
-def _columns(
-    heads: list[list[str]], width: int, requested: Sequence[str] | None, angle_unit: str | None, path: Path
-) -> tuple[list[int], list[float]]:
+def _columns(table: TextTable, requested: Sequence[str] | None, angle_unit: str | None) -> tuple[list[int], list[float]]:
     """Return the columns of time and angle, and the factors that make them SI."""
+    path, width, heads = table.path, table.width, table.heads
     if width < 2:
         raise InputError(str(path), "has one column; two are needed, time and angle, separated by commas, semicolons or tabs")
     given = None if angle_unit is None else _factor(angle_unit, "angle", f"{path}: unit of angle")
@@ -191,19 +140,17 @@ def _columns(
         if requested is not None or width > 2:
             raise InputError(str(path), f"has {width} columns but no line of names; add one, for example time (s), angle (deg)")
         return [0, 1], [1.0, 1.0 if given is None else given]
-    if len(heads) == 2 and len(heads[1]) != len(heads[0]):
-        raise InputError(str(path), f"has {len(heads[0])} names but {len(heads[1])} units below them")
-    below = [unit.strip("()[]{} ") for unit in heads[1]] if len(heads) == 2 else [""] * len(heads[0])
+    below = table.units or [""] * width
     places, factors = [], []
     for k, (what, known) in enumerate(_NAMES.items()):
-        parts = [_split_head(head, what) for head in heads[0]]
+        parts = [split_head(head, _SI[what]) for head in heads]
         choice = tuple(name.strip().lower() for name in ((requested[k],) if requested is not None else known))
-        found = [i for i, (name, _) in enumerate(parts) if {name.lower(), heads[0][i].lower()} & set(choice)]
+        found = [i for i, (name, _) in enumerate(parts) if {name.lower(), heads[i].lower()} & set(choice)]
         if not found and requested is None and width == 2:
             found = [k]
         if len(found) != 1:
             problem = f"has {len(found) or 'no'} column{'s' if found else ''} {(requested[k] if requested else choice[0])!r}"
-            names = ", ".join(heads[0])
+            names = ", ".join(heads)
             raise InputError(str(path), f"{problem} for the {what}; its columns are {names}: name those of time and angle")
         place = found[0]
         name, unit = parts[place]
@@ -218,27 +165,13 @@ def _columns(
         else:
             advice = f"write {what} ({'s' if what == 'time' else 'deg'})" + (" or give angle_unit" if what == "angle" else "")
             raise InputError(
-                str(path), f"has the column {quoted(heads[0][place])} for the {what}, whose unit is unknown; {advice}"
+                str(path), f"has the column {quoted(heads[place])} for the {what}, whose unit is unknown; {advice}"
             )
     return places, factors
 
 
-def _split_head(head: str, what: str) -> tuple[str, str]:
-    """Return the name and the unit of a column's head: `name (unit)`, `name / unit`; `name_unit` if the unit is known."""
-    part = _HEAD.match(head)
-    if part is not None:
-        return part["name"].strip(), part["unit"] or part["per"] or ""
-    tail = _TAIL.match(head)
-    if tail is not None and tail["tail"].lower() in _UNITS[what]:
-        return tail["name"].strip(), tail["tail"]
-    return head.strip(), ""
-
-
 def _factor(unit: str, what: str, field: str) -> float:
-    factor = _UNITS[what].get(unit.strip().lower())
+    factor = unit_factor(unit, _SI[what])
     if factor is None:
         raise InputError(field, f"is {quoted(unit)}, which is not a unit of {what} here; write {_EXAMPLES[what]}")
     return factor
-
-
-_EXAMPLES = {"time": "s, ms, us or min", "angle": "rad, mrad, deg, gon or turn"}

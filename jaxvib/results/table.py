@@ -1,0 +1,190 @@
+"""Tables of numbers in text files: CSV, or columns between semicolons, tabs or blanks."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxvib.errors import InputError, open_regular, quoted
+
+_MAX_BYTES, _MAX_LINE = 2**29, 10_000
+"""Largest number of bytes of a file (ten million rows of five columns), and of characters of a line."""
+
+_MAX_PREAMBLE = 400
+"""Largest number of lines above the head of a table."""
+
+_MISSING = ("", "-", "nan", "na", "n/a", "#n/a", "null", "none")
+"""Texts, in lower case, in place of a reading that is missing."""
+
+
+class TextTable(NamedTuple):
+    """Table of numbers in a text file.
+
+    **Attributes**
+
+    - `path` of the file
+    - `heads` and `units`: texts of the line of names and of the line below it, an empty list without such a line
+    - `width`: number of columns
+    - `remarks`: lines above the head, and those that begin with #
+    - `first`: number of lines with content above the first row of numbers
+    - `mark`: character between columns, None for blanks
+    """
+
+    path: Path
+    heads: list[str]
+    units: list[str]
+    width: int
+    remarks: list[str]
+    first: int
+    mark: str | None
+
+    def values(self, places: Sequence[int], names: Sequence[str], *, missing: bool = False) -> np.ndarray:
+        """Return columns as numbers, (rows, columns).
+
+        **Arguments**: `places` of the columns, from 0; their `names` for messages; `missing`: True to return NaN for readings
+        that are empty or NaN.
+
+        **Raises** `InputError` with the line, for a row of another width and for a text that is not a finite number.
+        """
+        try:
+            found = np.loadtxt(self._texts(), delimiter=self.mark, usecols=places, comments=None, quotechar='"', ndmin=2)
+        except ValueError:
+            found = None
+        if found is not None and np.all(np.isfinite(found)):
+            return found
+        return np.array([self._row(k, text, places, names, missing) for k, text in self._rows()])
+
+    def line(self, row: int) -> int:
+        """Return the number of the line in the file of a row of numbers, from 0."""
+        return next(itertools.islice(self._rows(), row, None))[0]
+
+    def _rows(self) -> Iterator[tuple[int, str]]:
+        return itertools.islice(_content(self.path), self.first, None)
+
+    def _texts(self) -> Iterator[str]:
+        """Yield the rows for NumPy. **Raises** `ValueError` for a row of another width."""
+        for _, text in self._rows():
+            if (len(text.split()) if self.mark is None else text.count(self.mark) + 1) != self.width:
+                raise ValueError
+            yield text if self.mark == "," else text.replace(",", ".")
+
+    def _row(self, line: int, text: str, places: Sequence[int], names: Sequence[str], missing: bool) -> list[float]:
+        cells = _cells(text, self.mark)
+        if len(cells) != self.width:
+            raise InputError(f"{self.path} line {line}", f"has {len(cells)} columns; the lines above have {self.width}")
+        found = []
+        for place, name in zip(places, names, strict=True):
+            cell = cells[place]
+            if missing and cell.lower() in _MISSING:
+                found.append(np.nan)
+                continue
+            if not is_number(cell, self.mark):
+                problem = f"has {quoted(cell)} where the {name} should be; a finite number is needed"
+                raise InputError(f"{self.path} line {line}", problem)
+            found.append(float(cell.replace(",", ".")))
+        return found
+
+
+def read_table(path: str | Path, needs: str) -> TextTable:
+    """Read the head of a table of text.
+
+    - Lines that begin with # and empty lines are skipped, and so are lines above the line of names if it is directly above the
+      numbers
+    - Between semicolons, tabs or blanks numbers may have a decimal comma
+
+    **Arguments**: `path` of the file; `needs`: the expected columns, for messages.
+
+    **Returns** `TextTable`. **Raises** `InputError` for a file that cannot be read or has no numbers.
+
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+    >>> _ = path.write_text("recorder 7\\ntime (s);frame (g)\\n0,0;0,5\\n0,1;0,7\\n")
+    >>> table = read_table(path, "time and readings")
+    >>> table.heads, table.values([0, 1], table.heads).tolist()
+    (['time (s)', 'frame (g)'], [[0.0, 0.5], [0.1, 0.7]])
+    """
+    path = Path(path)
+    remarks = [text.lstrip("# \t") for _, text in _lines(path, _MAX_PREAMBLE) if text.startswith("#")]
+    texts = [text for _, text in itertools.islice(_content(path), _MAX_PREAMBLE + 2)]
+    if not texts:
+        raise InputError(str(path), f"contains no lines of numbers; it needs {needs}")
+    mark, count = _mark(texts[0]), 0
+    while count < min(2, len(texts)) and not _has_number(texts[count], mark):
+        count += 1
+    start = 0
+    if not _is_table(texts[: count + 2], mark):
+        for k in range(1, len(texts) - 1):
+            own = _mark(texts[k])
+            if _has_number(texts[k], own) or not _has_number(texts[k + 1], own) or not _is_table(texts[k : k + 3], own):
+                continue
+            alike = [above for above in texts[:k] if _is_table([above, texts[k]], own)]
+            if any(_has_number(above, own) for above in alike):  # numbers above the names: the table is damaged
+                break
+            two = bool(alike) and alike[-1] == texts[k - 1] and len(_cells(texts[k], own)) > 1
+            start, mark, count = (k - 1, own, 2) if two else (k, own, 1)
+            break
+    if start + count == len(texts):
+        raise InputError(str(path), "contains no lines of numbers below its header")
+    heads = [_cells(text, mark) for text in texts[start : start + count]]
+    width = len(heads[0]) if heads else len(_cells(texts[0], mark))
+    units = heads[1] if len(heads) == 2 else []
+    if units and len(units) != width:
+        raise InputError(str(path), f"has {width} names but {len(units)} units below them")
+    below = [unit.strip("()[]{} ") for unit in units]
+    return TextTable(path, heads[0] if heads else [], below, width, remarks + texts[:start], start + count, mark)
+
+
+def is_number(cell: str, mark: str | None) -> bool:
+    """Return True for the text of a finite number, with a decimal comma if `mark`, between columns, is no comma."""
+    try:
+        return bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))
+    except ValueError:
+        return False
+
+
+def _has_number(text: str, mark: str | None) -> bool:
+    return any(is_number(cell, mark) for cell in _cells(text, mark))
+
+
+def _is_table(texts: list[str], mark: str | None) -> bool:
+    """Return True if all lines have the same number of columns."""
+    return len({len(_cells(text, mark)) for text in texts}) == 1
+
+
+def _mark(text: str) -> str | None:
+    return next((mark for mark in (";", "\t", ",") if mark in text), None)
+
+
+def _cells(text: str, mark: str | None) -> list[str]:
+    return [cell.strip().strip('"') for cell in text.split(mark)]
+
+
+def _content(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the number and the text of each line that is neither empty nor begins with #."""
+    return ((k, text) for k, text in _lines(path) if text.strip() and not text.startswith("#"))
+
+
+def _lines(path: Path, most: int | None = None) -> Iterator[tuple[int, str]]:
+    """Yield the number, from 1, and the text of each line without surrounding blanks, at most `most`."""
+    try:
+        with open_regular(path) as file:
+            if file.seek(0, io.SEEK_END) > _MAX_BYTES:
+                raise InputError(str(path), f"is larger than {_MAX_BYTES >> 20} MB; give the path of a CSV file")
+            file.seek(0)
+            text = io.TextIOWrapper(file, encoding="utf-8-sig")
+            for k in itertools.count(1) if most is None else range(1, most + 1):
+                line = text.readline(_MAX_LINE + 1)
+                if not line:
+                    return
+                if len(line) > _MAX_LINE:
+                    raise InputError(f"{path} line {k}", f"has more than {_MAX_LINE} characters; give one row in each line")
+                yield k, line.strip("\r\n ")
+    except OSError as error:
+        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a CSV file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), "is not UTF-8 text; save it as UTF-8") from error
