@@ -140,7 +140,11 @@ def calls() -> Iterator[Callable[[], Call]]:
     scales = dict(mass_scale=1.0, frequency_scale=1.0, radius=1.0, kappa=1.0)
     yield call("Dimensionless", **form, **scales)
     one = dict(omega=1.0, amplitude=1e-3, force=1.0)
-    yield call("Dimensionless.read", lambda: jv.Dimensionless(**form).read, **{k: jnp.asarray(v) for k, v in one.items()})
+    yield call(
+        "Dimensionless.convert_results",
+        lambda: jv.Dimensionless(**form).convert_results,
+        **{k: jnp.asarray(v) for k, v in one.items()},
+    )
     yield call("support", at=(1.0, -0.2), stiffness=(4e5, 4e5), damping=(2e3, 2e3), angle=0.1)
     yield call("plane_body", mass=2000.0, inertia=600.0, supports=later(springs))
     loaded = dict(loads=later(lambda: scene().loads), drive=later(lambda: scene().drive))

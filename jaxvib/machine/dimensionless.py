@@ -130,19 +130,19 @@ class Dimensionless(eqx.Module):
         return self.eps * self.kappa * self.mass_scale / (1 if self.form == "antiphase" else self.count)
 
     @property
-    def length(self) -> Array:
+    def length_unit(self) -> Array:
         """Length y~ = s~/M2S in m, the unit of v_2; it equals eps kappa R in both forms."""
         return self.eps * self.kappa * self.radius
 
     @property
-    def lengths(self) -> Array:
+    def length_units(self) -> Array:
         """Unit rho_i y~ of each platform's v_i, (n,) m."""
-        return self._by_platform(self.rho, 1.0) * self.length
+        return self._by_platform(self.rho, 1.0) * self.length_unit
 
     @property
-    def force(self) -> Array:
+    def force_unit(self) -> Array:
         """Force M2S w^2 y~ in N, the unit of the foundation force."""
-        return self.mass_scale * self.frequency_scale**2 * self.length
+        return self.mass_scale * self.frequency_scale**2 * self.length_unit
 
     def _by_platform(self, others: Array, exciter: float) -> Array:
         where = min(1, others.shape[0])
@@ -175,7 +175,7 @@ class Dimensionless(eqx.Module):
         return Scene(machine, loads, ConstantSpeed(self.speed * w))
 
     @validated
-    def read(
+    def convert_results(
         self, *, omega: Array | None = None, amplitude: Array | complex | None = None, force: Array | None = None
     ) -> dict[str, Array]:
         """Convert results in SI to the numbers of the paper.
@@ -194,15 +194,15 @@ class Dimensionless(eqx.Module):
 
         >>> import jaxvib as jv
         >>> form = jv.Dimensionless("antiphase", natural=1/3, damping=0.01, eps=1e-3, beta=1.0, speed=3.0, frequency_scale=50.0)
-        >>> round(float(form.read(omega=jv.natural_frequencies(form.scene()))["omega"][0]), 4)
+        >>> round(float(form.convert_results(omega=jv.natural_frequencies(form.scene()))["omega"][0]), 4)
         0.3333
         """
-        units = {"omega": self.frequency_scale, "amplitude": self.lengths, "force": self.force}
+        units = {"omega": self.frequency_scale, "amplitude": self.length_units, "force": self.force_unit}
         given = {"omega": omega, "amplitude": amplitude, "force": force}
-        if amplitude is not None and jnp.shape(amplitude)[-1:] not in ((), (1,), jnp.shape(self.lengths)):
+        if amplitude is not None and jnp.shape(amplitude)[-1:] not in ((), (1,), jnp.shape(self.length_units)):
             shape = jnp.shape(amplitude)
             raise InputError(
                 "amplitude",
-                f"has shape {shape}; its last axis must have {self.lengths.shape[0]} entries, one for each platform",
+                f"has shape {shape}; its last axis must have {self.length_units.shape[0]} entries, one for each platform",
             )
         return {name: value / units[name] for name, value in given.items() if value is not None}

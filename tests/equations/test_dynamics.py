@@ -97,9 +97,9 @@ def test_two_mass_is_the_papers_equation(form):
 
     rng = np.random.default_rng(1)
     v, dv, phi, dphi = rng.normal(size=2), rng.normal(size=2), rng.normal(size=count), rng.normal(size=count)
-    state = jv.State(v * paper.lengths, dv * paper.lengths * w, (jnp.asarray(phi),), (jnp.asarray(dphi * w),))
+    state = jv.State(v * paper.length_units, dv * paper.length_units * w, (jnp.asarray(phi),), (jnp.asarray(dphi * w),))
     field = jv.vector_field(s)(0.0, state)
-    ddv, ddphi = field.velocity / paper.lengths / w**2, field.rate[0] / w**2
+    ddv, ddphi = field.velocity / paper.length_units / w**2, field.rate[0] / w**2
 
     share = 1.0 / count if form == "criterion" else 1.0
     s_y2 = share * np.sum(np.cos(phi) * ddphi - np.sin(phi) * dphi**2)
@@ -121,9 +121,9 @@ def test_three_mass_is_the_papers_equation_mended():
     )
     rng = np.random.default_rng(2)
     v, dv, phi, dphi = rng.normal(size=3), rng.normal(size=3), rng.normal(size=1), rng.normal(size=1)
-    state = jv.State(v * paper.lengths, dv * paper.lengths, (jnp.asarray(phi),), (jnp.asarray(dphi),))
+    state = jv.State(v * paper.length_units, dv * paper.length_units, (jnp.asarray(phi),), (jnp.asarray(dphi),))
     field = jv.vector_field(paper.scene())(0.0, state)
-    a, ddphi = field.velocity / paper.lengths, field.rate[0]
+    a, ddphi = field.velocity / paper.length_units, field.rate[0]
     r = np.array([rho1, 1.0, rho3])
     y, dy = r * v, r * dv
     link = [2 * hl[k] * (dy[i] - dy[j]) + nl[k] ** 2 * (y[i] - y[j]) for k, (i, j) in enumerate([(0, 1), (0, 2), (1, 2)])]

@@ -74,7 +74,9 @@ def test_both_scalings_are_the_same_machine():
     for a, b in zip(jax.tree.leaves(one.scene()), jax.tree.leaves(all_.scene()), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14)
     jam = jv.jam_modes(one.scene()).select(3)
-    first, second = (f.read(omega=jam.omega, amplitude=jam.amplitude, force=jam.foundation_force) for f in (one, all_))
+    first, second = (
+        f.convert_results(omega=jam.omega, amplitude=jam.amplitude, force=jam.foundation_force) for f in (one, all_)
+    )
     assert first["omega"] == second["omega"]
     np.testing.assert_allclose(first["amplitude"], 3 * second["amplitude"], rtol=1e-14)
     np.testing.assert_allclose(first["force"], 3 * second["force"], rtol=1e-14)

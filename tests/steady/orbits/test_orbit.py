@@ -127,7 +127,7 @@ def test_shooting_on_the_papers_equations_agrees(omega, eps):
         end = solve_ivp(paper, (0.0, period), start, "DOP853", args=(x[5], eps), rtol=1e-12, atol=1e-12).y[:, -1]
         return (end - start - [0, 0, 0, 0, 2.0 * np.pi, 0])[[0, 1, 2, 3, 4, 5]]
 
-    v, w = np.asarray(q / form.lengths), np.asarray(velocity / form.lengths)
+    v, w = np.asarray(q / form.length_units), np.asarray(velocity / form.length_units)
     near = np.array([v[0], w[0], v[1], w[1], rate[0], orbit.rotor_speed]) * (1.0 + 1e-4 * np.array([1, -1, 1, -1, 0.1, 1]))
     root = fsolve(miss, near, xtol=1e-13)
     np.testing.assert_allclose(root[5], orbit.rotor_speed, rtol=1e-8)

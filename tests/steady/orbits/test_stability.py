@@ -81,7 +81,7 @@ def grows(omega, eps):
     orbit = jv.jam_orbit(published(eps=eps).scene(), omega=omega)
     form, n = published(eps=eps), float(orbit.rotor_speed)
     q, velocity, (phi,), (rate,) = orbit.at(0.0)
-    v, w = np.asarray(q / form.lengths), np.asarray(velocity / form.lengths)
+    v, w = np.asarray(q / form.length_units), np.asarray(velocity / form.length_units)
     start = np.array([v[0], w[0], v[1], w[1], phi[0], rate[0]])
 
     def paper(t, y):

@@ -72,7 +72,7 @@ def _quiet() -> tuple[float, float, float]:
         omega = bracketed_root(
             lambda w: jnp.sum(stiffness * steady_displacement(scene, w).imag), jnp.asarray(0.9 * near), jnp.asarray(1.1 * near)
         )
-        return omega, -form.read(amplitude=steady_displacement(scene, omega).imag)["amplitude"]
+        return omega, -form.convert_results(amplitude=steady_displacement(scene, omega).imag)["amplitude"]
 
     omega, (first, second) = solve()
     return float(omega), float(first), float(second)
@@ -82,7 +82,7 @@ def _platform_2() -> float:
     """Amplitude of platform 2 with damping, from the machine's equations."""
     form = _other(_DAMPING, _LINK_DAMPING)
     answer = jax.jit(steady_displacement)(form.scene(), jnp.asarray(_OMEGA))
-    return float(jnp.abs(form.read(amplitude=answer)["amplitude"][1]))
+    return float(jnp.abs(form.convert_results(amplitude=answer)["amplitude"][1]))
 
 
 def _platform_2_again(own: int) -> float:
