@@ -62,6 +62,6 @@ def test_tables_agree_with_an_independent_program(model, least, threshold):
     found = published_tables([model], [row], turns=60, starts=1)
     np.testing.assert_allclose(found.least[0], least, atol=0.003)
     np.testing.assert_allclose(found.threshold[0], threshold, atol=0.003)
-    assert np.all(found.converged) and np.all(found.moved <= 0.01) and found.moved.shape == (1, 2, 2)
+    assert np.all(found.converged) and np.all(found.last_change <= 0.01) and found.last_change.shape == (1, 2, 2)
     first = [steps_per_second(published_torus(gap), dict(printed=printed_torus).get(model, gap_torus)) for gap in row.gap]
     np.testing.assert_allclose(found.steps_per_turn[0], 2.0 * np.asarray(first) * 2.0 * np.pi / 140.0, rtol=1e-9)

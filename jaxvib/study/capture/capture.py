@@ -66,7 +66,7 @@ class Capture(Result):
     - `threshold`: the least speed from which on all starts were captured, halfway to the next lower speed that was tried
     - `uncertainty`: half the distance to that speed or to the highest speed at which half of the starts fail, whichever is
       more, and at least the move; NaN if there is no threshold
-    - `moved`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN without a
+    - `last_change`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN without a
       doubling
     - `steps` and `turns` of the rotor that each run took
 
@@ -79,7 +79,7 @@ class Capture(Result):
     detached: np.ndarray = eqx.field(metadata=in_unit("", "speed", "start"))
     threshold: Array = eqx.field(metadata=in_unit(""))
     uncertainty: Array = eqx.field(metadata=in_unit(""))
-    moved: Array = eqx.field(metadata=in_unit(""))
+    last_change: Array = eqx.field(metadata=in_unit(""))
     steps: Array = eqx.field(metadata=in_unit(""))
     turns: Array = eqx.field(metadata=in_unit(""))
     status: CaptureStatus
@@ -105,7 +105,7 @@ class Capture(Result):
         """Return the threshold with its uncertainty, and the outcomes below it, as text."""
         n = self.captured.shape[1]
         head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
-        doubled = "" if np.isnan(self.moved) else f"; their last doubling changed the threshold by {float(self.moved):.1e}"
+        doubled = "" if np.isnan(self.last_change) else f"; their last doubling changed the threshold by {float(self.last_change):.1e}"
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
@@ -259,11 +259,11 @@ def capture(
 
     # A threshold close to one of the speeds may fall into the interval on either side of it.
     tolerance = 1.001 * max(np.max(np.diff(tried), initial=0.0) if resolution is None else resolution, 1e-12)
-    found = refine(scan, lambda answer: np.array([answer.border]), 1, tolerance, most if given is None else 0)
-    (answer,), moved = found.answers, float(found.moved[0, 0])
-    uncertainty = jnp.fmax(answer.uncertainty, moved) if np.isfinite(answer.threshold) else answer.uncertainty
-    status = CaptureStatus.not_converged if moved > tolerance else answer.status
-    return dataclasses.replace(answer, moved=jnp.asarray(moved), uncertainty=uncertainty, status=status)
+    found = refine(scan, lambda result: np.array([result.border]), 1, tolerance, most if given is None else 0)
+    (result,), last_change = found.results, float(found.last_change[0, 0])
+    uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
+    status = CaptureStatus.not_converged if last_change > tolerance else result.status
+    return dataclasses.replace(result, last_change=jnp.asarray(last_change), uncertainty=uncertainty, status=status)
 
 
 def _rolling_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
@@ -303,7 +303,7 @@ def _summarize_captures(
         detached=detached,
         threshold=jnp.asarray(threshold),
         uncertainty=jnp.asarray(uncertainty),
-        moved=jnp.asarray(math.nan),
+        last_change=jnp.asarray(math.nan),
         steps=jnp.asarray(steps),
         turns=jnp.asarray(turns),
         status=status,

@@ -40,7 +40,7 @@ class ThresholdCurve(Result):
       start at the highest speed was
     - `least` (V,): the least speed at which any start was captured, NaN if none was. Between both, captures and failures
       alternate
-    - `moved` (V,): change of the threshold by the last doubling of the steps
+    - `last_change` (V,): change of the threshold by the last doubling of the steps
     - `turns` of the rotor that each run took
     """
 
@@ -50,7 +50,7 @@ class ThresholdCurve(Result):
     threshold: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     uncertainty: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     least: np.ndarray = eqx.field(metadata=in_unit("", "value"))
-    moved: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    last_change: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     turns: Array = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
@@ -135,7 +135,7 @@ def threshold_curve(
         threshold=np.array([each.border for each in found]),
         uncertainty=np.array([0.0 if each.border == -1.0 else float(each.uncertainty) for each in found]),
         least=np.array([_least(each) for each in found]),
-        moved=np.array([float(each.moved) for each in found]),
+        last_change=np.array([float(each.last_change) for each in found]),
         turns=jnp.asarray(turns),
     )
 

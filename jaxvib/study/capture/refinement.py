@@ -38,51 +38,51 @@ _DECAY_PER_STEP = 3.0
 """Largest product of decay rate and step. The method of order 8 is stable up to 5.2; the margin is needed because normal forces
 rise above the force on the equator."""
 
-Answer = TypeVar("Answer")
+Found = TypeVar("Found")
 
 
-class Refined(NamedTuple, Generic[Answer]):
-    """Answers of the finest scans.
+class Refined(NamedTuple, Generic[Found]):
+    """Results of the finest scans.
 
-    **Attributes**: `answers` of P points; `multiple` (P,): the number of steps of each answer, in units of the first scan's;
-    `moved` (P, K): the change of its K borders by the last doubling, infinite if only one of the two scans has the border, NaN
+    **Attributes**: `results` of P points; `multiple` (P,): the number of steps of each result, in units of the first scan's;
+    `last_change` (P, K): the change of its K borders by the last doubling, infinite if only one of the two scans has the border, NaN
     without a doubling.
     """
 
-    answers: list[Answer]
+    results: list[Found]
     multiple: np.ndarray
-    moved: np.ndarray
+    last_change: np.ndarray
 
 
 def refine(
-    scan: Callable[[np.ndarray, int], list[Answer]],
-    borders: Callable[[Answer], np.ndarray],
+    scan: Callable[[np.ndarray, int], list[Found]],
+    borders: Callable[[Found], np.ndarray],
     points: int,
     tolerance: float,
     doublings: int = DOUBLINGS,
-) -> Refined[Answer]:
+) -> Refined[Found]:
     """Double the steps of each point until its borders change by less than the tolerance.
 
-    **Arguments**: `scan(indices, multiple)` returns the answers of points with `multiple` times the steps; `borders` returns
-    the borders of an answer, NaN for one that does not exist; `points`: their number P; `tolerance`: the largest allowed change
+    **Arguments**: `scan(indices, multiple)` returns the results of points with `multiple` times the steps; `borders` returns
+    the borders of a result, NaN for one that does not exist; `points`: their number P; `tolerance`: the largest allowed change
     of a border; `doublings`: the largest number of doublings.
 
     >>> found = refine(lambda i, n: [1.0 / n] * i.size, lambda x: np.array([x]), 1, tolerance=0.3)
-    >>> found.answers, found.multiple.tolist(), found.moved.tolist()
+    >>> found.results, found.multiple.tolist(), found.last_change.tolist()
     ([0.25], [4], [[0.25]])
     """
     multiple, moving = np.ones(points, dtype=int), np.arange(points)
-    answers = scan(moving, 1)
-    moved = np.full((points, *borders(answers[0]).shape), np.nan)
+    results = scan(moving, 1)
+    last_change = np.full((points, *borders(results[0]).shape), np.nan)
     for k in range(1, doublings + 1):
         if moving.size == 0:
             break
         multiple[moving] = 2**k
         for i, finer in zip(moving, scan(moving, 2**k), strict=True):
-            moved[i] = _distance(borders(answers[i]), borders(finer))
-            answers[i] = finer
-        moving = moving[np.any(moved[moving] > tolerance, axis=1)]
-    return Refined(answers, multiple, moved)
+            last_change[i] = _distance(borders(results[i]), borders(finer))
+            results[i] = finer
+        moving = moving[np.any(last_change[moving] > tolerance, axis=1)]
+    return Refined(results, multiple, last_change)
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -88,9 +88,9 @@ def test_steps_double_until_borders_stay():
 
     found = refine(scan, np.asarray, 4, tolerance=0.05, doublings=3)
     assert asked == [([0, 1, 2, 3], 1), ([0, 1, 2, 3], 2), ([0, 2, 3], 4), ([0, 3], 8)]
-    assert found.multiple.tolist() == [8, 2, 4, 8] and found.moved[:, 0].tolist() == [0.046875, 0.0, 0.0, 4.0]
+    assert found.multiple.tolist() == [8, 2, 4, 8] and found.last_change[:, 0].tolist() == [0.046875, 0.0, 0.0, 4.0]
     unmoved = refine(scan, np.asarray, 2, tolerance=0.05, doublings=0)
-    assert unmoved.multiple.tolist() == [1, 1] and np.all(np.isnan(unmoved.moved))
+    assert unmoved.multiple.tolist() == [1, 1] and np.all(np.isnan(unmoved.last_change))
 
 
 @pytest.mark.parametrize(("gap", "stiff"), [(0.5, True), (5.1, False)])
@@ -111,18 +111,18 @@ def test_capture_doubles_steps_until_its_threshold_stays(monkeypatch):
     needed = steps_per_second(scene)
     chosen = jv.capture(scene, speeds, turns=150)
     assert int(chosen.steps) == 2 * int(np.ceil(150.0 * 2.0 * np.pi / 140.0 * needed))
-    assert chosen.status_name == "found" and float(chosen.moved) == 0.0
+    assert chosen.status_name == "found" and float(chosen.last_change) == 0.0
     assert "changed the threshold by 0.0e+00" in chosen.summary()
     monkeypatch.setattr("jaxvib.study.capture.capture.steps_per_second", lambda scene, equations: 0.2 * needed)
     first, early, late = (jv.capture(scene, speeds, turns=150, doublings=n) for n in (0, 1, 3))
-    assert first.status_name == "none_captured" and np.isnan(first.moved)
-    assert early.status_name == "not_converged" and np.isinf(early.moved) and np.isinf(early.uncertainty)
-    assert late.status_name == "found" and float(late.moved) == 0.0 and int(late.steps) == 4 * int(first.steps)
+    assert first.status_name == "none_captured" and np.isnan(first.last_change)
+    assert early.status_name == "not_converged" and np.isinf(early.last_change) and np.isinf(early.uncertainty)
+    assert late.status_name == "found" and float(late.last_change) == 0.0 and int(late.steps) == 4 * int(first.steps)
     np.testing.assert_array_equal(late.captured, chosen.captured)
     # Steps that are given are taken as they are.
     fixed = jv.capture(scene, speeds, turns=150, stepsize_controller=jv.EqualSteps(int(chosen.steps)))
     np.testing.assert_array_equal(fixed.captured, chosen.captured)
-    assert fixed.steps == chosen.steps and np.isnan(fixed.moved)
+    assert fixed.steps == chosen.steps and np.isnan(fixed.last_change)
 
 
 @pytest.mark.slow

@@ -102,7 +102,7 @@ class TorusTables(NamedTuple):
     - `captured` (M, P, S), True if a speed of those `tried` (S,) is captured
     - `fraction` (M, P), the share captured of `starts` perturbed starts at the paper's speed
     - `steps_per_turn` (M, P), the least number of steps for a turn of the rotor in the last scan
-    - `moved` (M, P, 2), by how much the last doubling of the steps moved `least` and `threshold`, infinite if it made one
+    - `last_change` (M, P, 2), by how much the last doubling of the steps moved `least` and `threshold`, infinite if it made one
       appear or vanish; NaN without a doubling
     - `turns` of the rotor that each run took
 
@@ -123,7 +123,7 @@ class TorusTables(NamedTuple):
     tried: np.ndarray
     captured: np.ndarray
     steps_per_turn: np.ndarray
-    moved: np.ndarray
+    last_change: np.ndarray
     resolution: float
     starts: int
     turns: int
@@ -142,7 +142,7 @@ class TorusTables(NamedTuple):
     @property
     def converged(self) -> np.ndarray:
         """True if the last doubling of the steps moved the nearer border by 0.011 of the rotor's speed at most, (M, P)."""
-        return self._nearer(self.moved) <= TABLE_TOLERANCE
+        return self._nearer(self.last_change) <= TABLE_TOLERANCE
 
     def _nearer(self, values: np.ndarray) -> np.ndarray:
         """Entries of `values` (M, P, 2) for the border that is nearer to the paper's speed."""
@@ -167,7 +167,7 @@ class TorusTables(NamedTuple):
                     point = f"  {self.gap[i]:4.1f} {self.paper[i]:7.3f}" if m == 0 else " " * 14
                     pattern = "".join(".#"[int(x)] for x in self.captured[m, i])
                     numbers = f"{self.least[m, i]:7.3f} {self.threshold[m, i]:7.3f} {self.difference[m, i]:+7.3f}"
-                    steps = f"{self.steps_per_turn[m, i]:5.0f} " + " ".join(f"{x:6.3f}" for x in self.moved[m, i])
+                    steps = f"{self.steps_per_turn[m, i]:5.0f} " + " ".join(f"{x:6.3f}" for x in self.last_change[m, i])
                     lines.append(f"{point}  {name:9s}{numbers}  {self.fraction[m, i]:5.2f}  {steps}  {pattern}")
         return "\n".join(lines)
 
@@ -225,9 +225,9 @@ def published_tables(
         steps = needed * found.multiple
         fraction = np.mean(_tried(model, points, steps, np.tile(paper[:, None], (1, starts)), shifts, turns), axis=1)
         per_turn = steps * 2.0 * np.pi / TORUS_SPEED
-        return [*map(np.stack, zip(*found.answers, strict=True)), fraction, per_turn, found.moved]
+        return [*map(np.stack, zip(*found.results, strict=True)), fraction, per_turn, found.last_change]
 
-    borders, captured, fraction, per_turn, moved = map(np.stack, zip(*(column(MODELS[m]) for m in models), strict=True))
+    borders, captured, fraction, per_turn, last_change = map(np.stack, zip(*(column(MODELS[m]) for m in models), strict=True))
     return TorusTables(
         damping=damping,
         stiffness=stiffness,
@@ -241,7 +241,7 @@ def published_tables(
         tried=_GRID,
         captured=captured,
         steps_per_turn=per_turn,
-        moved=moved,
+        last_change=last_change,
         resolution=float((_GRID[1] - _GRID[0]) * _SHARES[0] ** _ROUNDS),
         starts=starts,
         turns=turns,
