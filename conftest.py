@@ -16,9 +16,9 @@ import jax
 import matplotlib
 import pytest
 
-from jaxvib import imported
+from jaxvib import code_changes
 from jaxvib.runtime import startup
-from jaxvib.runtime.cache import keep_programs, program_folder
+from jaxvib.runtime.cache import program_folder, set_program_folder
 from jaxvib.runtime.cpu import prepare_cpu
 from jaxvib.runtime.stored import _functions, _sources
 
@@ -73,9 +73,9 @@ def _stored():
     finds compiled depends on no other module. Where `coverage` asks which lines run, all programs are traced: a stored one runs
     none."""
     measured = "coverage" in sys.modules and sys.modules["coverage"].Coverage.current() is not None
-    keep_programs(None if measured else PROGRAMS)
+    set_program_folder(None if measured else PROGRAMS)
     yield
-    keep_programs(None)
+    set_program_folder(None)
     for function in _functions:
         function.ready.clear()
     eqx.clear_caches()
@@ -87,7 +87,7 @@ def _stored_again():
     """Restore the folder of programs that a test changes."""
     folder = program_folder()
     yield
-    keep_programs(folder)
+    set_program_folder(folder)
 
 
 class _Patch(pytest.MonkeyPatch):
@@ -108,13 +108,13 @@ class _Patch(pytest.MonkeyPatch):
 
     def _unknown(self):
         if program_folder() == PROGRAMS:
-            keep_programs(None)
+            set_program_folder(None)
 
 
 @pytest.fixture
 def unwatched():
     """Store programs although the test replaces a part of the package: the test is about storing, not about physics."""
-    with unittest.mock.patch.object(imported._code, "differences", list):
+    with unittest.mock.patch.object(code_changes._code, "differences", list):
         yield
 
 

@@ -5,7 +5,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-import jaxvib.imported  # noqa: F401  before all other imports, which it watches
+import jaxvib.code_changes  # noqa: F401  before all other imports, which it watches
 
 
 def _homes() -> dict[str, str]:

@@ -8,8 +8,6 @@ from jaxvib.runtime.cpu import prepare_cpu
 # Units of texts and figures
 from jaxvib.display import display_units
 
-# Units of texts and figures
-
 # Machines
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
@@ -103,14 +101,14 @@ from jaxvib.motion.simulate import simulate
 from jaxvib.motion.steps import Accuracy, EqualSteps, Tolerance
 from jaxvib.study.maps.run_ups import run_ups
 
-# What accuracy costs
+# Accuracy and its cost
 from jaxvib.study.accuracy.cost import Cost
 from jaxvib.study.accuracy.gradient_check import GradientCheck, GradientStatus, ImplicitRoute, check_gradients
 from jaxvib.study.accuracy.harmonics import harmonic_convergence
 from jaxvib.study.accuracy.tiers import compare_tiers
 from jaxvib.study.accuracy.work_precision import work_precision
 
-# What effects are worth
+# Influence of effects
 from jaxvib.study.audit.audit import Audit, AuditStatus, audit
 
 # Friction of a bearing
@@ -130,7 +128,7 @@ from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 from jaxvib.sweeps.definition import CaseStatus, SweepStatus
 from jaxvib.sweeps.sweep import Sweep, open_sweep, sweep
 
-# Pictures and films
+# Figures and animations
 from jaxvib.show.animate import animate
 from jaxvib.show.sketch import sketch
 
@@ -287,7 +285,7 @@ __all__ = [
     "growth",
     "Growth",
     "GrowthStatus",
-    # What accuracy costs
+    # Accuracy and its cost
     "work_precision",
     "compare_tiers",
     "harmonic_convergence",
@@ -296,7 +294,7 @@ __all__ = [
     "GradientCheck",
     "GradientStatus",
     "ImplicitRoute",
-    # What effects are worth
+    # Influence of effects
     "audit",
     "Audit",
     "AuditStatus",
@@ -326,7 +324,7 @@ __all__ = [
     "Sweep",
     "SweepStatus",
     "CaseStatus",
-    # Pictures and films
+    # Figures and animations
     "sketch",
     "animate",
     # Results

@@ -3,7 +3,7 @@
 
 import sys
 
-from jaxvib.imported import watch
+from jaxvib.code_changes import watch
 
 watch(sys.modules[__name__])  # before all other imports, which it then watches too
 

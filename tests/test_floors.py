@@ -22,7 +22,7 @@ FLOORS = (
     ("jaxvib.numerics", "jaxvib.display"),
     ("jaxvib.runtime",),
     ("jaxvib.boundary",),
-    ("jaxvib.errors", "jaxvib.imported"),
+    ("jaxvib.errors", "jaxvib.code_changes"),
 )
 """Floors from the top down; a module may import from its own package and from floors below its own."""
 

@@ -183,7 +183,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("vector_field", scene=s)
     yield call("initial_state", scene=s, start="rest", mode=None, angles=None, separation=0.0, throw=True)
     yield call("initial_state", scene=s, start="jam", mode=3, angles=(0.0, 1.0), separation=0.0, throw=False)
-    yield call("with_spin", scene=s, state=state, turning="rolling")
+    yield call("with_spin", scene=s, state=state, rotation="rolling")
     yield call("natural_frequencies", scene=s)
     yield call("mode_shapes", scene=s)
     yield call("energy", scene=s, state=state, t=0.0)
@@ -254,7 +254,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("ten_periods", pendulum=p, record=rec, periods=4, instrument=0.0, turns=None)
     yield call("identify", pendulum=p, record=rec, dry=False, instrument=0.0, throw=False)
     # Capture
-    torus = dict(turns=2, starts=1, spread=1e-3, seed=0, resolution=None, turning="rolling")
+    torus = dict(turns=2, starts=1, spread=1e-3, seed=0, resolution=None, rotation="rolling")
     fewer = dict(stepsize_controller=later(lambda: jv.EqualSteps(100)), equations=jv.vector_field)
     yield call("capture", scene=later(torus_scene), speeds=[-0.9, -0.5], **torus, **fewer)
     yield call("threshold_curve", make=lambda x: torus_scene(), values=[1.0], speeds=[-0.5], **torus, equations=jv.vector_field)

@@ -134,7 +134,7 @@ def _require_balance(effects: tuple[Effect, ...]) -> None:
     require_terms(effects, COINCIDENT_TERMS, problem, "or simulate")
 
 
-def light_friction(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
+def friction_on_light_loads(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
     """Return the sum of the torques of dry friction on light loads that turn at `omega`, N m.
 
     The motion of the carrier is too small to change the normal force on the loads, and the mean contribution of the weight over

@@ -35,7 +35,7 @@ START_SEPARATION = math.radians(1.0)
 """Angle between neighbouring loads at the start, rad, if they are not side by side. Loads at exactly one angle would stay at
 one angle, whether or not that is stable."""
 
-Turning = Literal["rolling", "still"]
+Rotation = Literal["rolling", "none"]
 """Initial rotation of the loads about themselves: rolling on their track, or none in space."""
 
 
@@ -145,7 +145,7 @@ def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: A
 
 
 @validated
-def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State:
+def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> State:
     """Return the state with the loads' own rotation, if effects of the scene release it; a state that has one stays as it is.
 
         c = p' - w axis x (p + r n),    s = - w axis . n        (n the normal of the contact)
@@ -154,9 +154,9 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
 
     - `scene` whose effects release the rotation (`FreeSpin`, `Sliding`)
     - `state` without it
-    - `turning`: "rolling" (the default), for loads that roll on their track and do not spin on it, or "still", for loads that
+    - `rotation`: "rolling" (the default), for loads that roll on their track and do not spin on it, or "none", for loads that
       do not turn in space, so that their contact slides if the scene has `Sliding`, as in the equation; typical: slips of 5 to
-      50 m/s for "still"
+      50 m/s for "none"
 
     **Returns** `State`. **Raises** `InputError` for another name, and for a spin that the scene does not release or of a wrong
     shape.
@@ -165,19 +165,19 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
     >>> loads = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)
     >>> scene = jv.Scene(jv.planar_rotor(mass=9.0, stiffness=1e4, damping=9.0), loads, jv.ConstantSpeed(100.0), jv.Sliding(0.1))
     >>> rest = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1),), (jnp.zeros(1),))
-    >>> round(float(jv.with_spin(scene, rest, "still").spin.slip[0][0]), 6)        # - w (R + r)
+    >>> round(float(jv.with_spin(scene, rest, "none").spin.slip[0][0]), 6)        # - w (R + r)
     -21.0
     """
-    if turning not in get_args(Turning):
-        raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
+    if rotation not in get_args(Rotation):
+        raise InputError("rotation", f"is {quoted(rotation)}; it must be 'rolling' or 'none'")
     exciters = []
     for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         with within(scene.place_of(k)):
-            exciters.append(_exciter_with_spin(exciter, own, turning))
+            exciters.append(_exciter_with_spin(exciter, own, rotation))
     return State(state.displacement, state.velocity, exciters=exciters)
 
 
-def _exciter_with_spin(exciter: Exciter, state: ExciterState, turning: Turning) -> ExciterState:
+def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation) -> ExciterState:
     """Return the state of an exciter with the rotation of its loads, see `with_spin`."""
     loads = exciter.loads
     has_drilling = has_term(exciter.effects, DrillingSpinRelease)
@@ -197,7 +197,7 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, turning: Turning) 
         return state
     zero = jnp.zeros_like(state.angle[0])
     drilling, slip = zero, tuple(zero for _ in state.angle)
-    if turning == "still":
+    if rotation == "none":
         u, rate, w = state.angle, state.rate, exciter.turning_drive.rotor_speed(jnp.zeros(()), state.rotor)
         spin, normal_force = loads.drilling_spin(u, rate, w), loads.normal_force(u, rate, {})
         drilling = zero if spin is None else spin.still

@@ -12,7 +12,7 @@ from jax import Array
 from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 
-from jaxvib.ode.types import Mapped, Tangents
+from jaxvib.ode.types import Batched, Tangents
 
 VECTOR = 8
 """Width of vectors of a processor; the number of tangents is padded to a multiple of it."""
@@ -58,7 +58,7 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
     return call
 
 
-def batch_last(function: Callable[[X], Out], batched: Callable[[X, Mapped], Out]) -> Callable[[X], Out]:
+def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out]) -> Callable[[X], Out]:
     """`function`, under `vmap` computed by `batched`; with derivatives of every kind, which are mapped as JAX does it.
 
     JAX puts the batch before all other axes of the state of a loop. `batched` may keep it as the last axis: every number of the
@@ -85,9 +85,9 @@ def batch_last(function: Callable[[X], Out], batched: Callable[[X, Mapped], Out]
         mapped = custom_vmap(lambda *arrays: function(unflatten(arrays)))
 
         @mapped.def_vmap
-        def _(size: int, is_mapped: Sequence[bool], *arrays: Array) -> tuple[Out, Mapped]:
-            last = [jnp.moveaxis(a, 0, -1) if along else a for a, along in zip(arrays, is_mapped, strict=True)]
-            known = dict(zip(places, is_mapped, strict=True))
+        def _(size: int, is_batched: Sequence[bool], *arrays: Array) -> tuple[Out, Batched]:
+            last = [jnp.moveaxis(a, 0, -1) if along else a for a, along in zip(arrays, is_batched, strict=True)]
+            known = dict(zip(places, is_batched, strict=True))
             out = batched(unflatten(last), jax.tree.unflatten(rest, [known.get(k, False) for k in range(len(leaves))]))
             return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), out), jax.tree.map(lambda _: True, out)
 
@@ -115,18 +115,18 @@ def _tangents_last(function: _WithTangents) -> _WithTangents:
     mapped = custom_vmap(single)
 
     @mapped.def_vmap
-    def _(size: int, is_mapped: Mapped, x: PyTree, tangents: Tangents) -> tuple[tuple[PyTree[Array], Tangents], Mapped]:
-        if any(jax.tree.leaves(is_mapped[0])):
-            axes = jax.tree.map(lambda which: 0 if which else None, is_mapped)
+    def _(size: int, is_batched: Batched, x: PyTree, tangents: Tangents) -> tuple[tuple[PyTree[Array], Tangents], Batched]:
+        if any(jax.tree.leaves(is_batched[0])):
+            axes = jax.tree.map(lambda which: 0 if which else None, is_batched)
             out = jax.vmap(single, in_axes=tuple(axes))(x, tangents)
             return out, jax.tree.map(lambda _: True, out)
         padded = -(-size // VECTOR) * VECTOR
 
-        def last(tangent: Array, is_mapped: bool) -> Array:
-            every = jnp.moveaxis(tangent, 0, -1) if is_mapped else jnp.repeat(tangent[..., None], size, axis=-1)
+        def last(tangent: Array, is_batched: bool) -> Array:
+            every = jnp.moveaxis(tangent, 0, -1) if is_batched else jnp.repeat(tangent[..., None], size, axis=-1)
             return jnp.pad(every, [(0, 0)] * (every.ndim - 1) + [(0, padded - size)])
 
-        y, out = function(x, jax.tree.map(last, tangents, is_mapped[1]))
+        y, out = function(x, jax.tree.map(last, tangents, is_batched[1]))
         out = jax.tree.map(lambda tangent: jnp.moveaxis(tangent[..., :size], -1, 0), out)
         return (y, out), (jax.tree.map(lambda _: False, y), jax.tree.map(lambda _: True, out))
 

@@ -25,7 +25,7 @@ from jaxvib.ode.dopri8 import (
     ravel,
     unravel,
 )
-from jaxvib.ode.types import VF, Args, BoolScalarLike, Mapped, RealScalarLike, Tangents, Terms, Y
+from jaxvib.ode.types import VF, Args, Batched, BoolScalarLike, RealScalarLike, Tangents, Terms, Y
 
 _Known: TypeAlias = "tuple[Array, Array] | None"
 """Last stage of the previous step (n,), and the number of stages that it provides: 1, or 0 without a previous step. None if
@@ -144,17 +144,17 @@ def _advance(inputs: _Inputs) -> _Step:
     return unravel(end, y0), stages, unravel(error, y0)
 
 
-def _advance_batched(inputs: _Inputs, mapped: Mapped) -> _Step:
+def _advance_batched(inputs: _Inputs, is_batched: Batched) -> _Step:
     """`_advance` for a batch along a last axis."""
     t0, dt, y0, known, args, terms = inputs
-    t0_too, dt_too, y0_too, known_too, *others_too = mapped
+    t0_too, dt_too, y0_too, known_too, *others_too = is_batched
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
     flags = flat_tangents((t0_too, dt_too, *others_too), (t0, dt, args, terms))
     places = [k for k, along in enumerate(flags) if along]
     like = jax.tree.map(lambda leaf, along: leaf[..., 0] if along else leaf, y0, y0_too)
-    size = next(leaf.shape[-1] for leaf, along in zip(*map(jax.tree.leaves, (inputs, mapped)), strict=True) if along)
+    size = next(leaf.shape[-1] for leaf, along in zip(*map(jax.tree.leaves, (inputs, is_batched)), strict=True) if along)
 
-    def whole(tree: PyTree[Array], along: Mapped) -> Array:
+    def whole(tree: PyTree[Array], along: Batched) -> Array:
         spread = lambda leaf, here: leaf if here else jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))  # noqa: E731
         return ravel(jax.tree.map(spread, tree, along), 1)
 

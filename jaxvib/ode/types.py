@@ -43,6 +43,6 @@ Norm: TypeAlias = Callable[[PyTree[Array]], RealScalarLike]
 Tangents: TypeAlias = PyTree[Array | None]
 """A tree like that of primal values, each array with a last axis over the tangent directions; None where all of them are 0."""
 
-Mapped: TypeAlias = PyTree[bool]
+Batched: TypeAlias = PyTree[bool]
 """A tree like that of values, with True for each value that has an axis over the batch (`in_batched` of
 `jax.custom_batching.custom_vmap`)."""

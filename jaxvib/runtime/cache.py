@@ -58,7 +58,7 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    keep_programs(programs)
+    set_program_folder(programs)
     return path
 
 
@@ -68,7 +68,7 @@ def default_folder() -> Path:
     return Path(set_already or user_folder())
 
 
-def keep_programs(folder: Path | None) -> None:
+def set_program_folder(folder: Path | None) -> None:
     """Set the folder of traced programs; None disables their storage."""
     _folder[:] = [] if folder is None else [folder]
 
@@ -82,12 +82,12 @@ def program_folder() -> Path | None:
 def compiled_anew() -> Iterator[None]:
     """Disable both caches within the context, to measure compile times of programs that are new to this process."""
     folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
-    keep_programs(None)
+    set_program_folder(None)
     jax.config.update("jax_enable_compilation_cache", False)
     try:
         yield
     finally:
-        keep_programs(folder)
+        set_program_folder(folder)
         jax.config.update("jax_enable_compilation_cache", enabled)
 
 

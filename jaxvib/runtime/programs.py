@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.code_changes import code_state
 from jaxvib.errors import InputError
-from jaxvib.imported import code_state
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import primal_of, traced
 from jaxvib.runtime.devices import arrays_on_device

@@ -29,7 +29,7 @@ import numpy as np
 from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
-from jaxvib.imported import CodeState, clear_derived, code_state, digest_of_sources
+from jaxvib.code_changes import CodeState, clear_derived, code_state, digest_of_sources
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import evaluating, no_host_checks, without_source_locations
 from jaxvib.runtime.cpu import processor
@@ -80,8 +80,8 @@ class StoredFunction(Generic[T]):
     - host callbacks
     - arrays on several devices
 
-    In a process whose code differs from the source files (see `jaxvib.imported`), no program is stored or read, and programs
-    that were traced from the former code are not used again.
+    In a process whose code differs from the source files (see `jaxvib.code_changes`), no program is stored or read, and
+    programs that were traced from the former code are not used again.
     """
 
     def __init__(self, function: Callable[..., T]):

@@ -48,7 +48,7 @@ class SweepStatus(eqx.Enumeration):
     """Progress of a study. The value of each member is the message shown to the user."""
 
     done = "every case was computed"
-    partly = "some cases have not been computed yet; run the study again to continue"
+    incomplete = "some cases have not been computed yet; run the study again to continue"
 
 
 @dataclass(frozen=True)

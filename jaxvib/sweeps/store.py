@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxvib.code_changes import code_state, digest_of_sources
 from jaxvib.errors import InputError, quoted
-from jaxvib.imported import code_state, digest_of_sources
 from jaxvib.machine.files import Tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence

@@ -296,5 +296,5 @@ def open_sweep(store: str | Path) -> Sweep:
 def _found(store: Store, states: np.ndarray, computed: int, seconds: float, damaged: int) -> Sweep:
     counts = store.counts(states)
     rows = tuple(CaseCount(name, int(n)) for name, n in zip(CASE_STATUSES, counts, strict=True) if n)
-    status = SweepStatus.partly if counts[0] else SweepStatus.done
+    status = SweepStatus.incomplete if counts[0] else SweepStatus.done
     return Sweep(status, str(store.path), math.prod(store.shape), rows, computed, seconds, damaged)

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.coincident import light_friction
+from jaxvib.equations.coincident import friction_on_light_loads
 from jaxvib.equations.linear import jammed_loads, peak_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_term
@@ -335,7 +335,7 @@ def _power(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     n, omega = scene.drive.speed, jam.omega
     torque = loads.drag_sum() * (n - omega)
     if has_term(scene.all_effects, ContactFriction):
-        torque = torque + light_friction(loads, scene.all_effects, omega, n)
+        torque = torque + friction_on_light_loads(loads, scene.all_effects, omega, n)
     # With strong drag n - Omega has few correct digits. The torque then follows from the dissipation of the carrier, which has
     # all digits.
     close = n - omega < _SLIP * n

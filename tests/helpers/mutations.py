@@ -213,7 +213,7 @@ def store_outcome(store, asked, truth):
         try:
             data = sweep.data.load()
         except jv.InputError:
-            assert sweep.damaged or sweep.status_name == "partly", "refused although nothing was counted"
+            assert sweep.damaged or sweep.status_name == "incomplete", "refused although nothing was counted"
             return
         done = data.status.values != 0
         for name in truth.data_vars:

@@ -65,7 +65,7 @@ def test_sliding_ball_starts_to_roll_like_a_rigid_ball():
     sliding, expected = RIGID.coordinates(sliding), RIGID.coordinates(expected)
     assert 0.04 < rolls < 0.06
     plain = one_ball(jv.FreeSpin(), jv.Sliding(0.1))
-    start = jv.with_spin(plain, at(*START), "still")
+    start = jv.with_spin(plain, at(*START), "none")
     along = RIGID.slip(still) @ np.array([-np.sin(0.3), np.cos(0.3), 0.0])
     np.testing.assert_allclose(start.spin.slip[0], along, rtol=1e-12)
     np.testing.assert_allclose(start.spin.drilling, RIGID.coordinates(still)[-1], rtol=1e-12)
@@ -87,7 +87,7 @@ def test_plane_track_ball_rolls_at_the_closed_form_speed():
     loads = jv.rollers(count=1, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(60.0), (jv.Sliding(0.2, 0.05),))
     rest = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.full(1, 20.0),))
-    start = jv.with_spin(s, rest, "still")
+    start = jv.with_spin(s, rest, "none")
     np.testing.assert_allclose(start.spin.slip[0], 0.2 * 20.0 - 60.0 * 0.21)
     run = jv.simulate(s, 0.5, start=start, samples=200, stepsize_controller=jv.EqualSteps(3000), estimate=False)
     state, end = run.trajectory.state, 20.0 + (60.0 * 1.05 - 20.0) / 3.0
@@ -135,7 +135,7 @@ def test_power_balances_the_energy_of_balls_that_spin_and_slide(effects):
 def test_derivatives_with_spin_and_sliding_are_differences():
     """Along one direction in which every number of the scene and of the state changes."""
     s = scene((*published(), *BOTH), count=1)
-    start = jv.with_spin(s, at(0.4, 1.1, 90.0, 20.0), "still")
+    start = jv.with_spin(s, at(0.4, 1.1, 90.0, 20.0), "none")
     leaves, rest = jax.tree.flatten((s, start))
     rng = np.random.default_rng(0)
     sizes = [rng.normal(size=np.shape(leaf)) * np.maximum(np.abs(leaf), 1e-3) for leaf in leaves]
@@ -209,7 +209,7 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
             lambda: jv.Scene(HEAVY, balls(), jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1), (jv.FreeSpin(),)),
             r"effects.free_spin needs a drive with prescribed speed \(property ideal\), not 'dc_motor'",
         ),
-        (lambda: jv.with_spin(scene(BOTH), some_state(), "asleep"), "turning is 'asleep'; it must be 'rolling' or 'still'"),
+        (lambda: jv.with_spin(scene(BOTH), some_state(), "asleep"), "rotation is 'asleep'; it must be 'rolling' or 'none'"),
         (
             lambda: jv.simulate(scene(), 0.1, start=jv.with_spin(scene(BOTH), some_state())),
             "start.spin is given, but no effect of the scene allows it",

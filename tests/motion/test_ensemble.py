@@ -58,11 +58,11 @@ def error_of(given, k, found, exact):
 
 def test_another_process_need_not_trace_an_ensemble(tmp_path):
     """This holds even if `make` is defined within the call: the program is that of the scenes it made."""
-    cache.keep_programs(tmp_path)
+    cache.set_program_folder(tmp_path)
     try:
         jv.ensemble(lambda value: make(value), values(), 5.0, stepsize_controller=jv.EqualSteps(200))
     finally:
-        cache.keep_programs(None)
+        cache.set_program_folder(None)
     assert list(tmp_path.glob("_run_batch-*.program"))
 
 

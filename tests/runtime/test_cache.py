@@ -17,9 +17,9 @@ root_only = pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() != 0, rea
 
 @pytest.fixture(autouse=True)
 def _unchanged():
-    cache.keep_programs(None)
+    cache.set_program_folder(None)
     yield
-    cache.keep_programs(None)
+    cache.set_program_folder(None)
 
 
 def test_an_own_folder_is_used_and_closed_to_others(tmp_path):

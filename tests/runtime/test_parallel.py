@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxvib.runtime import parallel
-from jaxvib.runtime.cache import keep_programs
+from jaxvib.runtime.cache import set_program_folder
 from jaxvib.runtime.programs import cached
 
 
@@ -71,7 +71,7 @@ def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
 @pytest.mark.parametrize("stored", [True, False])
 def test_threads_compile_a_new_program_once(monkeypatch, tmp_path, unwatched, stored):
     monkeypatch.setattr(parallel, "cores", lambda: 4)
-    keep_programs(tmp_path if stored else None)
+    set_program_folder(tmp_path if stored else None)
     traces, compiled = [], []
 
     def listen(event, seconds, **_):
@@ -171,11 +171,11 @@ import jaxvib as jv
 jv.prepare_cpu(3)
 jv.use_cache({str(tmp_path)!r})
 import jax, jax.numpy as jnp
-from jaxvib import imported
+from jaxvib import code_changes
 from jaxvib.runtime import parallel, programs
 assert parallel.shared_devices() == [None]  # processors are one, however they are divided
 parallel.shared_devices = jax.local_devices
-imported._code.differences = list  # as `unwatched`
+code_changes._code.differences = list  # as `unwatched`
 
 def doubled(x):
     return 2.0 * x

@@ -11,7 +11,7 @@ import jaxvib as jv
 from jaxvib.motion.analysis.separation import _transition
 from jaxvib.motion.envelope.envelope import _growth_at_end, _run
 from jaxvib.motion.integrate import integrate
-from jaxvib.runtime.cache import keep_programs
+from jaxvib.runtime.cache import set_program_folder
 from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jams_of
@@ -28,7 +28,7 @@ def slow_square(x):
 
 
 def test_a_call_waits_for_its_prepared_program(tmp_path):
-    keep_programs(tmp_path)
+    set_program_folder(tmp_path)
     began = threading.Event()
     assert not slow_square.is_ready(np.ones(3))
     in_background(lambda: (began.set(), slow_square.prepare(jnp.zeros(3))))

@@ -45,7 +45,7 @@ def asked(tmp_path, monkeypatch, unwatched, request):
     """A function that asks as another process would: no program is held in memory, those on disk are."""
     monkeypatch.setattr(structure, "KNOWN_PACKAGES", structure.KNOWN_PACKAGES | {__name__})
     monkeypatch.setitem(globals(), "wave", programs.cached(outputs_from_solution=request.param)(wave))
-    cache.keep_programs(tmp_path)
+    cache.set_program_folder(tmp_path)
 
     def forgetful(x, shift=SHIFT):
         return globals()["wave"](x, shift, "a")
@@ -67,7 +67,7 @@ def asked(tmp_path, monkeypatch, unwatched, request):
     forget()
     yield forgetful, forget
     forget()
-    cache.keep_programs(None)
+    cache.set_program_folder(None)
 
 
 def number(function, x, shift=SHIFT):
@@ -213,7 +213,7 @@ def test_derivatives_of_jam_modes_equal_those_without_cache(asked):
 
     k = s.machine.stiffness
     stored = [jax.grad(force)(k), jax.jacfwd(force)(k), jax.jacrev(force)(k)]
-    cache.keep_programs(None)
+    cache.set_program_folder(None)
     for found in stored:
         np.testing.assert_allclose(found, jax.grad(force)(k), rtol=1e-12)
 

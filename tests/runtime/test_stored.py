@@ -18,7 +18,7 @@ from scenes import scene
 
 import jaxvib as jv
 import optimize
-from jaxvib import imported
+from jaxvib import code_changes
 from jaxvib.runtime import cache, programs, stored, structure
 from jaxvib.steady.jams import jam
 
@@ -48,9 +48,9 @@ def with_callback(x):
 def folder(tmp_path, monkeypatch, unwatched):
     traces.clear()
     monkeypatch.setattr(structure, "KNOWN_PACKAGES", structure.KNOWN_PACKAGES | {__name__})
-    cache.keep_programs(tmp_path)
+    cache.set_program_folder(tmp_path)
     yield tmp_path
-    cache.keep_programs(None)
+    cache.set_program_folder(None)
 
 
 def test_another_process_need_not_trace(folder):
@@ -221,11 +221,11 @@ def test_the_key_holds_every_source_and_the_versions(module, monkeypatch):
     """A module of any folder, and those at the top of both packages."""
     text, read, changed = stored._sources(), pathlib.Path.read_bytes, pathlib.Path(module.__file__)
     assert importlib.metadata.version("jaxlib") in text and importlib.metadata.version("diffrax") in text
-    assert imported.digest_of_sources() in text
-    digest = imported.digest_of_sources.__wrapped__
-    assert digest() == imported.digest_of_sources()
+    assert code_changes.digest_of_sources() in text
+    digest = code_changes.digest_of_sources.__wrapped__
+    assert digest() == code_changes.digest_of_sources()
     monkeypatch.setattr(pathlib.Path, "read_bytes", lambda path: b"" if path == changed else read(path))
-    assert digest() != imported.digest_of_sources()
+    assert digest() != code_changes.digest_of_sources()
 
 
 def test_unchanged_programs_are_not_recompiled_after_an_edit(folder, monkeypatch):
@@ -309,7 +309,7 @@ def test_an_error_of_the_function_is_raised_once(folder):
 def test_a_folder_that_cannot_be_written_to_does_no_harm(folder, place):
     """The disk is full for files of more than 100 bytes."""
     where = {"read-only": pathlib.Path("/proc"), "not there": folder / "no", "full": folder}[place]
-    cache.keep_programs(where)
+    cache.set_program_folder(where)
     _, hard = limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         if place == "full":
@@ -371,7 +371,7 @@ def test_jams_from_a_stored_program_are_the_same(folder):
     jv.jam_modes(s)
     jam.jams_of.stored.ready.clear()
     again = jv.jam_modes(s)
-    cache.keep_programs(None)
+    cache.set_program_folder(None)
     traced = jv.jam_modes(s)
     assert jax.tree.structure(again) == jax.tree.structure(traced) and len(list(folder.iterdir())) == 1
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(traced), strict=True):

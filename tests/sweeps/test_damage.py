@@ -83,7 +83,7 @@ def test_a_damaged_chunk_is_counted_and_computed_again(stores, copy, array, harm
     seen = jv.open_sweep(copy)
     if (array, harm) != ("status", "missing"):  # a chunk without statuses and with a seal is damaged too
         assert seen.damaged == 10
-    assert seen.status_name == "partly" and seen.counts[0] == ("missing", 10) and "run the study again" in seen.summary()
+    assert seen.status_name == "incomplete" and seen.counts[0] == ("missing", 10) and "run the study again" in seen.summary()
     with pytest.raises(jv.InputError, match=r"1 of 5 chunks are damaged, the first of them chunk 1; run the study again"):
         _ = seen.data
     found = run_study(STUDY, copy)

@@ -109,7 +109,7 @@ def test_interrupted_anywhere_and_resumed_it_is_the_same_store(whole, tmp_path, 
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             run_study(STUDY, store, report=stop)
-    assert jv.open_sweep(store).status_name == "partly" and "run the study again" in jv.open_sweep(store).message
+    assert jv.open_sweep(store).status_name == "incomplete" and "run the study again" in jv.open_sweep(store).message
     progress = []
     found = run_study(STUDY, store, report=progress.append)
     assert found.computed == 25 and progress[-1].done == progress[-1].cases == 45 and progress[-1].left == 0.0
@@ -131,7 +131,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(whole, tmp_path, monkeypatch
         with pytest.raises(jv.InputError, match=r"cannot be written \(No space left on device\); make room or name another"):
             run_study(STUDY, store)
     kept = jv.open_sweep(store)
-    assert kept.status_name == "partly" and kept.counts[0].cases == 25
+    assert kept.status_name == "incomplete" and kept.counts[0].cases == 25
     assert run_study(STUDY, store).computed == 25 and files(store) == files(tmp_path / whole.store)
 
 

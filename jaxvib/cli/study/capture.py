@@ -15,7 +15,7 @@ from jaxvib.cli.output import fields_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from jaxvib.motion.start import Turning
+    from jaxvib.motion.start import Rotation
 
 
 @app.command("capture")
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 )
 @click.option("--resolution", type=float, help="Resolution of the threshold.")
 @click.option(
-    "--turning",
-    type=click.Choice(["rolling", "still"]),
+    "--rotation",
+    type=click.Choice(["rolling", "none"]),
     default="rolling",
     show_default=True,
-    help="Initial rotation of the balls: rolling, or still, so that they slide at first (needs the effect sliding).",
+    help="Initial rotation of the balls: rolling, or none, so that they slide at first (needs the effect sliding).",
 )
 @shared
 def capture(
@@ -50,7 +50,7 @@ def capture(
     starts: int,
     turns: int,
     resolution: float | None,
-    turning: Turning,
+    rotation: Rotation,
     output: Output,
 ) -> None:
     """Find the initial speeds from which the balls in a torus of SCENE reach the rotor speed; --out adds pictures."""
@@ -60,7 +60,7 @@ def capture(
         raise jv.InputError("--from", f"is {low:g} with --to {high:g}; the speeds must ascend and lie between -1 and 0")
     loaded = jv.load_scene(scene)
     found = jv.capture(
-        loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, turning=turning
+        loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, rotation=rotation
     )
     output.picture("capture.png", found.plot)
 
@@ -71,7 +71,7 @@ def capture(
         # One run starts just above the threshold, or at the highest speed if no threshold was found.
         speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high
         until = 2.0 * math.pi * min(turns, 400) / float(loaded.drive.speed)
-        run = jv.simulate(loaded, until, start=jv.with_spin(loaded, moving_state(loaded, speed), turning), estimate=False)
+        run = jv.simulate(loaded, until, start=jv.with_spin(loaded, moving_state(loaded, speed), rotation), estimate=False)
         kept = run.trajectory
         assert kept is not None
         around = np.asarray(kept.state.azimuth) - np.asarray(kept.rotor_angle)[:, None]

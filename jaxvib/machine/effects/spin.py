@@ -74,7 +74,7 @@ class Sliding(Effect):
     - F_t is the force of the contact on the load along the track; the index t denotes the part tangential to the track
     - F_r is here the force with which the load would roll at the actual acceleration of its centre
     - c is the velocity of the point of contact relative to the track along each coordinate of a load (`State.spin.slip`,
-      default: 0 at the start; `with_spin(scene, state, "still")` for loads that do not rotate yet)
+      default: 0 at the start; `with_spin(scene, state, "none")` for loads that do not rotate yet)
     - A sliding load moves like a mass without rotation. Friction accelerates its rotation until it rolls; a ball from rest then
       has 2/7 of the track's speed
     - Rolling is exact: below the limit there is no creep

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
-from jaxvib.equations.coincident import light_friction
+from jaxvib.equations.coincident import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
@@ -108,7 +108,7 @@ def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
         return free
 
     def residual(n: Array) -> Array:
-        return model.drag * (n - omega) + light_friction(model.loads, effects, omega, n) - torque
+        return model.drag * (n - omega) + friction_on_light_loads(model.loads, effects, omega, n) - torque
 
     return bracketed_root(residual, omega, free)
 

@@ -40,13 +40,13 @@ class JamValues(Protocol):
 class Tier(NamedTuple):
     """Method to compute a jam.
 
-    **Attributes**: `name`; `answers`: text on its purpose; `require(scene)` raises `InputError` if the tier cannot include the
+    **Attributes**: `name`; `purpose`: text; `require(scene)` raises `InputError` if the tier cannot include the
     scene, and names the property that a part of the scene lacks; `jam(scene, mode, until)` returns the result for a jam mode,
     integrated until a time (s) if the tier integrates in time.
     """
 
     name: str
-    answers: str
+    purpose: str
     require: Callable[[Scene], object]
     jam: Callable[[Scene, int, float], JamValues]
 

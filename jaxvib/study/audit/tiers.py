@@ -23,16 +23,16 @@ class TierRow(NamedTuple):
 
     **Attributes**
 
-    - `tier`: its name; `answers`: True if it can compute the audit's quantities for the scene
+    - `tier`: its name; `applicable`: True if it can compute the audit's quantities for the scene
     - `amplitude`, `foundation_force`, `omega`: the error of this quantity relative to the best tier, not the quantity itself;
-      for `amplitude` that of the coordinate with the largest error, in units of the largest amplitude; NaN if `answers` is
+      for `amplitude` that of the coordinate with the largest error, in units of the largest amplitude; NaN if `applicable` is
       False
     - `seconds` of a computation, and additional seconds of the first one, `compile`; NaN without timings
     - `says`: its purpose, or the reason why it cannot compute the quantities
     """
 
     tier: str
-    answers: bool
+    applicable: bool
     amplitude: float
     foundation_force: float
     omega: float
@@ -42,35 +42,35 @@ class TierRow(NamedTuple):
 
     def words(self) -> str:
         """Return the row as text."""
-        if not self.answers:
+        if not self.applicable:
             return f"not applicable; {self.says}"
         off = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))
         took = "" if math.isnan(self.seconds) else f", {self.seconds:.2g} s"
         return f"error {100.0 * off:.2g} %{took}; {self.says}"
 
 
-def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues, repeats: int) -> list[TierRow]:
-    """Return a row for each of `TIERS`. The reference is `own`, the values of the best tier; no timings if `repeats` is 0."""
-    return [_row(tier, scene, comparison, own, repeats) for tier in TIERS]
+def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues, repeats: int) -> list[TierRow]:
+    """Return a row for each of `TIERS`. `reference` contains the values of the best tier; no timings if `repeats` is 0."""
+    return [_row(tier, scene, comparison, reference, repeats) for tier in TIERS]
 
 
-def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues, repeats: int) -> TierRow:
+def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues, repeats: int) -> TierRow:
     nothing = (math.nan,) * 5
     refusal = tier.refusal(scene)
     if refusal is not None:
         return TierRow(tier.name, False, *nothing, says=refusal)
-    call = _call(tier, scene, comparison, own)
+    call = _call(tier, scene, comparison, reference)
     if isinstance(call, str):
         return TierRow(tier.name, False, *nothing, says=call)
     try:
         found, seconds, compiling = timed(call, repeats) if repeats else (call(), math.nan, math.nan)
     except (InputError, ComputationError) as problem:
         return TierRow(tier.name, False, *nothing, says=str(problem))
-    amplitude, size = np.abs(np.asarray(found.amplitude)), np.asarray(own.amplitude)
+    amplitude, size = np.abs(np.asarray(found.amplitude)), np.asarray(reference.amplitude)
     if not np.all(np.isfinite(amplitude)):
         status = getattr(found, "status", None)
         return TierRow(tier.name, False, *nothing, says="this motion does not exist" if status is None else status_name(status))
-    says = tier.answers
+    says = tier.purpose
     if isinstance(comparison, JamComparison) and isinstance(found, MotionValues) and found.kind != "jammed":
         says = f"the run left the jam: {found.kind}"
     off = (amplitude - size) / np.max(size)
@@ -78,8 +78,8 @@ def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, ow
         tier.name,
         True,
         float(off[np.argmax(np.abs(off))]),
-        float(found.foundation_force) / own.foundation_force - 1.0,
-        float(found.omega) / own.omega - 1.0,
+        float(found.foundation_force) / reference.foundation_force - 1.0,
+        float(found.omega) / reference.omega - 1.0,
         seconds,
         compiling,
         says,
@@ -87,19 +87,19 @@ def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, ow
 
 
 def _call(
-    tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, own: MotionValues
+    tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues
 ) -> Callable[[], JamValues | MotionValues] | str:
     """Return a function that evaluates the tier, or the reason why the tier cannot be evaluated."""
-    timeless = tier.name in ("leading order", "exact orbit")
+    without_integration = tier.name in ("leading order", "exact orbit")
     if isinstance(comparison, JamComparison):
-        if not timeless and "unstable" in own.kind:
+        if not without_integration and "unstable" in reference.kind:
             return "the jam is unstable, and a run leaves it"
         until = 10.0 * SLOW_PERIODS * slow_period(scene)
         if tier.name == "full":
             return lambda: comparison.full(scene)
         return lambda: tier.jam(scene, comparison.mode, until)
-    if timeless:
-        return "computes the jams of this scene, not the one that a run reaches"
+    if without_integration:
+        return "computes jams of this scene, not the motion that this run reaches"
     if tier.name == "full":
         return lambda: comparison.full(scene)
     start = comparison.state(scene)

@@ -23,7 +23,7 @@ from jaxvib.machine.torus import in_torus
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.run import Run
-from jaxvib.motion.start import Turning, with_spin
+from jaxvib.motion.start import Rotation, with_spin
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -66,8 +66,8 @@ class Capture(Result):
     - `threshold`: the least speed from which on all starts were captured, halfway to the next lower speed that was tried
     - `uncertainty`: half the distance to that speed or to the highest speed at which half of the starts fail, whichever is
       more, and at least the move; NaN if there is no threshold
-    - `last_change`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN without a
-      doubling
+    - `last_change`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN
+      without a doubling
     - `steps` and `turns` of the rotor that each run took
 
     Below the threshold outcomes may be chaotic, captures standing alone among failures: there `fraction` gives their share.
@@ -105,7 +105,11 @@ class Capture(Result):
         """Return the threshold with its uncertainty, and the outcomes below it, as text."""
         n = self.captured.shape[1]
         head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
-        doubled = "" if np.isnan(self.last_change) else f"; their last doubling changed the threshold by {float(self.last_change):.1e}"
+        doubled = (
+            ""
+            if np.isnan(self.last_change)
+            else f"; their last doubling changed the threshold by {float(self.last_change):.1e}"
+        )
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
@@ -161,7 +165,7 @@ def capture(
     spread: Number = 1e-3,
     seed: int = 0,
     resolution: float | None = None,
-    turning: Turning = "rolling",
+    rotation: Rotation = "rolling",
     stepsize_controller: EqualSteps | None = None,
     doublings: int = DOUBLINGS,
     equations: Equations = vector_field,
@@ -188,7 +192,7 @@ def capture(
     - `seed` of these moves
     - `resolution` of the threshold, relative to the rotor's speed; typical: 1e-2 to 1e-4. Each refinement takes a run of all
       starts
-    - `turning`: "rolling", for balls that roll from the start, or "still", for balls that are thrown without turning, so that
+    - `rotation`: "rolling", for balls that roll from the start, or "none", for balls that are thrown without turning, so that
       they slide until they roll; it needs the effect `Sliding`
     - `stepsize_controller`: `EqualSteps(n)` for the whole run, which are not doubled; the default begins with a step for each
       radian of the fastest motion, two if that is a contact between balls or the end of a slip, and a third for a time constant
@@ -214,11 +218,11 @@ def capture(
         raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a prescribed speed, use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:
         raise InputError("resolution", f"is {quoted(resolution)}; it must be between 0 and 1, such as 1e-3")
-    if turning not in get_args(Turning):
-        raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
-    if turning == "still" and not has_term(scene.all_effects, SlipRelease):
-        problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
-        raise InputError("turning", problem)
+    if rotation not in get_args(Rotation):
+        raise InputError("rotation", f"is {quoted(rotation)}; it must be 'rolling' or 'none'")
+    if rotation == "none" and not has_term(scene.all_effects, SlipRelease):
+        problem = "is 'none', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
+        raise InputError("rotation", problem)
     tried = np.linspace(-1.0, 0.0, _SCAN_SPEEDS + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
     allowed = tried.ndim == 1 and tried.size > 0 and np.all(np.isfinite(tried)) and np.all(np.diff(tried) > 0.0)
     if not allowed or tried[0] < -1.0 or tried[-1] > 0.0:
@@ -236,7 +240,7 @@ def capture(
         lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
         shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
         values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
-        make = _rolling_start if turning == "rolling" else _sliding_start
+        make = _rolling_start if rotation == "rolling" else _sliding_start
         ran = ensemble(make, values, end, stepsize_controller=EqualSteps(steps), estimate=False, equations=equations)
         slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
         finite = np.asarray(ran.finite)
@@ -273,7 +277,7 @@ def _rolling_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
 
 def _sliding_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
     scene, state = _rolling_start(value)
-    return scene, with_spin(scene, state, "still")
+    return scene, with_spin(scene, state, "none")
 
 
 def _least(captured: np.ndarray) -> int:

@@ -19,7 +19,7 @@ from jaxvib.motion.ensemble import Equations
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.study.capture.capture import Capture, Turning, capture
+from jaxvib.study.capture.capture import Capture, Rotation, capture
 from jaxvib.units import Number
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def threshold_curve(
     spread: Number = 1e-3,
     seed: int = 0,
     resolution: float | None = None,
-    turning: Turning = "rolling",
+    rotation: Rotation = "rolling",
     equations: Equations = vector_field,
 ) -> ThresholdCurve:
     """Return the capture thresholds of scenes that differ in one number.
@@ -96,7 +96,7 @@ def threshold_curve(
 
     - `make`: a function that returns the scene of a value
     - `values` (V,) of the number; typical: 5 to 20
-    - `speeds`, `turns`, `starts`, `spread`, `seed`, `resolution`, `turning`, `equations`: as `capture`, which computes each
+    - `speeds`, `turns`, `starts`, `spread`, `seed`, `resolution`, `rotation`, `equations`: as `capture`, which computes each
       value
 
     **Returns** `ThresholdCurve`. **Raises** `InputError` for no values, and as `capture`.
@@ -125,7 +125,7 @@ def threshold_curve(
             spread=spread,
             seed=seed,
             resolution=resolution,
-            turning=turning,
+            rotation=rotation,
             equations=equations,
         )
         for value in numbers

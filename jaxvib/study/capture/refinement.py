@@ -45,8 +45,8 @@ class Refined(NamedTuple, Generic[Found]):
     """Results of the finest scans.
 
     **Attributes**: `results` of P points; `multiple` (P,): the number of steps of each result, in units of the first scan's;
-    `last_change` (P, K): the change of its K borders by the last doubling, infinite if only one of the two scans has the border, NaN
-    without a doubling.
+    `last_change` (P, K): the change of its K borders by the last doubling, infinite if only one of the two scans has the
+    border, NaN without a doubling.
     """
 
     results: list[Found]

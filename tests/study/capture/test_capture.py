@@ -67,13 +67,13 @@ def test_a_threshold_curve_is_captures_beside_each_other():
 def test_captures_of_balls_that_are_thrown_without_turning():
     base = published_torus(3.5)
     scene = jv.Scene(base.machine, base.loads, base.drive, (*base.all_effects, jv.Sliding(0.1)))
-    rolled, slid = (jv.capture(scene, [-0.7, -0.1], turns=20, turning=how) for how in ("rolling", "still"))
+    rolled, slid = (jv.capture(scene, [-0.7, -0.1], turns=20, rotation=how) for how in ("rolling", "none"))
     assert np.all(rolled.finite) and np.all(slid.finite) and not np.any(rolled.captured[0])
-    start = jv.with_spin(scene, moving_state(scene, -0.7), "still")
+    start = jv.with_spin(scene, moving_state(scene, -0.7), "none")
     np.testing.assert_allclose(start.spin.slip[0], -0.7 * 140.0 * 0.2)
-    for scene_, how, says in ((base, "still", "term SlipRelease"), (scene, "asleep", "it must be 'rolling' or 'still'")):
+    for scene_, how, says in ((base, "none", "term SlipRelease"), (scene, "asleep", "it must be 'rolling' or 'none'")):
         with pytest.raises(jv.InputError, match=says):
-            jv.capture(scene_, [-0.5], turns=5, turning=how)
+            jv.capture(scene_, [-0.5], turns=5, rotation=how)
 
 
 def test_steps_double_until_borders_stay():

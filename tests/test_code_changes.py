@@ -17,7 +17,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib import imported
+from jaxvib import code_changes
 from jaxvib.equations import linear
 from jaxvib.machine import drive, loads
 from jaxvib.numerics import fourier
@@ -33,9 +33,9 @@ ROOT = pathlib.Path(jv.__file__).parents[1]
 def folder(tmp_path):
     """Cache folder of a process that has not asked anything yet."""
     jam.jams_of.stored.ready.clear()
-    cache.keep_programs(tmp_path)
+    cache.set_program_folder(tmp_path)
     yield tmp_path
-    cache.keep_programs(None)
+    cache.set_program_folder(None)
 
 
 def force():
@@ -107,41 +107,41 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_every_kind_of_replacement_is_noticed(change):
-    before = imported.code_state(look=True)
+    before = code_changes.code_state(look=True)
     assert before.is_on_disk
     with CHANGES[change]():
-        within = imported.code_state(look=True)
+        within = code_changes.code_state(look=True)
         assert not within.is_on_disk and within.number > before.number
-        assert imported.code_state(look=True) == within
-    after = imported.code_state(look=True)
+        assert code_changes.code_state(look=True) == within
+    after = code_changes.code_state(look=True)
     assert after.is_on_disk and after.number > within.number
 
 
 def test_a_replacement_that_came_and_went_counts_too():
     """JAX may hold programs that other functions traced meanwhile."""
-    before = imported.code_state(look=True)
+    before = code_changes.code_state(look=True)
     with mock.patch.object(jam, "peak_force"):
         pass
-    assert imported.code_state().number > before.number and imported.code_state().is_on_disk
+    assert code_changes.code_state().number > before.number and code_changes.code_state().is_on_disk
 
 
 @pytest.mark.parametrize(("owner", "name"), [(jam, "peak_force"), (jam.JamModes, "exists")])
 def test_a_removed_definition_is_noticed(owner, name):
     with pytest.MonkeyPatch.context() as patch:
         patch.delattr(owner, name)
-        assert not imported.code_state(look=True).is_on_disk
-    assert imported.code_state(look=True).is_on_disk
+        assert not code_changes.code_state(look=True).is_on_disk
+    assert code_changes.code_state(look=True).is_on_disk
 
 
 def test_use_of_the_package_is_no_replacement():
     """Imports at first use, and attributes that Python adds to classes when they are asked for."""
     jv.simulate(scene("one_mass", "balls"), 0.01)
-    for owner in list(imported._code.members):
+    for owner in list(code_changes._code.members):
         inspect.get_annotations(owner)
         inspect.getdoc(owner)
         with contextlib.suppress(ValueError):
             inspect.signature(owner)
-    assert imported.code_state(look=True).is_on_disk
+    assert code_changes.code_state(look=True).is_on_disk
 
 
 def test_caches_of_replaced_functions_are_emptied():
@@ -165,13 +165,13 @@ def toy(tmp_path):
             os.utime(path, (seconds, seconds))
         sys.modules.pop("jaxvib.toy_module", None)
         importlib.invalidate_caches()
-        code.stamps[str(path)] = imported._stamp(path)
+        code.stamps[str(path)] = code_changes._stamp(path)
         return path, importlib.import_module("jaxvib.toy_module")
 
-    before, code = imported._code, imported._Code()
-    vars(imported)["_code"] = code
+    before, code = code_changes._code, code_changes._Code()
+    vars(code_changes)["_code"] = code
     yield imported_as
-    vars(imported)["_code"] = before
+    vars(code_changes)["_code"] = before
     sys.modules.pop("jaxvib.toy_module", None)
     vars(jv).pop("toy_module", None)
     jv.__path__.remove(str(tmp_path))
@@ -179,39 +179,39 @@ def toy(tmp_path):
 
 def test_an_edit_after_the_import_is_noticed(toy):
     path, _ = toy("x = 1.0\n")
-    assert imported.code_state(look=True).is_on_disk
+    assert code_changes.code_state(look=True).is_on_disk
     path.write_text("x = 22.0\n")
-    assert not imported.code_state(look=True).is_on_disk
+    assert not code_changes.code_state(look=True).is_on_disk
 
 
 def test_a_removed_source_is_noticed(toy):
     path, _ = toy("x = 1.0\n")
     path.unlink()
-    assert not imported.code_state(look=True).is_on_disk
+    assert not code_changes.code_state(look=True).is_on_disk
 
 
 def test_a_module_without_a_digested_source_is_in_doubt(toy):
     path, module = toy("x = 1.0\n")
-    assert imported.code_state(look=True).is_on_disk
-    del imported._code.stamps[str(path)]
-    imported.watch(module)
-    assert not imported.code_state(look=True).is_on_disk
+    assert code_changes.code_state(look=True).is_on_disk
+    del code_changes._code.stamps[str(path)]
+    code_changes.watch(module)
+    assert not code_changes.code_state(look=True).is_on_disk
 
 
 def test_a_module_reloaded_is_in_doubt(toy):
     """Others hold what it defined before."""
     _, module = toy("x = 1.0\n")
     importlib.reload(module)
-    assert not imported.code_state(look=True).is_on_disk
+    assert not code_changes.code_state(look=True).is_on_disk
 
 
 def test_stale_bytecode_is_in_doubt(toy):
     """Python runs it if the source was changed within a second and has the same size."""
     _, module = toy("x = 1.0\n", seconds=1e9)
     os.utime(module.__cached__, (1e9, 1e9))
-    assert imported.code_state(look=True).is_on_disk
+    assert code_changes.code_state(look=True).is_on_disk
     _, module = toy("x = 2.0\n", seconds=1e9 + 0.5)
-    assert module.x == 1.0 and not imported.code_state(look=True).is_on_disk
+    assert module.x == 1.0 and not code_changes.code_state(look=True).is_on_disk
 
 
 CODE = """
