@@ -13,7 +13,7 @@ import tempfile
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +95,7 @@ def export_fmu(
       `exciters[1].rotor.torque`
     - Event indicators are comparisons in nonsmooth forces (stops, contacts, dry friction) and in a drive whose acceleration
       jumps; a solver ends a step at the time at which an indicator changes its sign
-    - Directional derivatives of rates and outputs with respect to states and inputs are exact
+    - Directional derivatives of rates and outputs with respect to states, inputs, parameters and time are exact
 
     **Arguments**
 
@@ -145,12 +145,12 @@ def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) ->
     """Return the files of the unit without a binary, the number of its statements, and the identifier of the model."""
     equations, names = equations_of(scene, state, drive), named_entries(scene)
     events = has_events(scene)
-    rates, tangent = _programs(scene, equations, events, len(names))
+    programs = _programs(scene, equations, events, len(names))
     step = _step(scene)
-    variables = _variables(scene, equations, rates.branches, step)
+    variables = _variables(scene, equations, programs.rates.branches, step)
     identifier = re.sub(r"\W", "_", name, flags=re.ASCII)[:60]
     identifier = identifier if re.match("[A-Za-z]", identifier) else f"machine_{identifier}"
-    body = _model(scene, equations, rates, tangent, variables)
+    body = _model(scene, equations, programs, variables)
     own = Path(__file__).parent / "c"
     files = {f"sources/{each}": (own / each).read_bytes() for each in ("machine.h", f"fmi{fmi[0]}.c")}
 
@@ -168,7 +168,7 @@ def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) ->
             f'<BuildConfiguration modelIdentifier="{identifier}"><SourceFileSet><SourceFile name="fmi3.c"/></SourceFileSet>'
             "</BuildConfiguration>\n</fmiBuildDescription>\n"
         ).encode()
-    return files, len(rates.body), identifier
+    return files, len(programs.rates.body), identifier
 
 
 def _described(scene: Scene) -> str:
@@ -190,8 +190,17 @@ def _step(scene: Scene) -> float:
     return float(f"{min(explicit, 1.0 / max(decay, 1e-300)):.3g}")
 
 
-def _programs(scene: Scene, equations: Equations, events: bool, parameters: int) -> tuple[Written, Written]:
-    """Return C programs for the rates and for their derivatives in a direction of states and inputs."""
+class _Programs(NamedTuple):
+    """Programs in C: the `rates` and outputs; their derivatives in a direction of states and inputs (`tangent`), which implicit
+    solvers need often, and in a direction of parameters, time, states and inputs (`full_tangent`)."""
+
+    rates: Written
+    tangent: Written
+    full_tangent: Written
+
+
+def _programs(scene: Scene, equations: Equations, events: bool, parameters: int) -> _Programs:
+    """Return the programs of a scene."""
     if not HAS_JAXPRS:
         raise InputError("scene", "cannot be written as C, since this version of JAX does not give access to its programs")
     time = jnp.zeros((), scene.top_speed.dtype)
@@ -200,19 +209,25 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
     def tangent(scene: Scene, t: Array, states: object, inputs: object, *direction: object) -> object:
         return jax.jvp(lambda *moving: equations.rates(scene, t, *moving), (states, inputs), direction)[1]
 
+    def full_tangent(*values: Any) -> object:
+        return jax.jvp(equations.rates, values[: len(given)], values[len(given) :])[1]
+
     try:
-        programs = scalar_program(equations.rates, *given), scalar_program(tangent, *given, *given[2:])
+        rates = scalar_program(equations.rates, *given)
+        tangents = scalar_program(tangent, *given, *given[2:]), scalar_program(full_tangent, *given, *given)
     except NotScalarizable as error:
         problem = f"needs the operation {str(error)!r} of JAX, which is not available for scalars"
         raise InputError("scene", f"{problem}; remove the part that needs it") from error
-    numbers = [f"p[{k}]" for k in range(parameters)]
+    numbers, number_seeds = ([f"{name}[{k}]" for k in range(parameters)] for name in ("p", "p_seed"))
     count = {"x": len(equations.state_signals), "u": len(equations.input_signals), "y": len(equations.output_signals)}
     moving = [f"{name}[{k}]" for name in "xu" for k in range(count[name])]
     seeds = [f"{name}_seed[{k}]" for name in "xu" for k in range(count[name])]
     results = [f"{name}[{k}]" for name, size in (("rate", "x"), ("y", "y")) for k in range(count[size])]
-    return (
-        write_program(programs[0], [*numbers, "t", *moving], parameters, results, has_events=events),
-        write_program(programs[1], [*numbers, "t", *moving, *seeds], parameters, results),
+    values = [*numbers, "t", *moving]
+    return _Programs(
+        write_program(rates, values, parameters, results, has_events=events),
+        write_program(tangents[0], [*values, *seeds], parameters, results),
+        write_program(tangents[1], [*values, *number_seeds, "t_seed", *seeds], parameters, results),
     )
 
 
@@ -271,6 +286,7 @@ _MODEL = """/* Equations of one scene, written by jaxvib.
 #define INDICATORS {indicators}
 #define CONSTANTS {constants}
 #define TANGENT_CONSTANTS {tangent_constants}
+#define FULL_TANGENT_CONSTANTS {full_tangent_constants}
 
 static const char *const NAMES[] = {{{names}}};
 static const double START_STATES[] = {{{start_states}}};
@@ -299,10 +315,21 @@ static void tangent(const double *p, const double *constants, double t, const do
                     const double *u_seed, double *rate, double *y) {{
 {tangent}
 }}
+
+/* The same in the direction (p_seed, t_seed, x_seed, u_seed). */
+static void prepare_full_tangent(const double *p, double *constants) {{
+{prepare_full_tangent}
+}}
+
+static void full_tangent(const double *p, const double *constants, double t, const double *x, const double *u,
+                         const double *p_seed, double t_seed, const double *x_seed, const double *u_seed, double *rate,
+                         double *y) {{
+{full_tangent}
+}}
 """
 
 
-def _model(scene: Scene, equations: Equations, rates: Written, tangent: Written, variables: list[Variable]) -> str:
+def _model(scene: Scene, equations: Equations, programs: _Programs, variables: list[Variable]) -> str:
     """Return the C source of the equations."""
     parameters = [each for each in variables if each.kind == "parameter"]
     bounds = [each.spec.bounds for each in named_entries(scene)]
@@ -319,15 +346,19 @@ def _model(scene: Scene, equations: Equations, rates: Written, tangent: Written,
         "high": [each.high or "INFINITY" for each in parameters],
         "open": [str(each) for each in opened],
     }
-    blocks = {"prepare": rates.prepare, "body": rates.body, "prepare_tangent": tangent.prepare, "tangent": tangent.body}
+    blocks = {"prepare": programs.rates.prepare, "body": programs.rates.body}
+    for name in ("tangent", "full_tangent"):
+        written = getattr(programs, name)
+        blocks |= {f"prepare_{name}": written.prepare, name: written.body}
     return _MODEL.format(
         states=len(states),
         inputs=len(inputs),
         outputs=len(equations.output_signals),
         parameters=len(parameters),
-        indicators=rates.branches,
-        constants=rates.constants,
-        tangent_constants=tangent.constants,
+        indicators=programs.rates.branches,
+        constants=programs.rates.constants,
+        tangent_constants=programs.tangent.constants,
+        full_tangent_constants=programs.full_tangent.constants,
         **{name: ", ".join(texts) for name, texts in lists.items()},
         **{name: "\n".join(f"    {line}" for line in lines) for name, lines in blocks.items()},
     )

@@ -242,6 +242,30 @@ def test_directional_derivatives_equal_jvp(name, opened):
 
 
 @needs_compiler
+@each_scene("stop", "imbalance", "imbalance and a motor", "rotor with stations", "body with loads and an unbalance")
+def test_derivatives_by_parameters_equal_differences(name, opened):
+    """Central differences of the rates over each parameter that may change to both sides, and over time."""
+    found, low = exported(name), {each.name: each.min for each in exported(name).of.modelVariables}
+    machine, names = opened(found), [*rates_of(found), *(n for n in found.references if n.startswith("foundation_force"))]
+    put_all(machine, found, of_state(found.scene, state_of(found.scene)))
+    parameters = [each.name for each in found.of.modelVariables if each.causality == "parameter"]
+
+    def rates(known, value):
+        machine.setTime(value) if known == "time" else put_all(machine, found, {known: value})
+        return machine.value(*names)
+
+    for known in ("time", *parameters):
+        (value,) = machine.value(known)
+        if value == 0.0 and low[known] is not None and float(low[known]) == 0.0:
+            continue
+        step = 1e-5 * (abs(value) or 1.0)
+        difference = (rates(known, value + step) - rates(known, value - step)) / (2.0 * step)
+        size = np.max(np.abs(rates(known, value)))
+        slope = machine.getDirectionalDerivative([found.references[n] for n in names], [found.references[known]], [1.0])
+        np.testing.assert_allclose(slope, difference, rtol=1e-6, atol=1e-7 * size / (abs(value) or 1.0), err_msg=known)
+
+
+@needs_compiler
 def test_derivatives_by_inputs_equal_differences(opened):
     found = exported("imbalance and a motor")
     machine = opened(found)

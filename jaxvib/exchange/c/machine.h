@@ -144,19 +144,30 @@ static void set_states(Machine *m, const double *states) {
     m->data.evaluated = 0;
 }
 
-/* Sensitivities of rates and outputs in a direction of states and inputs. */
+/* Sensitivities of rates and outputs in a direction of states, inputs, parameters and time. */
 static int differentiate_values(Machine *m, const unsigned *unknown, size_t unknowns, const unsigned *known, size_t knowns,
                                 const double *seed, double *sensitivity) {
     double direction[VALUES] = {0}, change[VALUES] = {0}, constants[TANGENT_CONSTANTS + 1], *v = m->data.values;
+    double full_constants[FULL_TANGENT_CONSTANTS + 1], *x = direction + AT_STATES, *u = direction + AT_INPUTS;
+    int full = 0;
     for (size_t i = 0; i < knowns; i++) {
         unsigned r = known[i];
-        if (!((r >= AT_STATES && r < AT_RATES) || (r >= AT_INPUTS && r < AT_OUTPUTS)))
-            return report(m, "there is no derivative by %s, only by states and inputs", r < VALUES ? NAMES[r] : "this");
+        int is_fixed = !r || (r >= AT_PARAMETERS && r < AT_INDICATORS);
+        if (!(is_fixed || (r >= AT_STATES && r < AT_RATES) || (r >= AT_INPUTS && r < AT_OUTPUTS)))
+            return report(m, "there is no derivative by %s, only by states, inputs, parameters and time",
+                          r < VALUES ? NAMES[r] : "this");
         direction[r] = change[r] = seed[i];
+        full |= is_fixed;
     }
-    prepare_tangent(v + AT_PARAMETERS, constants);
-    tangent(v + AT_PARAMETERS, constants, v[0], v + AT_STATES, v + AT_INPUTS, direction + AT_STATES, direction + AT_INPUTS,
-            change + AT_RATES, change + AT_OUTPUTS);
+    if (full) {
+        prepare_full_tangent(v + AT_PARAMETERS, full_constants);
+        full_tangent(v + AT_PARAMETERS, full_constants, v[0], v + AT_STATES, v + AT_INPUTS, direction + AT_PARAMETERS,
+                     direction[0], x, u, change + AT_RATES, change + AT_OUTPUTS);
+    } else {
+        prepare_tangent(v + AT_PARAMETERS, constants);
+        tangent(v + AT_PARAMETERS, constants, v[0], v + AT_STATES, v + AT_INPUTS, x, u, change + AT_RATES,
+                change + AT_OUTPUTS);
+    }
     for (size_t i = 0; i < unknowns; i++) {
         unsigned r = unknown[i];
         if (!(r >= AT_STATES && r < AT_PARAMETERS))
