@@ -118,7 +118,8 @@ from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
 
 # Recorded runs of a machine
-from jaxvib.identification.run import Channel, MeasuredRun
+from jaxvib.identification.records.channel import Channel
+from jaxvib.identification.run import MeasuredRun
 
 # Capture in a torus
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture

@@ -2,125 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxvib.boundary import validated
-from jaxvib.errors import InputError, quoted, require_one_of
+from jaxvib.errors import InputError, quoted
+from jaxvib.identification.records.agreement import check_agreement
+from jaxvib.identification.records.channel import UNITS, Channel
+from jaxvib.identification.records.pulses import numbered_pulses, rising_edges
+from jaxvib.identification.records.sampling import clipped_at, even_samples, require_ascending
 from jaxvib.results.table import is_number
 from jaxvib.units import Number, number
-from jaxvib.units.columns import unit_factor
 
-Kind = Literal["acceleration", "velocity", "displacement", "force", "pulses", "speed", "angle", "torque", "current"]
-
-UNITS: dict[str, str] = {
-    "acceleration": "m/s^2",
-    "velocity": "m/s",
-    "displacement": "m",
-    "force": "N",
-    "pulses": "",
-    "speed": "rad/s",
-    "angle": "rad",
-    "torque": "N m",
-    "current": "A",
-}
-"""SI unit of each kind of channel."""
-
-_GAIN_ERROR = {"acceleration": 0.01}
-"""Relative standard uncertainty of the gain by kind, if it is not stated; 0 for all other kinds."""
-
-_DIRECTIONS = {"up": (0.0, 1.0), "down": (0.0, -1.0), "across": (1.0, 0.0), "-across": (-1.0, 0.0)}
-
-
-class Channel(eqx.Module):
-    """Channel of a recorded run: a sensor with its place, or a quantity that the recorder computed.
-
-    **Arguments**
-
-    - `name` of the column or channel in the file
-    - `kind`: "acceleration", "velocity", "displacement", "force" (on the foundation), "pulses" (of a tachometer), "speed",
-      "angle" or "torque" of the rotor, "current" of the motor
-    - `at`: number of the platform, from 1, or (x, y), m, of a point of a body, for kinds that measure a motion; default: the
-      place of the exciter
-    - `direction` in which a positive reading points: "up", "down", "across", "-across", or a pair (across, up) of any length;
-      default: up
-    - `unit` of the samples, such as "g", "mm/s" or "rpm"; default: the unit stated in the file, otherwise the SI unit
-    - `gain_error`: relative standard uncertainty of the gain; default: 0.01 for acceleration, 0 for other kinds; typical: 0.01
-      to 0.05
-    - `delay`, s, of the readings behind the motion; typical: 0 to 1e-3
-    - `high_pass`, Hz, corner frequency of the sensor's first-order high-pass filter, 0 for none; typical: 0.1 to 1 for IEPE
-      accelerometers
-    - `range`: largest absolute reading, in `unit` or with its own unit; readings at it are clipped; default: detected in the
-      histogram
-    - `per_turn`: number of pulses per turn
-
-    **Raises** `InputError` for an unknown kind or direction, a unit of another dimension, and numbers that are not allowed.
-
-    >>> import jaxvib as jv
-    >>> jv.Channel("frame", "acceleration", at=1, unit="g", range="50 g").range
-    490.3325
-    """
-
-    name: str = eqx.field(static=True)
-    kind: Kind = eqx.field(static=True)
-    at: int | tuple[float, float] | None
-    direction: tuple[float, float]
-    unit: str | None = eqx.field(static=True)
-    gain_error: float
-    delay: float
-    high_pass: float
-    range: float | None
-    per_turn: int = eqx.field(static=True)
-
-    @validated
-    def __init__(
-        self,
-        name: str,
-        kind: str,
-        at: int | Sequence[Number] | None = None,
-        direction: str | Sequence[float] | None = None,
-        unit: str | None = None,
-        gain_error: Number | None = None,
-        delay: Number = 0.0,
-        high_pass: Number = 0.0,
-        range: Number | None = None,
-        per_turn: int = 1,
-    ):
-        where = f"channel {quoted(name)}"
-        require_one_of(kind, get_args(Kind), f"{where}: kind")
-        if unit is not None and kind != "pulses" and unit_factor(unit, UNITS[kind]) is None:
-            raise InputError(
-                f"{where}: unit", f"is {quoted(unit)}, which is not a unit of {kind}; write for example {UNITS[kind]}"
-            )
-        if per_turn < 1:
-            raise InputError(f"{where}: per_turn", f"is {per_turn}; it must be at least 1")
-        self.name, self.kind, self.unit, self.per_turn = name, kind, unit, int(per_turn)  # pyright: ignore[reportAttributeAccessIssue]
-        self.at, self.direction = _place(at, where), _direction(direction, where)
-        self.gain_error = _GAIN_ERROR.get(kind, 0.0) if gain_error is None else _known(gain_error, "", f"{where}: gain_error")
-        self.delay = float(number(delay, "s", f"{where}: delay"))
-        self.high_pass = _known(high_pass, "Hz", f"{where}: high_pass")
-        self.range = None if range is None else self._full_scale(range, f"{where}: range")
-
-    def _full_scale(self, value: Number, field: str) -> float:
-        """Return the largest reading in SI units."""
-        if isinstance(value, str):
-            text, _, unit = value.strip().partition(" ")
-            factor = unit_factor(unit, UNITS[self.kind]) if unit else self.factor
-            if factor is not None and is_number(text, ","):
-                return float(number(float(text) * factor, UNITS[self.kind], field, low=0.0, open_low=True))
-        return float(number(value, UNITS[self.kind], field, low=0.0, open_low=True)) * (
-            1.0 if isinstance(value, str) else self.factor
-        )
-
-    @property
-    def factor(self) -> float:
-        """Factor from the channel's unit to SI; 1 for a channel without a unit."""
-        return 1.0 if self.unit is None or self.kind == "pulses" else unit_factor(self.unit, UNITS[self.kind]) or 1.0
+_FULL = 0.999
+"""Share of the range of a sensor above which a reading counts as clipped."""
 
 
 class Change(NamedTuple):
@@ -164,7 +63,7 @@ class MeasuredRun(eqx.Module):
     def from_arrays(
         cls,
         channels: Sequence[Channel],
-        times: ArrayLike | Mapping[str, ArrayLike],
+        times: np.ndarray | Sequence[float] | Mapping[str, ArrayLike],
         values: Mapping[str, ArrayLike],
         change: Mapping[str, Number] | None = None,
         source: str = "run",
@@ -191,30 +90,19 @@ class MeasuredRun(eqx.Module):
         >>> run.change["machine.mass[0]"].action, round(float(np.max(run.values["frame"])), 3)
         ('add', 0.981)
         """
-        found_times, found_values, clipped, notes = {}, {}, {}, []
         names = [channel.name for channel in channels]
         if not names:
             raise InputError("channels", "is empty; give at least one Channel")
         for name in names:
             if names.count(name) > 1:
                 raise InputError("channels", f"has the name {quoted(name)} twice; names must differ")
-        for channel in channels:
-            name, where = channel.name, f"{source}: channel {quoted(channel.name)}"
-            if isinstance(times, Mapping) and name not in times:
-                raise InputError("times", f"has no entry {quoted(name)}; it has: {', '.join(times) or 'none'}")
-            time = _samples(times[name] if isinstance(times, Mapping) else times, where)
-            if name not in values:
-                if channel.kind != "pulses" or not isinstance(times, Mapping):
-                    raise InputError("values", f"has no entry {quoted(name)}; it has: {', '.join(values) or 'none'}")
-                value = np.arange(time.size, dtype=float)
-            else:
-                value = _samples(values[name], where) * channel.factor
-            if time.shape != value.shape:
-                raise InputError(where, f"has {time.size} times but {value.size} values; each value needs its time")
-            found_times[name], found_values[name] = time, value
-            clipped[name] = np.zeros(time.size, bool) if channel.range is None else np.abs(value) >= channel.range
+        found = {channel.name: _read_channel(channel, times, values, source) for channel in channels}
         parsed = {name: parse_change(value, f"change[{quoted(name)}]") for name, value in (change or {}).items()}
-        return cls(tuple(channels), found_times, found_values, clipped, parsed, tuple(notes), source)
+        its_times, its_values = {k: each.time for k, each in found.items()}, {k: each.value for k, each in found.items()}
+        notes = [note for each in found.values() for note in each.notes]
+        notes += check_agreement(channels, its_times, its_values, source)
+        clipped = {name: each.clipped for name, each in found.items()}
+        return cls(tuple(channels), its_times, its_values, clipped, parsed, tuple(notes), source)
 
     def of_kind(self, *kinds: str) -> tuple[Channel, ...]:
         """Return the channels of the given `kinds`."""
@@ -249,7 +137,52 @@ def parse_change(value: Number, field: str) -> Change:
     return Change("set", text)
 
 
-def _samples(values: ArrayLike, where: str) -> np.ndarray:
+class _Samples(NamedTuple):
+    """Samples of a channel: `time` s, `value` in SI units, True in `clipped` at the end of the range, `notes`."""
+
+    time: np.ndarray
+    value: np.ndarray
+    clipped: np.ndarray
+    notes: list[str]
+
+
+def _read_channel(
+    channel: Channel,
+    times: np.ndarray | Sequence[float] | Mapping[str, ArrayLike],
+    values: Mapping[str, ArrayLike],
+    source: str,
+) -> _Samples:
+    """Return the samples of a channel after checks and repairs."""
+    name, where = channel.name, f"{source}: channel {quoted(channel.name)}"
+    if isinstance(times, Mapping) and name not in times:
+        raise InputError("times", f"has no entry {quoted(name)}; it has: {', '.join(times) or 'none'}")
+    time = _as_samples(times[name] if isinstance(times, Mapping) else times, where)
+    if name not in values:
+        if channel.kind != "pulses" or not isinstance(times, Mapping):
+            raise InputError("values", f"has no entry {quoted(name)}; it has: {', '.join(values) or 'none'}")
+        time, number, notes = numbered_pulses(time, where)
+        return _Samples(time, number, np.zeros(time.size, bool), notes)
+    value = _as_samples(values[name], where) * channel.factor
+    if time.shape != value.shape:
+        raise InputError(where, f"has {time.size} times but {value.size} values; each value needs its time")
+    if channel.kind == "pulses":
+        require_ascending(time, where)
+        edges = rising_edges(time, value if channel.direction[1] >= 0.0 else -value, where)
+        edges, number, notes = numbered_pulses(edges, where)
+        return _Samples(edges, number, np.zeros(edges.size, bool), notes)
+    time, value, notes = even_samples(time, value, where)
+    low, high = (-np.inf, np.inf) if channel.kind in ("speed", "angle") else clipped_at(value)
+    if channel.range is not None:
+        low, high = max(low, -_FULL * channel.range), min(high, _FULL * channel.range)
+    clipped = (value <= low) | (value >= high)
+    if np.any(clipped):
+        count, first = int(np.count_nonzero(clipped)), time[np.argmax(clipped)]
+        ends = " and ".join(f"{each:.4g} {UNITS[channel.kind]}" for each in (low, high) if np.isfinite(each))
+        notes.append(f"{where} is clipped at about {ends}: {count} of {value.size} readings, the first at {first:g} s")
+    return _Samples(time, value, clipped, notes)
+
+
+def _as_samples(values: ArrayLike, where: str) -> np.ndarray:
     try:
         found = np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
@@ -257,35 +190,3 @@ def _samples(values: ArrayLike, where: str) -> np.ndarray:
     if found.ndim != 1:
         raise InputError(where, f"has an array of shape {found.shape}; one list of numbers is needed")
     return found
-
-
-def _known(value: Number, unit: str, field: str) -> float:
-    return float(number(value, unit, field, low=0.0))
-
-
-def _place(at: int | Sequence[Number] | None, where: str) -> int | tuple[float, float] | None:
-    if at is None or isinstance(at, (int, np.integer)):
-        if at is not None and at < 1:
-            raise InputError(f"{where}: at", f"is {at}; it must be the number of a platform, from 1, or a pair (x, y)")
-        return None if at is None else int(at)
-    if len(at) != 2:
-        raise InputError(f"{where}: at", f"is {quoted(at)}; it must be the number of a platform, or a pair (x, y)")
-    x, y = (float(number(each, "m", f"{where}: at[{k}]")) for k, each in enumerate(at))
-    return x, y
-
-
-def _direction(direction: str | Sequence[float] | None, where: str) -> tuple[float, float]:
-    """Return the unit vector (across, up) of a direction."""
-    field = f"{where}: direction"
-    if direction is None:
-        return _DIRECTIONS["up"]
-    if isinstance(direction, str):
-        require_one_of(direction, _DIRECTIONS, field)
-        return _DIRECTIONS[direction]
-    if len(direction) != 2:
-        raise InputError(field, f"is {quoted(direction)}; write up, down, across, -across or a pair (across, up)")
-    across, up = (float(number(each, "", f"{field}[{k}]")) for k, each in enumerate(direction))
-    length = math.hypot(across, up)
-    if length == 0.0:
-        raise InputError(field, "is (0, 0); it must be a vector that is not zero")
-    return across / length, up / length

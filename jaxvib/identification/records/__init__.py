@@ -1,0 +1,1 @@
+"""Channels of recorded runs, and checks and repairs of their samples."""

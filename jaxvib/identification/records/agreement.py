@@ -1,0 +1,244 @@
+"""Agreement of the channels of a run with one another: units, signs, swapped channels, shafts, clocks, aliasing.
+
+Two kinds of comparison need no model of the machine. Speeds of the rotor from pulses, an angle and a speed must be equal.
+Motions x, y of one point in one direction are derivatives of one another, Y = (i w)^d X with d = 0, 1 or 2, at each frequency
+at which they are coherent.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxvib.errors import InputError, quoted
+from jaxvib.identification.records.channel import UNITS, Channel
+from jaxvib.units.columns import unit_factor
+
+_ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+"""Number of derivatives of the displacement in a kind of motion."""
+
+_OTHER_UNITS = {
+    "displacement": ("m", "mm", "um", "mil"),
+    "velocity": ("m/s", "mm/s", "in/s"),
+    "acceleration": ("m/s^2", "g", "mm/s^2"),
+    "speed": ("rad/s", "rpm", "Hz", "deg/s"),
+}
+"""Units that a file may have in place of the stated one."""
+
+_SPEED_ERROR, _MOTION_ERROR, _UNIT_ERROR = 0.03, 0.3, 0.15
+"""Largest relative differences between two speeds and between two motions, and between the latter if another unit explains
+them."""
+
+_COHERENT, _STRONG = 0.9, 1e-3
+"""Smallest coherence of a frequency that is compared, and smallest power relative to the largest one."""
+
+_SEGMENTS = 8
+"""Number of segments of a record whose spectra are averaged."""
+
+_DRIFT = 3.0
+"""Drift of a clock, relative to its standard error, above which it is stated."""
+
+
+class _Signal(NamedTuple):
+    channel: Channel
+    time: np.ndarray
+    value: np.ndarray
+
+
+def check_agreement(
+    channels: Sequence[Channel], times: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], source: str
+) -> list[str]:
+    """Compare the channels of a run with one another, and return notes about clocks and aliasing.
+
+    **Raises** `InputError` for a wrong unit, a reversed sign, swapped channels, different shafts, and a sampling rate that is
+    too low for the speed of the rotor.
+    """
+    signals = [_Signal(channel, times[channel.name], values[channel.name]) for channel in channels]
+    speeds = [_speed(signal) for signal in signals if signal.channel.kind in ("pulses", "angle", "speed")]
+    motions = [_Signal(each.channel, each.time, _filled(each.value)) for each in signals if each.channel.kind in _ORDERS]
+    notes = []
+    for one, other in itertools.combinations(sorted(speeds, key=lambda each: each.channel.kind == "speed"), 2):
+        notes += _compare_speeds(one, other, source)
+    _check_motions(motions, source)
+    for motion in motions:
+        notes += _aliasing(motion, speeds, source)
+    return notes
+
+
+def _speed(signal: _Signal) -> _Signal:
+    """Return the speed of the rotor, rad/s, from any channel of it."""
+    channel, time, value = signal
+    if channel.kind == "speed":
+        known = np.isfinite(value)
+        return _Signal(channel, time[known], value[known])
+    if channel.kind == "pulses":
+        angle, step = 2.0 * np.pi * value / channel.per_turn, channel.per_turn  # whole turns: marks may be uneven
+    else:
+        angle, step = value, max(1, time.size // 500)
+    angle, time = angle[::step], time[::step]
+    known = np.isfinite(angle)
+    angle, time = angle[known], time[known]
+    return _Signal(channel, 0.5 * (time[1:] + time[:-1]), np.diff(angle) / np.diff(time))
+
+
+def _compare_speeds(one: _Signal, other: _Signal, source: str) -> list[str]:
+    """Compare two speeds of the rotor; `other` is the one whose unit is in doubt."""
+    inside = (one.time > other.time[0]) & (one.time < other.time[-1])
+    if np.count_nonzero(inside) < 4:
+        return []
+    time, reference = one.time[inside], one.value[inside]
+    speed = np.interp(time, other.time, other.value)
+    turning = np.abs(reference) > 0.05 * np.max(np.abs(reference))
+    ratio = float(np.median(speed[turning] / reference[turning]))
+    where, name = f"{source}: channel {quoted(other.channel.name)}", quoted(one.channel.name)
+    if abs(abs(ratio) - 1.0) <= _SPEED_ERROR:
+        if ratio < 0.0 and other.channel.kind != "speed":
+            raise InputError(where, f"turns against {name}; reverse the sign of one of them")
+        return _drift(one, other, np.sign(ratio), source)
+    if other.channel.kind == "speed":
+        fits = _fitting_unit(other.channel, 1.0 / abs(ratio), _SPEED_ERROR)
+        if fits:
+            problem = f"is {abs(ratio):.4g} times the speed of {name}"
+            raise InputError(where, f"{problem}; the unit {quoted(fits)} would fit")
+    scatter = float(np.median(np.abs(speed[turning] / reference[turning] / ratio - 1.0)))
+    if scatter > _SPEED_ERROR:
+        raise InputError(
+            where, f"and {name} are not the speed of one rotor: their ratio changes by {scatter:.0%}; leave one out"
+        )
+    problem = f"turns {abs(ratio):.4g} times as fast as {name} at all times"
+    raise InputError(where, f"{problem}: correct per_turn, or leave out the channel of the shaft without the exciter")
+
+
+def _fitting_unit(channel: Channel, factor: float, error: float) -> str | None:
+    """Return the unit by which readings would be `factor` times as large; None if there is no such unit."""
+    for unit in _OTHER_UNITS[channel.kind]:
+        found = (unit_factor(unit, UNITS[channel.kind]) or 1.0) / channel.factor
+        if found != 1.0 and abs(found / factor - 1.0) <= error:
+            return unit
+    return None
+
+
+def _drift(one: _Signal, other: _Signal, sign: float, source: str) -> list[str]:
+    """Return a note if the clock of one speed drifts against that of the other: while the speed changes at the rate a, a
+    delay of d + e t changes the reading by -a (d + e t)."""
+    inside = (one.time > other.time[0]) & (one.time < other.time[-1])
+    time, reference = one.time[inside], one.value[inside]
+    if time.size < 32:
+        return []
+    rate = np.gradient(reference, time)
+    late = time - time[0]
+    columns = np.stack([reference, -rate, -rate * late], axis=1)
+    difference = sign * np.interp(time, other.time, other.value)
+    scale = np.linalg.norm(columns, axis=0)
+    if np.min(scale) < 1e-9 * np.max(np.abs(reference)) or np.linalg.cond(columns / scale) > 1e3:
+        return []
+    found, *_ = np.linalg.lstsq(columns / scale, difference, rcond=None)
+    left = difference - columns / scale @ found
+    spread = (
+        np.sqrt(np.sum(left**2) / (time.size - 3) * np.diag(np.linalg.inv((columns / scale).T @ (columns / scale)))) / scale
+    )
+    drift, error = found[2] / scale[2], max(float(spread[2]), 1e-7)
+    moved = abs(drift) * late[-1]
+    if abs(drift) < _DRIFT * error or moved * float(np.max(np.abs(reference))) < 0.1:
+        return []
+    pair = f"{quoted(one.channel.name)} and {quoted(other.channel.name)}"
+    return [
+        f"{source}: the clocks of {pair} drift by {1e3 * moved:.3g} ms over the record ({1e6 * abs(drift):.3g} ppm); "
+        "record both by one device, or leave one out"
+    ]
+
+
+def _check_motions(motions: Sequence[_Signal], source: str) -> None:
+    """Compare motions of the same point in the same direction."""
+    pairs = [pair for pair in itertools.combinations(motions, 2) if _same_place(pair[0].channel, pair[1].channel)]
+    factors = {(one.channel.name, other.channel.name): _factor(one, other) for one, other in pairs}
+    wrong = [pair for pair in pairs if not _agrees(factors[pair[0].channel.name, pair[1].channel.name])]
+    for (a, b), (c, d) in itertools.combinations(wrong, 2):
+        for first, second, third, fourth in ((a, b, c, d), (a, b, d, c)):
+            alike = second.channel.kind == fourth.channel.kind
+            if alike and _agrees(_factor(first, fourth), known=True) and _agrees(_factor(third, second), known=True):
+                names = f"{quoted(second.channel.name)} and {quoted(fourth.channel.name)}"
+                raise InputError(
+                    f"{source}: channels {names}", "are swapped: each fits the other's place; exchange their places"
+                )
+    for one, other in wrong:
+        factor = factors[one.channel.name, other.channel.name]
+        assert factor is not None
+        where, name = f"{source}: channel {quoted(other.channel.name)}", quoted(one.channel.name)
+        if factor.real < 0.0 and abs(factor.imag) < 0.5 * abs(factor.real) and abs(abs(factor) - 1.0) <= _MOTION_ERROR:
+            raise InputError(where, f"has the reversed sign of {name} at the same place; reverse the direction of one of them")
+        units = [
+            f"{quoted(unit)} for {quoted(each.channel.name)}"
+            for each, need in ((other, 1.0 / abs(factor)), (one, abs(factor)))
+            if (unit := _fitting_unit(each.channel, need, _UNIT_ERROR))
+        ]
+        problem = f"is {abs(factor):.3g} times what follows from {name} at the same place"
+        fix = f"the unit {' or '.join(units)} would fit" if units else "correct the unit, the place or the gain of one of them"
+        raise InputError(where, f"{problem}; {fix}")
+
+
+def _same_place(one: Channel, other: Channel) -> bool:
+    across = one.direction[0] * other.direction[1] - one.direction[1] * other.direction[0]
+    return one.at == other.at and abs(across) < 1e-6
+
+
+def _agrees(factor: complex | None, known: bool = False) -> bool:
+    return not known if factor is None else abs(factor - 1.0) <= _MOTION_ERROR
+
+
+def _factor(one: _Signal, other: _Signal) -> complex | None:
+    """Return Y / ((i w)^d X) of two motions X, Y, positive if their directions agree; None without coherent frequencies."""
+    step = max(float(np.median(np.diff(each.time))) for each in (one, other))
+    start, end = max(one.time[0], other.time[0]), min(one.time[-1], other.time[-1])
+    count = int((end - start) / step)
+    length = 2 * (count // (_SEGMENTS + 1))
+    if length < 32:
+        return None
+    grid = start + step * np.arange(count)
+    sign = np.sign(
+        one.channel.direction[0] * other.channel.direction[0] + one.channel.direction[1] * other.channel.direction[1]
+    )
+    spectra = []
+    for signal in (one, other):
+        pieces = np.lib.stride_tricks.sliding_window_view(np.interp(grid, signal.time, signal.value), length)[:: length // 2]
+        pieces = pieces - np.mean(pieces, axis=1, keepdims=True)
+        spectra.append(np.fft.rfft(pieces * np.hanning(length), axis=1))
+    x, y = spectra
+    xx, yy, xy = np.mean(np.abs(x) ** 2, axis=0), np.mean(np.abs(y) ** 2, axis=0), np.mean(np.conj(x) * y, axis=0)
+    w = 2.0 * np.pi * np.fft.rfftfreq(length, step)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        coherence = np.abs(xy) ** 2 / (xx * yy)
+        strong = (coherence > _COHERENT) & (xx > _STRONG * np.max(xx[2:])) & (yy > _STRONG * np.max(yy[2:]))
+        strong &= (np.arange(w.size) >= 2) & (w < 0.8 * np.pi / step)
+        factors = xy / xx / (1j * w) ** (_ORDERS[other.channel.kind] - _ORDERS[one.channel.kind])
+    if np.count_nonzero(strong) < 2:
+        return None
+    return complex(np.median(factors[strong].real), np.median(factors[strong].imag)) * float(sign)
+
+
+def _aliasing(motion: _Signal, speeds: Sequence[_Signal], source: str) -> list[str]:
+    """Return a note if most of the power is close to half the sampling rate.
+
+    **Raises** `InputError` for a rotor that turns faster than half the sampling rate.
+    """
+    rate = 1.0 / float(np.median(np.diff(motion.time)))
+    where = f"{source}: channel {quoted(motion.channel.name)}"
+    fastest = max((float(np.quantile(np.abs(each.value), 0.99)) for each in speeds), default=0.0) / (2.0 * np.pi)
+    if fastest > 0.5 * rate:
+        problem = f"is sampled at {rate:.4g} Hz, less than twice the largest speed of the rotor, {fastest:.4g} Hz"
+        raise InputError(where, f"{problem}: its vibration is aliased; record at more than {2.56 * fastest:.3g} Hz")
+    power = np.abs(np.fft.rfft((motion.value - np.mean(motion.value)) * np.hanning(motion.value.size))) ** 2
+    share = float(np.sum(power[int(0.8 * power.size) :]) / max(float(np.sum(power)), 1e-300))
+    if share > 0.5:
+        problem = f"has {share:.0%} of its power between 0.4 and 0.5 times its sampling rate of {rate:.4g} Hz"
+        return [f"{where} {problem}: it is probably aliased; record faster, or with an anti-aliasing filter"]
+    return []
+
+
+def _filled(value: np.ndarray) -> np.ndarray:
+    """Return readings with missing ones interpolated."""
+    known = np.isfinite(value)
+    return value if np.all(known) else np.interp(np.arange(value.size), np.flatnonzero(known), value[known])

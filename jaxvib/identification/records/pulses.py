@@ -1,0 +1,120 @@
+"""Pulses of a tachometer: times of edges, missed and doubled pulses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxvib.errors import InputError
+
+MIN_PULSES = 12
+"""Smallest number of pulses of a run."""
+
+_LOW, _HIGH = 0.35, 0.65
+"""Levels relative to the range of the signal; a pulse begins above the high one after the signal was below the low one."""
+
+_MISSED, _DOUBLED = 1.6, 0.62
+"""Intervals, relative to their neighbours, above which pulses were missed and below which one of two is false."""
+
+_NEIGHBOURS = 5
+"""Number of intervals on each side with which an interval is compared."""
+
+_MAX_FAULTS = 0.1
+"""Largest share of missed and false pulses."""
+
+
+def rising_edges(time: np.ndarray, level: np.ndarray, where: str) -> np.ndarray:
+    """Return the times at which a sampled signal rises through the middle of its range, interpolated between the samples.
+
+    A pulse counts once, even if noise crosses the middle several times.
+
+    >>> t = np.arange(0.0, 1.0, 1e-3)
+    >>> rising_edges(t, np.sin(40.0 * np.pi * t - 1.0), "run: channel 'tacho'")[:2].round(5).tolist()
+    [0.00796, 0.05796]
+    """
+    known = np.isfinite(level)
+    time, level = time[known], level[known]
+    low, high = (float(x) for x in np.quantile(level, [0.01, 0.99])) if level.size else (0.0, 0.0)
+    if level.size and high - low < 0.5 * np.ptp(level):  # pulses shorter than a hundredth of their period
+        low, high = float(np.min(level)), float(np.max(level))
+    if high <= low:
+        raise InputError(where, "is constant; give a channel with the pulses of the tachometer")
+    level = (level - low) / (high - low)
+    state = np.where(level > _HIGH, 1, np.where(level < _LOW, 0, -1))
+    last = np.maximum.accumulate(np.where(state >= 0, np.arange(state.size), -1))
+    state = np.where(last >= 0, state[np.maximum(last, 0)], -1)
+    starts = np.flatnonzero((state[1:] == 1) & (state[:-1] == 0)) + 1
+    rises = np.flatnonzero((level[1:] >= 0.5) & (level[:-1] < 0.5)) + 1
+    after = rises[np.searchsorted(rises, starts, side="right") - 1]
+    share = (0.5 - level[after - 1]) / (level[after] - level[after - 1])
+    return time[after - 1] + share * (time[after] - time[after - 1])
+
+
+def numbered_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the times of pulses without false ones, their numbers, and notes about repairs.
+
+    The interval between two pulses is compared with the geometric mean of the medians of five intervals before it and five
+    after it, which is also right while a rotor starts from rest. A missed pulse leaves a number out.
+
+    **Raises** `InputError` for too few pulses, times that do not ascend, and too many missed and false pulses.
+
+    >>> t = np.delete(np.arange(40) / 10.0, 17)
+    >>> _, number, notes = numbered_pulses(t, "run: channel 'tacho'")
+    >>> number[15:19].tolist(), notes
+    ([15.0, 16.0, 18.0, 19.0], ["run: channel 'tacho' missed 1 pulse, at 1.6 s, which is counted"])
+    """
+    if time.size < MIN_PULSES:
+        raise InputError(where, f"has {time.size} pulses; at least {MIN_PULSES} are needed, record more turns")
+    wrong = np.flatnonzero(~(np.diff(time) > 0.0))
+    if wrong.size:
+        k = int(wrong[0])
+        raise InputError(where, f"has a pulse at {time[k + 1]:g} s after one at {time[k]:g} s; times must ascend")
+    count, notes = time.size, []
+    false: list[float] = []
+    while (doubtful := _false_pulses(time)).size and len(false) <= _MAX_FAULTS * count:
+        false += time[doubtful].tolist()
+        time = np.delete(time, doubtful)
+    ratio = np.diff(time) / _usual(np.diff(time))
+    steps = np.where(ratio > _MISSED, np.maximum(np.rint(ratio), 1.0), 1.0)
+    steps[[0, -1]] = 1.0  # neighbours on one side only
+    missed = int(np.sum(steps - 1.0))
+    if len(false) + missed > _MAX_FAULTS * count:
+        found = f"misses {missed} and doubles {len(false)} of {count} pulses"
+        raise InputError(where, f"{found}; check the trigger level, the marks and the direction of the edge")
+    if false:
+        notes.append(f"{where} had {len(false)} false {_pulses(len(false))}, the first at {min(false):.4g} s; left out")
+    if missed:
+        first = float(time[np.argmax(steps > 1.0)])
+        place = f"at {first:.4g} s" if missed == 1 else f"the first at {first:.4g} s"
+        verb = "which is counted" if missed == 1 else "which are counted"
+        notes.append(f"{where} missed {missed} {_pulses(missed)}, {place}, {verb}")
+    return time, np.concatenate([[0.0], np.cumsum(steps)]), notes
+
+
+def _usual(steps: np.ndarray) -> np.ndarray:
+    """Return the interval that the neighbours of each interval suggest."""
+    padded = np.concatenate([np.full(_NEIGHBOURS, np.nan), steps, np.full(_NEIGHBOURS, np.nan)])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1)
+    before, after = np.full(steps.size, np.nan), np.full(steps.size, np.nan)
+    before[1:] = np.nanmedian(windows[1:, :_NEIGHBOURS], axis=1)
+    after[:-1] = np.nanmedian(windows[:-1, _NEIGHBOURS + 1 :], axis=1)
+    before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
+    return np.sqrt(before * after)
+
+
+def _false_pulses(time: np.ndarray) -> np.ndarray:
+    """Return the indices of pulses between two others that are one usual interval apart, no two of them neighbours."""
+    if time.size < MIN_PULSES:
+        return np.array([], int)
+    steps, usual = np.diff(time), _usual(np.diff(time))
+    ratio = steps / usual
+    short, long = np.minimum(ratio[:-1], ratio[1:]), np.maximum(ratio[:-1], ratio[1:])
+    pairs = np.abs(np.log((time[2:] - time[:-2]) / np.sqrt(usual[1:] * usual[:-1])))
+    doubtful = (short < _DOUBLED) & (long < 1.25) & (pairs < np.log(1.4))
+    doubtful[[0, -1]] = False
+    error = np.concatenate([[np.inf], np.where(doubtful, pairs, np.inf), [np.inf]])
+    best = doubtful & (error[1:-1] <= error[:-2]) & (error[1:-1] < error[2:])
+    return np.flatnonzero(best) + 1
+
+
+def _pulses(count: int) -> str:
+    return "pulse" if count == 1 else "pulses"

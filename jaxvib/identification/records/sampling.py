@@ -1,0 +1,198 @@
+"""Even sampling of a channel: order of times, gaps, missing and clipped readings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxvib.errors import InputError
+
+MIN_SAMPLES = 16
+"""Smallest number of samples of a channel."""
+
+_MAX_MISSING = 0.1
+"""Largest share of readings that may be NaN or constant dropouts."""
+
+_MAX_GAPS = 0.5
+"""Largest share of the duration of a record that may be in gaps."""
+
+_JITTER = 0.01
+"""Deviation of times from an even grid, relative to the step, above which readings are interpolated."""
+
+_GAP = 1.5
+"""Interval between samples, relative to the step, above which readings are missing."""
+
+_DROPOUT, _LONGER = 20, 10
+"""Smallest number of equal readings of a dropout, and its length relative to all but the longest percent of such stretches."""
+
+_BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
+"""Widths of the last bin of the histogram relative to all values; number of readings in it, relative to the next four bins and
+absolute, above which they are clipped. The peak of any smooth signal has a ratio below 2."""
+
+
+def require_ascending(time: np.ndarray, where: str) -> None:
+    """Check times. **Raises** `InputError` for too few, and for times that are not finite or do not ascend."""
+    if time.size < MIN_SAMPLES:
+        raise InputError(where, f"has {time.size} samples; at least {MIN_SAMPLES} are needed, record more")
+    wrong = np.flatnonzero(~np.isfinite(time))
+    if wrong.size:
+        raise InputError(where, f"has the time {time[wrong[0]]} at sample {wrong[0] + 1}; times must be finite numbers")
+    wrong = np.flatnonzero(np.diff(time) <= 0.0)
+    if wrong.size:
+        k = int(wrong[0])
+        if time[k + 1] == time[k]:
+            problem = f"has the time {time[k]:g} s twice, at samples {k + 1} and {k + 2}"
+            raise InputError(where, f"{problem}; leave one of them out, or give rate if the file rounds its times")
+        problem = f"has the time {time[k + 1]:g} s after {time[k]:g} s at sample {k + 2}"
+        raise InputError(where, f"{problem}; times must ascend: sort the samples, or make two runs of them")
+
+
+def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return a channel on an even grid of times, with NaN for missing readings, and notes about repairs.
+
+    - NaN and constant dropouts are missing readings
+    - A channel that has a reading only at every n-th time has a lower rate
+    - Gaps are filled with missing readings
+    - Readings at uneven times are interpolated linearly
+
+    **Raises** `InputError` for times that do not ascend, and if too many readings are missing.
+
+    >>> t = np.delete(np.arange(0.0, 1.0, 0.01), [40, 41])
+    >>> time, value, notes = even_samples(t, t, "run: channel 'frame'")
+    >>> time.size, int(np.count_nonzero(np.isnan(value))), notes
+    (100, 2, ["run: channel 'frame' has 1 gap; the longest is 0.03 s at 0.39 s"])
+    """
+    require_ascending(time, where)
+    time, value, notes = _own_rate(time, np.where(np.isfinite(value), value, np.nan), where)
+    missing = np.isnan(value)
+    if np.any(missing):
+        count = int(np.count_nonzero(missing))
+        first = f"the first at {time[np.argmax(missing)]:g} s"
+        if count > _MAX_MISSING * value.size:
+            share = f"has {count} of {value.size} readings that are not numbers, {first}"
+            raise InputError(where, f"{share}; at most {_MAX_MISSING:.0%} may be missing, use another part of the record")
+        notes.append(f"{where} has {count} {_readings(count)} that {_are(count)} not {_numbers(count)}, {first}; left out")
+    dropped = dropouts(value)
+    if np.any(dropped):
+        count = int(np.count_nonzero(dropped))
+        first = f"the first at {time[np.argmax(dropped)]:g} s"
+        if count > _MAX_MISSING * value.size:
+            share = f"is constant in stretches for {count} of {value.size} readings, {first}"
+            raise InputError(where, f"{share}: the sensor or its cable failed; use another part of the record")
+        notes.append(f"{where} is constant in stretches of in all {count} readings (dropouts), {first}; left out")
+        value = np.where(dropped, np.nan, value)
+    time, value, more = _on_grid(time, value, where)
+    return time, value, notes + more
+
+
+def _own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the samples of a channel that has a reading only at every n-th time, without the other times."""
+    there = np.flatnonzero(~np.isnan(value))
+    if there.size < MIN_SAMPLES:
+        raise InputError(where, f"has {there.size} readings; at least {MIN_SAMPLES} are needed, record more")
+    stride = int(np.median(np.diff(there)))
+    if stride == 1 or np.mean(np.diff(there) % stride == 0) < 1.0:
+        return time, value, []
+    part = slice(there[0] % stride, None, stride)
+    rate = 1.0 / float(np.median(np.diff(time[part])))
+    return time[part], value[part], [f"{where} has a reading at every {stride}. time: its rate is {rate:.6g} Hz"]
+
+
+def _on_grid(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    step = float(np.mean(steps[steps < _GAP * step]))  # not rounded to the digits of the file
+    gaps, notes = steps > _GAP * step, []
+    if np.any(gaps):
+        lost = float(np.sum(steps[gaps]))
+        longest = int(np.argmax(steps))
+        count = int(np.count_nonzero(gaps))
+        found = "1 gap" if count == 1 else f"{count} gaps"
+        place = f"the longest is {steps[longest]:.3g} s at {time[longest]:g} s"
+        if lost > _MAX_GAPS * (time[-1] - time[0]):
+            raise InputError(
+                where, f"has {found} in {lost:.3g} of {time[-1] - time[0]:.3g} s; {place}: use a part without gaps"
+            )
+        notes.append(f"{where} has {found}; {place}")
+    index = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / step), 1.0))]).astype(int)
+    slope, start = np.polyfit(index - index[-1] / 2.0, time, 1)
+    grid = start + slope * (np.arange(index[-1] + 1) - index[-1] / 2.0)
+    error = np.max(np.abs(time - grid[index]))
+    if error <= max(_JITTER * slope, _resolution(time)):
+        even = np.full(grid.size, np.nan)
+        even[index] = value
+        return grid, even, notes
+    count = max(round((time[-1] - time[0]) / step), 1)
+    grid = time[0] + (time[-1] - time[0]) / count * np.arange(count + 1)
+    known = ~np.isnan(value)
+    even = np.interp(grid, time[known], value[known])
+    after = np.clip(np.searchsorted(time[known], grid), 1, np.count_nonzero(known) - 1)
+    even[np.diff(time[known])[after - 1] > _GAP * step] = np.nan
+    spread = f"{np.min(steps):.3g} to {np.max(steps[~gaps]):.3g} s"
+    notes.append(f"{where} has steps of {spread}; its readings were interpolated to even steps of {grid[1] - grid[0]:.4g} s")
+    return grid, even, notes
+
+
+def _resolution(time: np.ndarray) -> float:
+    """Return half a unit of the last decimal digit to which all times are rounded; 0 if they are not rounded."""
+    for digits in range(1, 9):
+        if np.all(
+            np.abs(time * 10.0**digits - np.rint(time * 10.0**digits)) < 1e-6 * np.maximum(np.abs(time) * 10.0**digits, 1.0)
+        ):
+            return 0.51 * 10.0**-digits
+    return 0.0
+
+
+def dropouts(value: np.ndarray) -> np.ndarray:
+    """Return True for readings in long stretches of exactly equal ones within the range of a signal that otherwise changes.
+
+    >>> x = np.sin(np.arange(400.0))
+    >>> x[100:140] = 0.0
+    >>> int(np.count_nonzero(dropouts(x)))
+    40
+    """
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(value) != 0.0) + 1])
+    lengths = np.diff(np.concatenate([starts, [value.size]]))
+    usual = max(float(np.quantile(lengths, 0.99)), 1.0)
+    with np.errstate(invalid="ignore"):
+        inside = (value[starts] > np.nanmin(value)) & (value[starts] < np.nanmax(value))
+    long = (lengths >= max(_DROPOUT, _LONGER * usual)) & inside
+    return np.repeat(long, lengths)
+
+
+def clipped_at(value: np.ndarray) -> tuple[float, float]:
+    """Return the levels (low, high) at which the histogram shows that readings are clipped; infinite if they are not.
+
+    >>> low, high = clipped_at(np.clip(np.sin(0.01 * np.arange(4000.0)), -2.0, 0.9))
+    >>> bool(np.isinf(low)), bool(0.85 < high <= 0.9)
+    (True, True)
+    """
+    known = value[~np.isnan(value)]
+    return -_clipped_above(-known), _clipped_above(known)
+
+
+def _clipped_above(value: np.ndarray) -> float:
+    top, size = float(np.max(value)), float(np.ptp(value))
+    below = value[value < top]
+    if size == 0.0 or below.size == 0:
+        return np.inf
+    level = np.inf
+    for share in _BINS:
+        width = max(share * size, 1.5 * (top - float(np.max(below))))  # a bin has at least one step of the converter
+        flat = value > top - width
+        last, before = np.count_nonzero(flat), np.count_nonzero((value > top - 5.0 * width) & ~flat)
+        three = np.count_nonzero(flat[2:] & flat[1:-1] & flat[:-2])
+        if last >= _MIN_CLIPPED and last > _SPIKE * before and three >= _MIN_CLIPPED // 2:
+            level = top - 2.0 * width  # noise on the clipped readings may exceed one bin
+    return level
+
+
+def _readings(count: int) -> str:
+    return "reading" if count == 1 else "readings"
+
+
+def _are(count: int) -> str:
+    return "is" if count == 1 else "are"
+
+
+def _numbers(count: int) -> str:
+    return "a number" if count == 1 else "numbers"
