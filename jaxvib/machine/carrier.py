@@ -80,9 +80,10 @@ class Carrier(eqx.Module):
 
 
 class Machine(Part):
-    """Machine in the designer's own numbers. A new kind of machine is a subclass with its matrices and its exciter's mount.
+    """Machine, described by the designer's own parameters. A new kind of machine is a subclass that defines its matrices and
+    the mount of an exciter.
 
-    `kind` is its name in scene files. `places` states how places on the machine are named, for effects and drawings:
+    `kind` is its name in scene files. `places` states how effects and drawings name a place on the machine:
 
     - "platform": by the number of the platform
     - "shaft": by the distance along a rotor's axis from its mass centre, m
@@ -125,7 +126,8 @@ class Machine(Part):
         """
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the rows (np, nd) of a point: it moves by rows q. Exciters, supports, stops and drawings use this method.
+        """Return the rows (np, nd) of a point; its displacement is rows q. Exciters, supports, stops and drawings use this
+        method.
 
         **Arguments**
 
@@ -159,7 +161,7 @@ class Machine(Part):
         return int(body)
 
     def shaft_supports(self) -> list[tuple[float, float, float]] | None:
-        """Return the supports along a rotor's axis, for a drawing; None if the matrices contain everything for a drawing.
+        """Return the supports along a rotor's axis, for a drawing; None if a drawing needs only the matrices.
 
         **Returns** a list with the distance from the mass centre (m), the stiffness (N/m) and the damping (N s/m) of each
         support.
@@ -167,22 +169,22 @@ class Machine(Part):
         return None
 
     def structure(self) -> Carrier:
-        """Return the names, directions and shapes of the carrier, without its numbers."""
+        """Return the names, directions and shapes of the carrier, without values."""
         return shapes_of(self)[0]
 
     def mounting(self, at: Place = None) -> Mount:
-        """Return the directions and shapes of the mount of an exciter at the place `at`, without its numbers."""
+        """Return the directions and shapes of the mount of an exciter at the place `at`, without values."""
         return shapes_of(self, at)[1]
 
 
 def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
-    """Return the names, directions and shapes of the carrier, and of the mount of an exciter at `at`, without numbers."""
+    """Return the names, directions and shapes of the carrier, and of the mount of an exciter at `at`, without values."""
     platform, position = (at, None) if isinstance(at, int) else (None, at)
     leaves, rest = jax.tree.flatten((machine, position))
-    return _structure(rest, tuple(map(_kind, leaves)), jnp.result_type(float), platform)
+    return _structure(rest, tuple(map(_shape_and_dtype, leaves)), jnp.result_type(float), platform)
 
 
-def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
+def _shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
     """Return the shape and the dtype of an array, or those of the array that JAX makes of a Python number."""
     known = leaf if isinstance(leaf, (jax.Array, np.ndarray)) else jnp.asarray(leaf)
     return known.shape, known.dtype

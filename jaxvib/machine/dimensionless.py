@@ -23,7 +23,7 @@ _KINDS = {1: "one_mass", 2: "two_mass", 3: "three_mass"}
 
 
 class Dimensionless(eqx.Module):
-    """Platform machine in the dimensionless numbers of the papers; the exciter is on platform 2, or on the only platform.
+    """Platform machine in the dimensionless parameters of the papers; the exciter is on platform 2, or on the only platform.
 
     With the exciter's total mass M2S = M2 + N m (loads included), time tau = w t, unbalance scale s~ and length y~ = s~/M2S:
 
@@ -34,7 +34,7 @@ class Dimensionless(eqx.Module):
     kappa = 1 + (moment of inertia about the mass centre)/(m R^2); phi_j are their angles, and s_y is the vertical component
     of their dimensionless unbalance s.
 
-    The two papers scale the unbalance differently, and eps and v_i with it:
+    The two papers scale the unbalance differently, and therefore also eps and v_i:
 
     - `form="antiphase"`: s~ = m R, so s_y = sum sin phi_j, coincident loads have s = N, and eps is m/(kappa M2S)
     - `form="criterion"`: s~ = N m R, so s_y = (1/N) sum sin phi_j, coincident loads have s = 1, and eps is N m/(kappa M2S)
@@ -149,7 +149,7 @@ class Dimensionless(eqx.Module):
         return jnp.concatenate([others[:where], jnp.full((1,), exciter, dtype=others.dtype), others[where:]])
 
     def scene(self) -> Scene:
-        """Return the `Scene` in SI numbers, at the chosen size."""
+        """Return the `Scene` in SI units, with the chosen size."""
         n = self.natural.shape[0]
         w, m_total, m = self.frequency_scale, self.mass_scale, self._load_mass
         mass = m_total / self._by_platform(self.rho, 1.0)
@@ -178,7 +178,7 @@ class Dimensionless(eqx.Module):
     def convert_results(
         self, *, omega: Array | None = None, amplitude: Array | complex | None = None, force: Array | None = None
     ) -> dict[str, Array]:
-        """Convert results in SI to the numbers of the paper.
+        """Convert results in SI to the dimensionless quantities of the paper.
 
         **Arguments**
 
@@ -186,7 +186,7 @@ class Dimensionless(eqx.Module):
         - `amplitude`, m, real or complex; its last axis has one entry for each platform
         - `force`, N, any shape
 
-        NaN in an array, for modes that do not exist, stays NaN.
+        NaN in an array (modes that do not exist) stays NaN.
 
         **Returns** a dict with the same keys: omega/w, amplitude_i/(rho_i y~), force/(M2S w^2 y~).
 

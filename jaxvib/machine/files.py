@@ -72,7 +72,7 @@ _ENTRIES: Mapping[str, Callable[..., Any]] = {"supports": support, "bodies": bod
 T = TypeVar("T")
 
 Tables: TypeAlias = dict[str, Any]
-"""Tables, arrays, texts and numbers of a file by name, before validation."""
+"""Content of a file by name, before validation: tables, arrays, texts and numbers."""
 
 
 def suggest_name(name: str, allowed: list[str]) -> str:
@@ -92,7 +92,7 @@ def read_toml(path: str | Path) -> Tables:
 
 
 def _tables(text: str, name: str) -> Tables:
-    """Return the tables of a TOML text. **Raises** `InputError` that begins with `name`."""
+    """Return the tables of a TOML text. **Raises** `InputError` whose message begins with `name`."""
     try:
         tables = tomllib.loads(text)
         _require_plain(tables, "")
@@ -168,7 +168,7 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
 
     **Arguments**
 
-    - `scene` with known numbers (not under a JAX transformation)
+    - `scene` whose parameters have known values (not under a JAX transformation)
     - `path` of the file, which is overwritten
 
     **Returns** the path. **Raises** `InputError` if the file cannot be written.
@@ -188,12 +188,12 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
 
 @validated
 def scene_from_toml(text: str) -> Scene:
-    """Return the scene of the text of a scene file.
+    """Return the scene that the text of a scene file describes.
 
     **Arguments**: `text` in TOML
 
     - the tables `[machine]`, `[loads]` and `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit
-    - the table `[effects]` names only the effects of the scene, as `gravity = true` or as a table of the effect's arguments
+    - the table `[effects]` names only the effects of the scene, each as `gravity = true` or as a table of its arguments
 
     **Returns** `Scene`.
 
@@ -223,7 +223,7 @@ def scene_from_toml(text: str) -> Scene:
 
 
 def scene_from_tables(tables: Tables) -> Scene:
-    """Return the scene of the tables of a scene file, see `scene_from_toml`."""
+    """Return the scene that the tables of a scene file describe, see `scene_from_toml`."""
     for name in tables:
         if name not in (*SECTIONS, "effects", "exciters"):
             raise misplaced_name(name, tables, "scene", [*SECTIONS, "effects", "exciters"])
@@ -287,7 +287,7 @@ def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -
 
 
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
-    """Return `build(**values)`. **Raises** `InputError` for unknown and missing names, which it names as `section.name`."""
+    """Return `build(**values)`. **Raises** `InputError` for an unknown or missing name, as `section.name`."""
     parameters = inspect.signature(build).parameters
     prefix = f"{section}." if section else ""
     for name in values:
@@ -314,7 +314,8 @@ def _built_entries(build: Callable[..., object], tables: object, section: str) -
 
 
 def rebuild_part(part: Any, section: str) -> Any:
-    """Build a part of a scene again from its numbers, which validates them. Return parts from outside the package unchanged."""
+    """Construct a part of a scene again from its parameters, which validates them. Parts of types from outside the package are
+    returned unchanged."""
     build = {**_MACHINES, **_LOADS, **DRIVES, **EFFECTS}.get(part.kind)
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
@@ -329,9 +330,9 @@ def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
 def scene_to_toml(scene: Scene) -> str:
     """Return the text of a scene file in SI numbers; `scene_from_toml` returns the same scene, bit for bit.
 
-    **Arguments**: `scene` with known numbers (not under a JAX transformation).
+    **Arguments**: `scene` whose parameters have known values (not under a JAX transformation).
 
-    **Returns** text. **Raises** `InputError` for a scene whose numbers are not known.
+    **Returns** text. **Raises** `InputError` for a scene with traced parameters.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),

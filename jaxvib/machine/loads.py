@@ -43,13 +43,13 @@ class DrillingSpin(NamedTuple):
     - `rate` s' (count,) rad/s^2 of a free spin
     - `force`: generalised forces per s, a (count,) array for each coordinate
     - `inertia`, kg m^2; the energy of the spin is inertia s^2/2
-    - `still`: the s (count,) rad/s of a load that does not rotate in space
+    - `without_rotation` (count,) rad/s: the value of s for a load that does not rotate in space
     """
 
     rate: Array
     force: tuple[Array, ...]
     inertia: Array
-    still: Array
+    without_rotation: Array
 
 
 class Loads(Part):
@@ -108,7 +108,8 @@ class Loads(Part):
 
     @abc.abstractmethod
     def position(self, *u: Array) -> tuple[Array, ...]:
-        """Return the load's position p(u), m: (across, up) in the rotor's plane, and along its axis if it moves there.
+        """Return the load's position p(u), m: (across, up) in the rotor's plane, and along the axis if the load moves in this
+        direction.
 
         **Arguments**: the coordinates `u`, (count,) each.
         """
@@ -141,7 +142,8 @@ class Loads(Part):
         """
 
     def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...] | None:
-        """Return the gyroscopic generalised force of a rolling load's rotation, N m, which does no work; None without one.
+        """Return the generalised force, N m, of the gyroscopic moment of a rolling load; it does no work. None if there is no
+        such moment.
 
         **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `speed` of the rotor, rad/s.
         """
@@ -165,7 +167,8 @@ class Loads(Part):
         return None
 
     def offsets(self) -> Array:
-        """Return the angles of loads at rest that lie side by side, relative to their middle, (count,) rad; 0 at one point."""
+        """Return the angles of loads at rest that lie side by side, relative to their middle, (count,) rad; 0 if all are at
+        one point."""
         return jnp.zeros((self.count,), dtype=jnp.result_type(self.mass))
 
     def natural_frequency(self, speed: Array) -> Array | None:
@@ -181,14 +184,16 @@ def ball_radius(loads: Loads, field: str = "loads.ball_radius") -> Array:
     own = getattr(loads, "ball_radius", None)
     if own is None:
         advice = "give balls or rollers their ball_radius"
-        raise InputError(field, f"needs loads that roll, with a ball_radius; {quoted(loads.kind)} have none here: {advice}")
+        raise InputError(
+            field, f"needs loads that roll and have a ball_radius, and these ({quoted(loads.kind)}) have none; {advice}"
+        )
     return own
 
 
 class CircularLoads(Loads):
     """Loads on a circle of radius R about the rotor's axis: p(phi) = R (cos phi, sin phi).
 
-        kappa m R^2 phi'' = - b_W R^2 (phi' - speed) - m p'(phi) . (port's acceleration)
+        kappa m R^2 phi'' = - b_W R^2 (phi' - speed) - m p'(phi) . (acceleration of the mount)
 
     kappa is 7/5 for a ball and 3/2 for a roller that roll on the track, 1 + J_C/(m R^2) for a pendulum.
 
@@ -200,8 +205,8 @@ class CircularLoads(Loads):
     - `inertia` J_C about the mass centre, kg m^2 (pendulums; None for the others)
     - `count` N of loads
     - `kind`: "ball", "roller" or "pendulum"
-    - `ball_radius` r of a ball or roller, m (scalar); None for loads that can all be at one point. With it, gathered loads lie
-      side by side on an arc, 2 arcsin(r/R) apart
+    - `ball_radius` r of a ball or roller, m (scalar); None for loads that can all be at one point. If it is set, gathered
+      loads lie side by side on an arc, 2 arcsin(r/R) apart
 
     Source: the antiphase paper, equations (1), (2), (6).
     """
@@ -257,7 +262,8 @@ class CircularLoads(Loads):
         return NormalForce(m * (self.radius * turn**2 - g.get(1, 0.0) * normal[1]), (-m * normal[0], -m * normal[1]))
 
     def offsets(self) -> Array:
-        """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of loads side by side relative to their middle."""
+        """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of loads j = 0 .. N - 1 side by side, relative to their
+        middle."""
         if self.ball_radius is None:
             return jnp.zeros((self.count,), dtype=jnp.result_type(self.radius))
         return side_by_side(self.count, self.ball_radius / self.radius)
@@ -291,11 +297,11 @@ def _circular(
         ball_radius=None if ball_radius is None else read(ball_radius=ball_radius)["ball_radius"],
     )
     if loads.ball_radius is not None:
-        _fit(loads, loads.ball_radius)
+        _require_room(loads, loads.ball_radius)
     return loads
 
 
-def _fit(loads: CircularLoads, r: Array) -> None:
+def _require_room(loads: CircularLoads, r: Array) -> None:
     """**Raises** `InputError` if the loads, of radius `r`, have no room side by side."""
     if not loads.alike:
         raise InputError("loads.ball_radius", "needs equal loads; give one mass, radius and drag for all")
@@ -303,7 +309,7 @@ def _fit(loads: CircularLoads, r: Array) -> None:
 
 
 def side_by_side(count: int, ratio: Array) -> Array:
-    """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of loads that touch, relative to their middle.
+    """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of touching loads j = 0 .. N - 1, relative to their middle.
 
     `ratio` is r/R.
     """
@@ -337,7 +343,8 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 
     - In jams and in the criterion gathered balls lie side by side, with the unbalance m R sin(N arcsin(r/R)) / (r/R) instead of
       N m R
-    - In time integration only the effect `LoadContact` uses it. Without that effect loads pass through each other
+    - In time integration only the effect `LoadContact` uses the `ball_radius`. Without this effect loads pass through each
+      other
 
     **Returns** `CircularLoads`.
 

@@ -1,4 +1,4 @@
-"""Mount of an exciter: the motion of its points with the coordinates of the machine."""
+"""Mount of an exciter: the displacements of its points as functions of the coordinates of the machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from jaxvib.units import Number, count, number, numbers
 
 
 class BodyPoint(eqx.Module):
-    """Point (x, y) of one of several bodies, m from its centre of mass (None: that centre); `body` is its number from 0."""
+    """Point (x, y) of one of several bodies, m from its centre of mass (None: the centre itself); `body` is the number of the
+    body, from 0."""
 
     at: Array | None
     body: int = eqx.field(static=True)
@@ -58,9 +59,9 @@ class Mount(eqx.Module):
 
     - `rows`: arrays (np, nd). The first is a point of the rotor's axis. The second is the tilt of the axis, in 1/m times the
       unit of a displacement. Machines that do not tilt have the first only
-    - `axes` (np,): the direction of a load's plane (0 across, 1 up) of each row
-    - `levers`: a lever (count,) for each entry of `rows`; None is 1, an absent entry is 0. It is (None,) if all loads run at
-      the first point, and (None, distances from it in m) if each load has its own station
+    - `axes` (np,): the direction of each row in the plane of the loads (0 across, 1 up)
+    - `levers`: a lever (count,) for each entry of `rows`; None stands for 1, an absent entry for 0. `levers` is (None,) if all
+      loads run at the first point, and (None, distances from this point in m) if each load has its own station
     - `rotor_levers`: the same for the rotor's mass centre, scalars
     - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one.
       typical: 0.01 to 0.5 kg m^2, the polar inertia of the rotor
@@ -84,7 +85,7 @@ class Mount(eqx.Module):
 
     @property
     def tilt(self) -> Array | None:
-        """Rows (np, nd) by which the axis tilts; None if the axis cannot tilt."""
+        """Rows (np, nd) of the tilt of the axis; None if the axis cannot tilt."""
         return self.rows[1] if len(self.rows) > 1 else None
 
     @property
@@ -104,10 +105,9 @@ class Mount(eqx.Module):
         return jax.vmap(lambda levers: _combine(levers, self.rows))(self.levers)
 
     def load_rates(self, rate: Array) -> dict[int, Array]:
-        """Return the velocities (or accelerations) of the loads' points by axis, from the rates `rate` (nd,) of the
-        coordinates.
+        """Return the velocities (or accelerations) of the loads' points by axis, from those of the coordinates, `rate` (nd,).
 
-        Each is a number if all loads run at one point, otherwise (count,). Rates in m/s give velocities in m/s.
+        Each is a scalar if all loads run at one point, otherwise (count,). The unit is that of `rate`: m/s for velocities.
         """
         if self.at_one_point:
             return dict(zip(self.axes, self.rows[0] @ rate, strict=True))
@@ -122,7 +122,7 @@ class Mount(eqx.Module):
     def distances(self, count: int) -> Array:
         """Return the distance of each of `count` loads from the rotor's mass centre along the axis, (count,) m.
 
-        It is 0 on a machine that does not tilt.
+        The distances are 0 on a machine that does not tilt.
         """
         zero = jnp.zeros((), self.rows[0].dtype)
         load, rotor = (levers[1] if len(levers) > 1 else zero for levers in (self.levers, self.rotor_levers))

@@ -27,14 +27,14 @@ _MIN_RATIO = 1e-15
 
 
 class Exciter(Part):
-    """Exciter of a machine: a rotor with its drive, its loads, its unbalance, or both.
+    """Exciter of a machine: a rotor with its drive, and with loads, an unbalance, or both.
 
     **Arguments**
 
     - `loads` from `balls`, `rollers`, `pendulums`; None without loads
     - `drive`, a `Motor` or an `IdealDrive`; the inertia of a motor includes the unbalance
     - `unbalance` S, kg m: static moment m r about the exciter's axis of a mass that turns with the rotor, greater than 0;
-      typical: 0.1 to 10 kg m. The function `unbalance` returns it from the force that catalogues state
+      typical: 0.1 to 10 kg m. The function `unbalance` computes it from the force that catalogues state
     - `unbalance_mass` m, kg: mass of the unbalance, added to the machine at the exciter's axis; typical: 5 to 200; default: the
       machine's mass includes it
     - `at`: place on the machine, a platform number, the distance along a rotor's axis from its mass centre, m (a float or
@@ -43,7 +43,7 @@ class Exciter(Part):
     - `direction` of rotation: +1 anticlockwise, -1 clockwise. Angles and speeds of a state are anticlockwise in both cases
     - `effects` of the rotor and its loads such as `StaticImbalance` or `DryFriction`
 
-    **Attributes**: the arguments, `at` as `platform` or `position`; `carries`: names of what turns, "loads" and "unbalance".
+    **Attributes**: the arguments; `at` is stored as `platform` or `position`; `carries`: "loads", "unbalance", or both.
 
     **Raises** `InputError` for
 
@@ -171,24 +171,24 @@ def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:
 class Scene(Part):
     """Complete description of a machine in motion; a frozen pytree of SI numbers.
 
-    `jax.grad`, `jax.vmap` and `jax.jit` apply to every number in it; `equinox.tree_at` replaces one.
+    `jax.grad`, `jax.vmap` and `jax.jit` apply to every parameter; `equinox.tree_at` replaces a parameter.
 
     **Arguments**
 
     - `machine` from `one_mass`, `two_mass`, `three_mass`, `network`, `planar_rotor` or `rotor`
     - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; typical: 0.1 % to 5 % of the machine's mass
     - `drive` such as `ConstantSpeed`; typical: 600 to 3000 rpm
-    - `effects` such as `Gravity`, each once; `CubicSupport` and `Stop` once for each such support. typical: none
+    - `effects` such as `Gravity`, each at most once, except `CubicSupport` and `Stop`: one for each such support; typical: none
     - `exciters`: instead of `loads` and `drive`, a list of `Exciter`
 
-    **Attributes**: `machine`; `exciters`; `effects` that act on the whole machine. Those of a rotor and its loads are in
-    `Exciter.effects`; `all_effects` are both. `loads` and `drive` are those of a scene with one exciter.
+    **Attributes**: `machine`; `exciters`; `effects` that act on the whole machine. Effects on a rotor and its loads are in
+    `Exciter.effects`; `all_effects` contains both. A scene with one exciter also has `loads` and `drive`.
 
     **Raises** `InputError` for
 
     - a part of the wrong type
-    - an effect that occurs twice and may occur once
-    - a number of stations other than that of the loads
+    - an effect that occurs twice but is allowed only once
+    - a number of stations that differs from the number of loads
     - an exciter at a place that the machine does not have
     - an effect that cannot act on this machine or these loads
 
@@ -248,7 +248,7 @@ class Scene(Part):
 
     @property
     def exciter(self) -> Exciter:
-        """Exciter of a scene that has one. **Raises** `InputError` if it has several."""
+        """Only exciter of the scene. **Raises** `InputError` if the scene has several."""
         if len(self.exciters) != 1:
             problem = f"has {len(self.exciters)} exciters; this function needs a scene with one"
             instead = "for several use synchronous_regimes or simulate"
@@ -264,7 +264,7 @@ class Scene(Part):
     def loads(self) -> Loads:
         """Loads of a scene with one exciter that turns anticlockwise and has no `unbalance`.
 
-        **Raises** `InputError` for other scenes, which the analyses that read this property do not include.
+        **Raises** `InputError` for other scenes, because analyses that read this property do not include them.
         """
         exciter = _require_anticlockwise(self.exciter)
         if exciter.loads is None or not exciter.is_plain:
@@ -283,7 +283,7 @@ class Scene(Part):
 
     @property
     def mounting(self) -> Mount:
-        """Directions and shapes of the only exciter's mount, without its numbers."""
+        """Directions and shapes of the only exciter's mount, without values."""
         # A property, since each analysis reads it and a method of an Equinox module costs 30 us a call.
         return shapes_of(self.machine, self.exciter.place)[1]
 
@@ -302,7 +302,7 @@ class Scene(Part):
         return Scene(**known, exciters=[exciter])
 
     def place_of(self, k: int) -> str:
-        """Return the place of exciter `k` before the names of its parts: "exciters[1]." or, for the only one, ""."""
+        """Return the prefix of the names of the parts of exciter `k`: "exciters[1].", or "" if there is one exciter."""
         return f"exciters[{k}]." if len(self.exciters) > 1 else ""
 
 

@@ -31,11 +31,12 @@ class TorusBalls(Loads):
 
         kappa m (B f'' + 2 rho cos a a' f') = (2/5) m w rho cos a a' + F_f
         kappa m (rho a'' - B f'^2 cos a)    = - (2/5) m w B cos a f' + F_a
-        N = m (B f'^2 sin a + rho a'^2 - n . (port's acceleration + gravity upward))
+        N = m (B f'^2 sin a + rho a'^2 - n . (acceleration of the mount + gravity upward))
 
     - w is the rotor speed. A ball rolls without slip and without drilling spin
-    - Its rotation adds the inertia kappa - 1 and the terms with w, which do no work. With them the rotation contributes
-      B f' (f' - w) instead of B f'^2; the centrifugal force on a ball that turns with the tube is then that of its mass alone
+    - Its rotation adds the inertia kappa - 1 and the terms with w, which do no work. Because of these terms the rotation
+      contributes B f' (f' - w) instead of B f'^2; the centrifugal force on a ball that turns with the tube is then that of its
+      mass alone
     - The acceleration of the wall when w changes is neglected, as in the gyroscopic matrix of a rotor
     - A ball on the equator moves like a ball in a plane track of radius R + rho
 
@@ -102,7 +103,8 @@ class TorusBalls(Loads):
     ) -> DrillingSpin:
         """Return s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r and the forces (2/5) m r s (B a', - rho sin a f').
 
-        A ball that does not rotate in space has s = w cos a.
+        c_f and c_a are the slips along the coordinates, 0 for a rolling ball. A ball that does not rotate in space has s = w
+        cos a.
         """
         (_, a), (turn, climb), m, own = u, rate, self.mass, self.ball_radius
         arm, up = self._arm(a), jnp.sin(a)
@@ -127,10 +129,10 @@ class TorusBalls(Loads):
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
 
 
-def in_torus(loads: Loads, asking: str) -> TorusBalls:
-    """Return the loads if they are balls in a torus. **Raises** `InputError` for others, which names the function `asking`."""
+def in_torus(loads: Loads, caller: str) -> TorusBalls:
+    """Return the loads if they are balls in a torus. **Raises** `InputError` for others, which names the `caller`."""
     if not isinstance(loads, TorusBalls):
-        advice = f"{asking} needs balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
+        advice = f"{caller} needs balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
         raise InputError("loads.kind", f"is {quoted(loads.kind)}; {advice}")
     return loads
 

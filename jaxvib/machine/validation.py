@@ -1,4 +1,5 @@
-"""Validation of scenes. Public functions call it because `equinox.tree_at` replaces parameters of a scene without a check."""
+"""Validation of scenes. Public functions validate each scene because `equinox.tree_at` replaces parameters of a scene without
+a check."""
 
 from __future__ import annotations
 
@@ -22,15 +23,16 @@ from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
 
 _VALID_SCENES: weakref.WeakValueDictionary[tuple[int, np.dtype], Scene] = weakref.WeakValueDictionary()
-"""Validated scenes by their `id` and the precision of their numbers. Scenes are immutable and therefore stay valid."""
+"""Validated scenes by their `id` and the precision of their arrays. Scenes are immutable and therefore stay valid."""
 
 
 def validate_scene(scene: Scene) -> Scene:
-    """Return the scene with arrays for all its numbers. If no number is traced, check that the constructors allow them.
+    """Return the scene with arrays for all its parameters. If none of them is traced, check that the constructors allow the
+    values.
 
-    The arrays have the precision in which JAX computes, whatever the setting was when the scene was made.
+    The arrays have the present precision of JAX, even if the scene was created with another setting.
 
-    **Raises** `InputError` for an object that is not a scene, and for a number that is not allowed.
+    **Raises** `InputError` for an object that is not a scene, and for a value that is not allowed.
 
     >>> import equinox as eqx, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -66,7 +68,7 @@ def validate_scene(scene: Scene) -> Scene:
 def allowed_unknowns(scene: Scene) -> Array | None:
     """Return a traced Boolean, True if the constructors allow the traced parameters of a scene.
 
-    None if all numbers have values; they are then already validated.
+    None if no parameter is traced; the values are then already validated.
 
     >>> import equinox as eqx, jax, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -87,7 +89,7 @@ def allowed_unknowns(scene: Scene) -> Array | None:
 def _allowed_value(scene: Scene) -> Array | None:
     """Return None if the constructors allow the parameters of a scene, otherwise False.
 
-    All numbers have values here, as under `grad` without `jit`.
+    All parameters have values here, as under `grad` without `jit`.
     """
     try:
         validate_scene(scene)
@@ -100,7 +102,7 @@ _CARRIED = ("loads", "unbalance")
 
 
 def _rebuild(scene: Scene) -> None:
-    """Build each part of a scene again. **Raises** `InputError` for a number that has a value and is not allowed."""
+    """Construct each part of a scene again. **Raises** `InputError` for a known value that is not allowed."""
     rebuild_part(scene.machine, "machine")
     for k, exciter in enumerate(scene.exciters):
         with within(scene.place_of(k)):
@@ -108,7 +110,7 @@ def _rebuild(scene: Scene) -> None:
                 rebuild_part(exciter.loads, "loads")
             rebuild_part(exciter.drive, "drive")
             if (exciter.loads is not None, exciter.unbalance is not None) != tuple(x in exciter.carries for x in _CARRIED):
-                raise InputError("carries", f"is {exciter.carries}, which is not that of the exciter; create a new Exciter")
+                raise InputError("carries", f"is {exciter.carries}, but the exciter has other parts; create a new Exciter")
             read_unbalance(exciter.drive, exciter.unbalance, exciter.unbalance_mass)
             for effect in exciter.effects:
                 rebuild_part(effect, f"effects.{effect.kind}")
@@ -118,7 +120,7 @@ def _rebuild(scene: Scene) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _SceneKey:
-    """Scene identified by all its numbers, because a derivative creates the same scene several times."""
+    """Scene compared by the values of all its parameters, because a derivative creates equal scenes several times."""
 
     numbers: Hashable
     scene: Scene = dataclasses.field(compare=False)
@@ -126,7 +128,7 @@ class _SceneKey:
 
 @functools.lru_cache(256)
 def _require_valid(key: _SceneKey) -> None:
-    """**Raises** `InputError` for a number that is not allowed."""
+    """**Raises** `InputError` for a value that is not allowed."""
     scene = key.scene
     _rebuild(scene)
     for k, exciter in enumerate(scene.exciters):

@@ -200,7 +200,7 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
     if rotation == "none":
         u, rate, w = state.angle, state.rate, exciter.turning_drive.rotor_speed(jnp.zeros(()), state.rotor)
         spin, normal_force = loads.drilling_spin(u, rate, w), loads.normal_force(u, rate, {})
-        drilling = zero if spin is None else spin.still
+        drilling = zero if spin is None else spin.without_rotation
         if has_slip:
             assert normal_force is not None
             own = loads.ball_radius  # pyright: ignore[reportAttributeAccessIssue]

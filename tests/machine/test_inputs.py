@@ -174,7 +174,7 @@ WRONG_ROTORS = {
     ),
     "supports at one place": (
         lambda: jv.rotor(**{**ROTOR, "position": 0.165}),
-        r"machine\.position puts both supports at 0\.165 m, which does not hold the tilt of the rotor",
+        r"machine\.position puts both supports at 0\.165 m, which leaves the tilt of the rotor without stiffness",
     ),
     "leaning platforms": (lambda: rotor_scene(two(), None, (jv.MomentImbalance(1e-3),)), r"needs a rotor that can tilt"),
     "far platform": (

@@ -75,7 +75,8 @@ class Drive(Part):
         return ()
 
     def settled(self) -> Drive:
-        """Return the drive as it is when it no longer changes: an ideal drive at its working speed, a motor that is off."""
+        """Return the drive in its final state: an ideal drive at its working speed, a motor after the time at which it is
+        switched off."""
         return self
 
 
@@ -179,8 +180,8 @@ class Motor(Drive):
 
         J theta'' = T(theta') - torque of the loads on the rotor
 
-    J (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the rotor's imbalance, not the loads;
-    typical: 0.005 to 1 kg m^2.
+    J (`inertia`) is the moment of inertia of the whole rotor about its axis. It includes the unbalance of the rotor but not
+    the loads; typical: 0.005 to 1 kg m^2.
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
     >>> class Turbine(jv.Motor):
@@ -220,7 +221,7 @@ class Motor(Drive):
         return self.torque_at(t, speed), self.inertia
 
     def torque_at(self, t: Array, speed: Array) -> Array:
-        """Return the torque at time `t` (s) and the rotor's `speed`, N m: `torque`, unless the motor changes with time."""
+        """Return the torque at time `t` (s) and the rotor's `speed`, N m; default: `torque`, which does not depend on time."""
         return self.torque(speed)
 
     @abc.abstractmethod
@@ -404,7 +405,7 @@ class InductionMotor(Motor):
     - `speed`: synchronous speed, rad/s; typical: "750 rpm", "1000 rpm", "1500 rpm" or "3000 rpm" on a grid of 50 Hz
     - `breakdown_torque` T_b, the largest torque, N m; typical: 2 to 3 times the rated torque, 8 to 250 for 0.5 to 15 kW at 1500
       rpm
-    - `breakdown_slip` s_b, the slip at that torque, below 1; typical: 0.1 to 0.4, the larger the smaller the motor
+    - `breakdown_slip` s_b, the slip at that torque, below 1; typical: 0.1 (large motors) to 0.4 (small motors)
     - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit or a value that is not allowed.
@@ -447,12 +448,12 @@ class SwitchedOff(Motor):
 
         T = torque of the motor  (t < at),    T = -bearing theta'  (t >= at)
 
-    `simulate` ends a step at that time. Steady motions are those after it: `torque` is the friction.
+    `simulate` ends a step at that time. In analyses of steady motions the motor is off: `torque` is the friction.
 
     **Arguments** (SI, or strings with a unit)
 
-    - `motor` until then, such as an `InductionMotor`
-    - `at`: time at which it is switched off, s, at least 0 (the default: it is off throughout); typical: 0 to 60
+    - `motor` before that time, such as an `InductionMotor`
+    - `at`: time at which it is switched off, s, at least 0 (the default: off from the start); typical: 0 to 60
     - `bearing` b, N m s: viscous friction of bearings and belts, at least 0; typical: 0.001 to 0.1
 
     **Raises** `InputError` for a wrong unit, a negative value, and a motor of the wrong type.
@@ -498,5 +499,5 @@ class SwitchedOff(Motor):
         return (self.at,)
 
     def settled(self) -> Drive:
-        """Return the motor that is off throughout."""
+        """Return the motor, switched off from the start."""
         return eqx.tree_at(lambda drive: drive.at, self, jnp.zeros_like(self.at))

@@ -189,8 +189,8 @@ class StaticImbalance(Effect):
 
     **Arguments** (SI, or strings with a unit)
 
-    - `moment` M e, kg m, not negative; typical: 1e-4 to 0.05. Grade G6.3 of ISO 21940-11 allows M times 6.3 mm/s over the
-      speed: 5e-4 for 37 kg at 460 rad/s
+    - `moment` M e, kg m, not negative; typical: 1e-4 to 0.05. Grade G6.3 of ISO 21940-11 allows M times 6.3 mm/s divided by
+      the speed: 5e-4 for 37 kg at 460 rad/s
     - `angle` of the heavy side at the rotor's angle 0, rad; typical: 0 (the default)
 
     **Raises** `InputError` for a wrong unit or a negative moment.
@@ -271,7 +271,8 @@ class MomentImbalance(Effect):
 
 
 def _moved_inertia(machine: Machine) -> tuple[Array, Array | None]:
-    """Return the mass (kg) that a force on the exciter moves, and the inertia (kg m^2) that a moment moves, or None."""
+    """Return the mass (kg) that a force on the exciter moves, and the inertia (kg m^2) that a moment moves (None if the
+    machine cannot tilt)."""
     mass, mount = machine.carrier().mass, machine.mount()
 
     def moved(rows: Array) -> Array:

@@ -28,17 +28,17 @@ class LoadContact(Effect):
     r is the loads' `ball_radius`.
 
     - On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1 follows load j, and load 1
-      follows the last one a turn later, so there are N pairs. A start has its angles in this order, less than a turn apart;
+      follows the last one a turn later, so there are N pairs. The angles of a start must be in this order, within one turn;
       named starts place coincident loads side by side
-    - With several coordinates each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 of 2 r
+    - With several coordinates each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 times 2 r
 
-    Two loads on a track at rest separate with the share e of their approach speed, the restitution
+    Two loads that collide on a track at rest separate at e times the speed at which they approached. The restitution e is
 
         e = exp(-(pi - 2 beta) tan beta),    sin beta = zeta = c / (2 sqrt(k mu)),    mu = kappa m / (2 (1 - (r/R)^2)),
 
     if zeta <= 1, otherwise e = exp(-2 gamma coth gamma) with cosh gamma = zeta. They lose the share 1 - e^2 of the energy of
-    their relative motion, rolling included; friction between loads is neglected. A contact lasts about pi sqrt(mu/k), which
-    steps must resolve: equal steps need ten per contact, the default of `ensemble` and `capture`.
+    their relative motion, including that of rolling; friction between loads is neglected. A contact lasts about pi sqrt(mu/k),
+    which steps must resolve: equal steps need ten per contact, the default of `ensemble` and `capture`.
 
     **Arguments** (SI, or strings with a unit)
 

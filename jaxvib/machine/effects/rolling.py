@@ -30,8 +30,8 @@ class RollingFriction(Effect):
     - J = dp/du. v is the velocity of the load's centre along the wall relative to the rotor, which turns at w
     - N is the normal force (`Loads.normal_force`), solved together with the accelerations; r is the radius of the load. There
       is no friction on a load that does not press
-    - With the exact sign, a load sticks under the fraction s < 1 of the largest friction. With the smooth sign it creeps at the
-      speed width artanh(s), which tends to 0 with the width
+    - With the exact sign, a load does not move if the force on it is the fraction s < 1 of the largest friction. With the
+      smooth sign it creeps at the speed width artanh(s), which tends to 0 with the width
     - The sign of N is that of the motion without this friction
 
     **Arguments** (SI, or strings with a unit)

@@ -23,9 +23,9 @@ class FreeSpin(Effect):
 
     - The symbols f, a, B, R, rho, r, w and n (the normal, from the tube's middle to the ball) are those of `TorusBalls`; Omega
       is here the angular velocity of the ball, a vector
-    - s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.drilling`, default:
-      0 at the start); typical: up to the rotor speed, 140 rad/s
-    - The forces Q act on the ball's two coordinates in addition to those of `TorusBalls`, whose contact keeps s = 0
+    - s, the spin of a ball about the normal relative to the wall, is an additional velocity of each ball
+      (`State.spin.drilling`, default: 0 at the start); typical: up to the rotor speed, 140 rad/s
+    - The forces Q act on the ball's two coordinates in addition to those of `TorusBalls`, where the contact keeps s = 0
     - A point contact exerts no moment about its normal. The ball's angular velocity about the normal therefore changes only
       with the direction of the normal, s' = Omega . n' + (w cos a)'
     - While f' is constant, s grows by (w B - R f')/r per radian of a, the angle up the wall. On a ball that left the equator

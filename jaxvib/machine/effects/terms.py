@@ -195,7 +195,8 @@ class ContactFriction:
 @final
 @dataclass(frozen=True)
 class DrillingSpinRelease:
-    """Freedom of rolling loads to spin about the normal of their contact (`Loads.drilling_spin`, `Spin.drilling`)."""
+    """Additional degree of freedom: spin of rolling loads about the normal of their contact (`Loads.drilling_spin`,
+    `Spin.drilling`)."""
 
     is_smooth: ClassVar[bool] = True
 
@@ -203,7 +204,7 @@ class DrillingSpinRelease:
 @final
 @dataclass(frozen=True)
 class SlipRelease:
-    """Freedom of rolling loads to slide (`Spin.slip`).
+    """Additional degree of freedom: sliding of rolling loads (`Spin.slip`).
 
     The contact transmits a force along the track of at most `coefficient` times N. A slip below `width`, m/s, decays.
     """

@@ -54,7 +54,7 @@ class NumberSpec(NamedTuple):
 
 
 PLAIN = NumberSpec(("",), Bounds())
-"""Specification of a number whose field has no metadata: any number, in SI."""
+"""Specification of a parameter whose field has no metadata: any value, in SI."""
 
 
 def unit(
@@ -123,7 +123,7 @@ def _read(spec: NumberSpec, value: Any, field: str, length: int | None) -> Array
 
 
 class Part(eqx.Module):
-    """Base of the parts of a scene: its representation shows numbers with their units.
+    """Base of the parts of a scene: its text representation shows values with their units.
 
     >>> import jaxvib as jv
     >>> jv.ConstantSpeed("60 rad/s")

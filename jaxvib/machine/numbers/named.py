@@ -1,6 +1,7 @@
 """Parameters of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
 
-Every floating-point number of a machine, a load, a drive or an effect has a name. Its unit, bounds and words are in `numbers`.
+Every floating-point parameter of a machine, a load, a drive or an effect has a name. Its unit, bounds and label are defined in
+the package `numbers`.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class NamedNumber(NamedTuple):
     - `name`
     - `path` of attributes and indices from the scene to the array
     - `entry` of the array; None for the whole array
-    - `size`: count of the numbers
+    - `size`: number of parameters
     - `spec` of the field
     """
 
@@ -50,16 +51,16 @@ class NamedNumber(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of the number, or of all entries."""
+        """Unit of the parameter, or of all entries."""
         return self.spec.units[self.entry if self.entry is not None and len(self.spec.units) > 1 else 0]
 
     @property
     def entries(self) -> set[tuple[_Path, int]]:
-        """Path and index of each single number. They show which numbers two names share."""
+        """Path and index of each parameter. If they occur under two names, these names share the parameter."""
         return {(self.path, k) for k in (range(self.size) if self.entry is None else (self.entry,))}
 
     def leaf(self, scene: Scene) -> Array:
-        """Return the array that contains the number."""
+        """Return the array that contains the parameter."""
         found: Any = scene
         for step in self.path:
             found = found[step] if isinstance(step, int) else getattr(found, step)
@@ -78,17 +79,17 @@ class NamedNumber(NamedTuple):
         return float(number(given, self.unit, field, **self.spec.bounds._asdict()))
 
     def single(self, scene: Scene) -> tuple[NamedNumber, ...]:
-        """Return the numbers of an array, each with its own name, or a tuple of the number if it is a single one."""
+        """Return the entries of an array, each with its own name; for a single parameter, a tuple of only this parameter."""
         if self.entry is not None or not np.ndim(self.leaf(scene)):
             return (self,)
         return tuple(self._replace(name=f"{self.name}[{k}]", entry=k, size=1) for k in range(self.size))
 
     def keeps_zeros(self, scene: Scene) -> bool:
-        """True for a whole array in which a 0 stands for a spring or a damper that the machine does not have."""
+        """True for a whole array in which an entry 0 stands for a spring or a damper that the machine does not have."""
         return self.entry is None and self.spec.zero_is_absent and np.ndim(self.leaf(scene)) > 0
 
     def words(self, scene: Scene) -> list[str]:
-        """Return the name of each number for a designer, such as "stiffness of support 2"."""
+        """Return the name of each parameter in text for users, such as "stiffness of support 2"."""
         which = self.path[1] if self.path[0] == "exciters" else 0
         exciter = scene.exciters[which if isinstance(which, int) else 0]
         load = "load" if exciter.loads is None else exciter.loads.kind.rpartition("_")[2]
@@ -151,7 +152,7 @@ def _is_continuous(value: object) -> bool:
 
 
 def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
-    """Yield the name, the path and the part of each part of a scene. Repeatable effects are numbered from 0."""
+    """Yield each part of a scene after its name and its path. Repeatable effects are numbered from 0."""
     yield "machine", ("machine",), scene.machine
     for k, exciter in enumerate(scene.exciters):
         place, path = scene.place_of(k), ("exciters", k)
@@ -184,10 +185,10 @@ def _steps(part: eqx.Module, steps: Sequence[Any]) -> tuple[_Path, NumberSpec]:
 
 
 def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
-    """Return the number, or the array of numbers, with the name `name`.
+    """Return the parameter, or the array of parameters, with the name `name`.
 
-    **Raises** `InputError` that names `field`, for a name that the scene does not have, and for the name of something other
-    than a continuous number, such as a count.
+    **Raises** `InputError` that names `field`, for a name that the scene does not have, and for the name of a discrete value,
+    such as a count.
     """
     there, field = numbers_of(scene), f"{field}.{name}"
     if not isinstance(name, str):
@@ -218,7 +219,7 @@ def _why_unnamed(scene: Scene, name: str) -> str:
 
 
 def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array | np.ndarray) -> Scene:
-    """Return the scene with `values` (sum of the sizes,), SI, for the numbers `found` in their order."""
+    """Return the scene with `values` (sum of the sizes,), SI, for the parameters `found` in their order."""
     leaves: dict[_Path, Array] = {}
     start = 0
     for each in found:
@@ -251,7 +252,7 @@ def put_present(scene: Scene, found: NamedNumber, value: float) -> Scene:
 
 
 def read_value(name: str, value: Number) -> float:
-    """Return a value in SI for the number `name` of any scene.
+    """Return a value in SI for the parameter `name` of any scene.
 
     **Raises** `InputError` for a name that no part of a scene has, a wrong unit, and a value out of bounds.
     """
@@ -265,9 +266,9 @@ def read_value(name: str, value: Number) -> float:
 
 
 def spec_of(name: str) -> NumberSpec | None:
-    """Return the spec of a number from its name alone, None if no kind of part has such a field.
+    """Return the specification of a parameter from its name alone; None if no kind of part has such a field.
 
-    If several kinds have it, the spec is that of an array, if one of them is.
+    If several kinds have the field, the specification of an array takes precedence.
     """
     part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
     part = part.removeprefix("exciters.")

@@ -18,7 +18,7 @@ from jaxvib.machine.numbers import unit
 from jaxvib.units import count
 from jaxvib.units.known import when_known
 
-_SYMMETRY = 1e-9
+_MAX_ASYMMETRY = 1e-9
 """Largest asymmetry of a mass or stiffness matrix, relative to its largest entry."""
 
 
@@ -28,7 +28,7 @@ class MatrixMachine(Machine):
     **Attributes** (nd coordinates)
 
     - `mass`, `damping`, `stiffness` and `gyroscopic` (or None), (nd, nd)
-    - `places` (places, np, nd): the rows of each place, see `Mount`
+    - `places_rows` (number of places, np, nd): the rows of each place, see `Mount`
     - `foundation` (2, nb, nd): stiffness and damping of the force on the foundation
     """
 
@@ -54,7 +54,7 @@ class MatrixMachine(Machine):
         return Mount(rows=(rows[: len(axes)],), axes=axes, gyroscopic=self.gyroscopic, turn=turn)
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the rows of the place with this number, from 1; of the first place for None."""
+        """Return the rows of the place with this number, from 1; None is the first place."""
         return self._all_rows(place, name)[:2]
 
     def _all_rows(self, place: Place, name: str) -> Array:
@@ -78,9 +78,9 @@ def from_matrices(
 
         M q'' + (C + n G) q' + K q = forces,        q = Phi r,    K Phi = M Phi diag(w^2),    Phi^T M Phi = 1
 
-    A model with more than `reduce` coordinates is reduced to its lowest real normal modes, those without damping and rotation.
-    The coordinates of the machine are then the modal amplitudes r. Displacements, forces and speeds at the places are those of
-    the model; amplitudes of coordinates are not.
+    A model with more than `reduce` coordinates is reduced to its lowest real normal modes, which are computed without damping
+    and rotation. The coordinates of the machine are then the modal amplitudes r. Displacements, forces and speeds at the
+    places are those of the model; amplitudes of coordinates are not.
 
     **Arguments** (numbers and arrays in SI; nd coordinates of the model)
 
@@ -88,7 +88,8 @@ def from_matrices(
     - `damping` C (nd, nd)
     - `gyroscopic` G (nd, nd): G times the rotor speed n times q' is a force; skew-symmetric. None without a rotor
     - `places`: a list of points at which exciters may sit, numbered from 1 in `Exciter(at=)`. Each is a list of the indices
-      of its coordinates, [up], [across, up] or [across, up, rotation], or an array (1 to 3, nd) of rows; all of one length
+      of its coordinates, [up], [across, up] or [across, up, rotation], or an array (1 to 3, nd) of rows; all places have the
+      same number of directions
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or across
       and up (nb = 2); default: the force is not known and given as 0
     - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
@@ -132,7 +133,7 @@ def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
 
 
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
-    """Return a matrix, square if `shape` is None; a number is a matrix with one entry."""
+    """Return a matrix, square if `shape` is None; a number stands for a 1 x 1 matrix."""
     try:
         found = jnp.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
@@ -150,10 +151,10 @@ def _require_definite(matrix: np.ndarray | float, name: str) -> None:
     """**Raises** `InputError` for a matrix that is not symmetric, or not positive (semi-)definite."""
     full = np.atleast_2d(matrix)
     scale = float(np.max(np.abs(full), initial=1e-300))
-    if np.max(np.abs(full - full.T)) > _SYMMETRY * scale:
+    if np.max(np.abs(full - full.T)) > _MAX_ASYMMETRY * scale:
         raise InputError(name, "is not symmetric; put skew-symmetric parts into gyroscopic, or take (A + A^T)/2")
     least = float(np.min(np.linalg.eigvalsh(full)))
-    if least <= 0.0 if name == "machine.mass" else least < -_SYMMETRY * scale:
+    if least <= 0.0 if name == "machine.mass" else least < -_MAX_ASYMMETRY * scale:
         allowed = "greater than 0" if name == "machine.mass" else "at least 0"
         raise InputError(name, f"has the eigenvalue {least:g}; all must be {allowed}")
 

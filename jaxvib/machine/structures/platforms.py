@@ -70,7 +70,7 @@ class Platforms(Machine):
         return Mount(rows=(self.rows_at(self.exciter if at is None else at, "at"),), axes=(1,))
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the row of a platform's coordinate; of the first platform for None."""
+        """Return the row of a platform's coordinate; None is the first platform."""
         n, which = self.mass.shape[0], 1 if place is None else place
         if not isinstance(which, int):
             raise InputError(name, f"is a distance along a rotor's axis; name a platform instead, 1 to {n}")

@@ -1,4 +1,4 @@
-"""Rigid rotors: on two elastic supports with tilts, and on one support without."""
+"""Rigid rotors: on two elastic supports with tilts, and on one support without tilts."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def _require_passive(field: str, one: float, two: float, three: float) -> None:
 
 def _require_two_places(places: np.ndarray) -> None:
     if places[0] == places[1]:
-        problem = "which does not hold the tilt of the rotor; give two places, such as [0.165, -0.155]"
+        problem = "which leaves the tilt of the rotor without stiffness; give two places, such as [0.165, -0.155]"
         raise InputError("machine.position", f"puts both supports at {places[0]:g} m, {problem}")
 
 
