@@ -50,7 +50,7 @@ check: $(VENV)/installed-dev
 
 # The documentation as pages that open from the disk; a warning is an error.
 docs: $(VENV)/installed-docs
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo out/site/index.html
 
 # Ratios of times beside recorded ones: fails where something became three times slower.

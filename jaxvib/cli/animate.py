@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.app import Output, app, loaded_scene, shared
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def animate(
             raise InputError("--until", "and --start and --mode are for a scene file; a saved run already has its own")
         motion, scene = jv.Run.load(source), None
     else:
-        loaded = jv.load_scene(source)
+        loaded = loaded_scene(source)
         if until is not None:
             motion, scene = jv.simulate(loaded, until, start=start or "rest", mode=mode, estimate=False), None
         elif mode is None:
@@ -71,5 +71,5 @@ def animate(
 @shared
 def sketch(scene: Path, output: Output) -> None:
     """Draw SCENE with its numbers: sketch.png, in --out or the current folder."""
-    jv.sketch(jv.load_scene(scene)).savefig(output.made("sketch.png"))
+    jv.sketch(loaded_scene(scene)).savefig(output.made("sketch.png"))
     output.done({"status": "done"}, lambda: "a sketch of the machine", "sketch")

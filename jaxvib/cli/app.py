@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import difflib
 import functools
 import importlib
 import json
@@ -34,6 +35,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     from jaxvib.display import speed_text  # slow imports, which --help does not need
     from jaxvib.machine.drives.drive import ConstantSpeed
     from jaxvib.machine.files import load_scene
+    from jaxvib.machine.validation import implausible_numbers
 
     scene = load_scene(path)
     if speed is not None:
@@ -42,6 +44,8 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
         end = float(scene.drive.speed)
         click.echo(f"constant speed of {speed_text(end, 6)}: the final speed of the drive ({scene.drive.kind})", err=True)
         scene = scene.replace(drive=ConstantSpeed(end))
+    for note in implausible_numbers(scene):
+        click.echo(f"note: {note}", err=True)
     there = [effect.kind for effect in scene.all_effects]
     for kind in without:
         if kind not in there:
@@ -54,14 +58,34 @@ WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave
 """Option of commands that do not include every effect."""
 
 
-SPEED = click.option("--speed", help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
+class _SpeedType(click.ParamType):
+    """Speed with a unit: a plain number other than 0 could be in rpm or in rad/s."""
+
+    name = "speed"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the text. **Raises** `InputError` for a number without a unit."""
+        try:
+            plain = float(value)
+        except ValueError:
+            return value
+        if plain == 0.0:
+            return value
+        field = "speed" if param is None else param.opts[-1]
+        raise InputError(field, f"is {quoted(value)}, a number without a unit; write '{plain:g} rpm' or '{plain:g} rad/s'")
+
+
+SPEED_TYPE = _SpeedType()
+"""Type of options that are speeds."""
+
+SPEED = click.option("--speed", type=SPEED_TYPE, help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
 """Option of commands about motions at a constant rotor speed."""
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     """Return a table with a title, column heads and lines; the first column is aligned to the left, the others to the right.
 
-    Empty columns are omitted.
+    Empty columns are omitted. The table fits into a terminal of 80 columns; longer heads and texts continue on a new line.
     """
     from rich.console import Console  # slow import, which --json does not need
     from rich.table import Table
@@ -69,10 +93,10 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     drawn = Table(title=title, title_justify="left")
     shown = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
     for k in shown:
-        drawn.add_column(columns[k], justify="left" if k == 0 else "right", no_wrap=k == 0)
+        drawn.add_column(columns[k], justify="left" if k == 0 else "right", overflow="fold")
     for row in rows:
         drawn.add_row(*(row[k] for k in shown))
-    console = Console(width=118)
+    console = Console(width=80)
     with console.capture() as capture:
         console.print(drawn)
     return capture.get().rstrip()
@@ -137,6 +161,18 @@ class _Lazy(click.Group):
             importlib.import_module(f"jaxvib.cli.{_HOMES[cmd_name]}")
         return super().get_command(ctx, cmd_name)
 
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command of the first argument. **Raises** a usage error that suggests a similar name."""
+        if args and not args[0].startswith("-") and args[0] not in _HOMES:
+            ctx.fail(f"No such command {quoted(args[0])}.{_similar(args[0], list(_HOMES))}")
+        return super().resolve_command(ctx, args)
+
+
+def _similar(name: str, allowed: Sequence[str]) -> str:
+    """Return a sentence with the most similar allowed name; an empty text if none is similar."""
+    near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.5)
+    return f" Did you mean {near[0]!r}?" if near else ""
+
 
 def _first_line(name: str) -> str:
     """Return the first sentence of a command's docstring, up to a full stop or semicolon."""
@@ -161,7 +197,7 @@ def app() -> None:
 
 
 def shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options --json, --out, --report and --unit to a command, which gets the first three as one `Output`."""
+    """Add the options --json, --out, --report, --title, --author and --unit to a command, which gets them as one `Output`."""
 
     @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
     @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write figures and data into this folder.")
@@ -170,6 +206,8 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
         type=click.Path(path_type=Path, dir_okay=False),
         help="Write a report with inputs, results and figures to this file (.html).",
     )
+    @click.option("--title", help="Title of the report [name of the command and of the scene file].")
+    @click.option("--author", help="Author of the report.")
     @click.option(
         "--unit",
         type=click.Choice(["rpm", "Hz", "rad/s", "SI"]),
@@ -178,11 +216,15 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
         help="Unit of speeds; SI: all numbers in SI units. JSON documents are always in SI units.",
     )
     @functools.wraps(command)  # also copies the command's own options, which click stores on the function
-    def wrapped(as_json: bool, out: Path | None, report: Path | None, unit: str, **rest: Any) -> None:
+    def wrapped(
+        as_json: bool, out: Path | None, report: Path | None, title: str | None, author: str | None, unit: str, **rest: Any
+    ) -> None:
         from jaxvib.display import display_units  # slow import, which --help does not need
 
         display_units(speed="rad/s" if unit == "SI" else unit, si=unit == "SI")  # pyright: ignore[reportArgumentType]
-        command(output=Output(as_json, out, report, rest.get("scene")), **rest)
+        output = Output(as_json, out, report, rest.get("scene"), title=title, author=author)
+        with output.waiting():
+            command(output=output, **rest)
 
     return wrapped
 
@@ -198,6 +240,7 @@ def run(arguments: list[str]) -> int:
         # a command whose result is a failure exits with its own code
         return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False, obj=tuple(arguments)) or 0
     except InputError as error:
+        error = _of_command_line(arguments, error)
         message = f"{error}{_way_out(arguments, error)}"
         return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
     except ComputationError as error:
@@ -216,6 +259,9 @@ def run(arguments: list[str]) -> int:
         field = error.ctx.command.name if error.ctx else "jaxvib"
         hint = f" (see: {error.ctx.command_path} --help)" if error.ctx else ""
         message = " ".join(error.format_message().split())
+        if isinstance(error, click.BadParameter) and error.param is not None and isinstance(error.param.type, click.Choice):
+            wrong = re.search(r"'(.*?)' is not one of", message)
+            message += "" if wrong is None else _similar(wrong[1], list(map(str, error.param.type.choices)))
         if isinstance(error, click.MissingParameter) and error.param is not None:
             description = getattr(error.param, "help", None) or _ARGUMENTS.get(error.param.name or "", "")
             message = f"{message.rstrip('.')}: {description.rstrip('.')}" if description else message
@@ -225,6 +271,19 @@ def run(arguments: list[str]) -> int:
         return stop.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _failed(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
+
+
+def _of_command_line(arguments: list[str], error: InputError) -> InputError:
+    """Return an error of a function in the words of the command line: options in place of arguments of the function."""
+    command = app.commands.get(arguments[0]) if arguments else None
+    options = [] if command is None else [each for each in command.params if isinstance(each, click.Option)]
+    names = {each.name: each.opts[-1] for each in options}
+    field, problem = names.get(error.field, error.field), error.problem
+    if field == "drive.speed" and "--speed" in arguments:
+        field = "--speed"
+    for name, option in names.items():
+        problem = re.sub(rf"(?<![\w.]){name}=('?)([\w. ]+)\1", rf"{option} \2", problem)
+    return InputError(field, problem)
 
 
 def _way_out(arguments: list[str], error: InputError) -> str:

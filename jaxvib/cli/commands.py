@@ -9,10 +9,14 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.app import Output, app, loaded_scene, shared
 from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
+
+_START_HELP = (
+    "Initial state: the machine at rest while the drive turns at its speed; a jam (with --mode); or a smooth spin-up from rest."
+)
 
 _SCREENS = ("linear-screen", "circular-screen", "feeder")
 _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus", *_SCREENS)
@@ -49,9 +53,7 @@ def new(kind: str, output: Output) -> None:
 @app.command("simulate")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time, such as 20s or '0.5 min'.")
-@click.option(
-    "--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help="Initial state."
-)
+@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help=_START_HELP)
 @click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
 @SEPARATION
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
@@ -75,12 +77,15 @@ def simulate(
 
     if csv is not None and window:
         raise InputError("--csv", "needs a trajectory, which --window does not save; leave one of them out")
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene)
+    meter = ProgressBar() if sys.stderr.isatty() and _long(loaded, options["until"]) else None
+    if meter is not None:
+        output.end_waiting()
     run = jv.simulate(
         loaded,
         stepsize_controller=chosen_steps(tolerance, accuracy),
         save="window" if window else "all",
-        progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, options["until"]) else None,
+        progress_meter=meter,
         **options,
     )
     output.picture("history.png", lambda: run.plot())

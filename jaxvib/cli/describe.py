@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 import inspect
+import textwrap
+from typing import TYPE_CHECKING
 
 import click
 
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, app, shared
+from jaxvib.errors import InputError, quoted
+
+if TYPE_CHECKING:
+    from jaxvib.report.arguments import Argument
+
+_WIDTH = 80
 
 
 @app.command("describe")
-@click.argument("group", type=click.Choice(["machines", "loads", "drives", "effects"]), required=False)
+@click.argument("group", metavar="[GROUP|NAME]", required=False)
 @click.argument("name", required=False)
 @shared
 def describe(group: str | None, name: str | None, output: Output) -> None:
-    """List the contents of scene files: machines, loads, drives, effects, their arguments with units and defaults."""
+    """List the contents of scene files: machines, loads, drives, effects, their arguments with units, defaults and meanings.
+
+    GROUP is machines, loads, drives or effects; NAME is a part, such as three_mass, whose whole documentation is printed."""
+    from jaxvib.machine.files import suggest_name
     from jaxvib.report.arguments import GROUPS, arguments_of, described
 
     if group is None:
         known = {word: list(kinds) for word, kinds in GROUPS.items()}
         output.done({"groups": known}, lambda: "\n".join(f"{g}: {', '.join(k)}" for g, k in known.items()), "describe")
         return
-    kinds = GROUPS[group] if name is None else {name: described(group, name)}
+    if group not in GROUPS and name is None:
+        home = next((each for each, kinds in GROUPS.items() if group in kinds), None)
+        if home is None:
+            every = [*GROUPS, *(kind for kinds in GROUPS.values() for kind in kinds)]
+            raise InputError("name", f"is {quoted(group)}; {suggest_name(group, every)}")
+        group, name = home, group
+    kinds = GROUPS.get(group, {}) if name is None else {name: described(group, name)}
     found = [
         {
             "kind": kind,
@@ -33,25 +50,24 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
 
     def text() -> str:
         parts = []
-        for part in found:
-            rows = [
-                [
-                    argument["name"],
-                    argument["unit"],
-                    "needed" if argument["needed"] else argument["default"] or "none",
-                    ", ".join(argument["allowed"]) or argument["bounds"],
-                ]
-                for argument in part["arguments"]
-            ]
-            parts.append(f"{part['kind']}: {part['about']}")
-            parts.append(table("", ["argument", "unit", "default", "allowed"], rows))
+        for kind, build in kinds.items():
+            parts.append(_wrapped(f"{kind}: {(inspect.getdoc(build) or '').split(chr(10) * 2)[0]}", ""))
+            parts += [_argument(argument) for argument in arguments_of(build)]
+            parts.append("")
         if name is not None:
-            parts.append(_manual(kinds[name]))
-        return "\n".join(parts)
+            parts.append((inspect.getdoc(kinds[name]) or "").split(">>>")[0].rstrip())
+        return "\n".join(parts).rstrip()
 
     output.done({group: found}, text, "describe")
 
 
-def _manual(build: object) -> str:
-    """Return the docstring up to its example."""
-    return (inspect.getdoc(build) or "").split(">>>")[0].rstrip()
+def _argument(argument: Argument) -> str:
+    """Return an argument as a line with its unit, default and allowed values, and its meaning below."""
+    default = "needed" if argument.needed else f"default {argument.default or 'none'}"
+    facts = [argument.unit, default, ", ".join(argument.allowed) or argument.bounds]
+    head = _wrapped(f"{argument.name}: {'; '.join(filter(None, facts))}", "  ")
+    return f"{head}\n{_wrapped(argument.meaning, '      ')}" if argument.meaning else head
+
+
+def _wrapped(text: str, indent: str) -> str:
+    return textwrap.fill(" ".join(text.split()), _WIDTH, initial_indent=indent, subsequent_indent=indent)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import click
 
-import jaxvib as jv
-from jaxvib.cli.app import app
+from jaxvib.cli.app import app, loaded_scene
 
 
 @app.command("explore")
@@ -25,7 +24,7 @@ def explore(scene: Path, port: int, no_browser: bool) -> None:
 
     require_marimo()
     require_free(port)
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene)
     click.echo("compiling ...")
     prepare(loaded)
     threading.Thread(target=prepare_counts, args=(loaded,), daemon=True).start()

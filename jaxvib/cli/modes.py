@@ -91,16 +91,16 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
     }
 
     def text() -> str:
-        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
+        from jaxvib.display import shown_unit, speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
+        length, factor = shown_unit("m", max((float(np.max(jam.amplitude)) for jam in jams), default=0.0))
         rows = [
             [
                 f"{int(jam.mode)}",
                 f"{scale * float(jam.omega):.5g}",
-                {"stable by slope": "stable", "unstable by slope": "unstable"}.get(jam.judgement, "cannot stay"),
-                _stability_text(growth[int(jam.mode)]),
-                *(f"{1e3 * float(a):.4g}" for a in jam.amplitude),
+                _stays(jam, growth[int(jam.mode)]),
+                *(f"{factor * float(a):.4g}" for a in jam.amplitude),
                 f"{float(jam.foundation_force):.4g}",
             ]
             for jam in jams
@@ -108,32 +108,34 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
         head = [
             "mode",
             unit,
-            "by slope",
-            "loads free",
-            *(f"{name}, mm" for name in scene.machine.structure().coordinates),
-            "force",
+            "stays",
+            *(f"{name}, {length}" for name in scene.machine.structure().coordinates),
+            "force, N",
         ]
         lines = [
             f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(found.resonances)}",
-            table("jam modes (light loads); amplitudes are zero to peak, the foundation force is in N", head, rows)
+            table("jam modes (light loads); amplitudes and foundation force are zero to peak", head, rows)
             if rows
             else "no jam mode at this speed",
         ]
         if rows:
-            lines.append(
-                "by slope: loads that stay together; loads free: loads that can separate (growth rate of a disturbance, 1/s)"
-            )
+            lines.append("stays, no: after a small disturbance the loads (balls, rollers, pendulums) leave")
         if folds:
-            pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
-            lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
+            pairs = [[f"{scale * found.folds.omega[k]:.5g}", f"{scale * found.folds.rotor_speed[k]:.5g}"] for k in folds]
+            lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
         return "\n".join([*lines, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
 
 
-def _stability_text(growth: float) -> str:
-    """Return a text about the stability of a jam whose loads can separate."""
-    return "unknown" if math.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
+def _stays(jam: jv.Jam, growth: float) -> str:
+    """Return a text about the stability of a jam, from its slope and the growth rate of disturbances of loads that can
+    separate."""
+    if jam.judgement == "loads cannot stay together":
+        return "no: the loads differ too much"
+    if not bool(jam.stable):
+        return "no"
+    return "yes, if they stay together" if math.isnan(growth) else "yes" if growth < 0.0 else "no: the loads spread"
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
@@ -187,7 +189,7 @@ def _phases(scene: jv.Scene, output: Output) -> None:
             return f"no jam at {rotor}"
         kept = ", ".join(f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable)
         conclusion = f"loads can stay jammed at {kept}" if kept else "none of them is stable: light loads cannot stay jammed"
-        return "\n".join([table(title, head, rows), conclusion, *_left_out(scene)])
+        return "\n".join([conclusion, table(title, head, rows), *_left_out(scene)])
 
     output.done(document, text, "modes", found)
 

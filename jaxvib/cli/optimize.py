@@ -38,16 +38,18 @@ def optimize(
     """Search for the machine that DESIGN describes; --out saves its scene file, the search, the pictures and the motion of the
     verification. Ctrl-C ends the search with the best machine so far; --resume continues it."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from optimize import Synthesis, load_design, synthesize
 
     loaded = load_design(design)
     given = {"starts": starts, "seed": seed, "searcher": searcher}
     options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
+    output.end_waiting()
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
+        TimeElapsedColumn(),
         console=Console(stderr=True, quiet=not sys.stderr.isatty()),
         transient=True,
     ) as bar:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Callable, Mapping
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,11 +35,23 @@ class Output:
     """Destination of the results of a command: a JSON document or text on stdout, files in a folder, a report of one HTML page.
 
     **Arguments**: `as_json`: True for JSON on stdout; `folder` of `--out`; `report`, the file of `--report`; `scene`, the scene
-    file of the command.
+    file of the command; `title` and `author` of the report.
     """
 
-    def __init__(self, as_json: bool, folder: Path | None, report: Path | None = None, scene: Path | None = None):
+    def __init__(
+        self,
+        as_json: bool,
+        folder: Path | None,
+        report: Path | None = None,
+        scene: Path | None = None,
+        *,
+        title: str | None = None,
+        author: str | None = None,
+    ):
         self.as_json = as_json
+        self.title = title
+        self.author = author
+        self._done = threading.Event()
         self.folder = folder
         self.report = report
         self.scene = scene
@@ -47,6 +63,29 @@ class Output:
             self._make(report.parent, "--report")
         if folder is not None:
             self._make(folder, "--out")
+
+    @contextlib.contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Show the elapsed time on the last line of a terminal, from the first second until the command prints something."""
+        if sys.stderr.isatty():
+            threading.Thread(target=self._show_elapsed_time, daemon=True).start()
+        try:
+            yield
+        finally:
+            self.end_waiting()
+
+    def end_waiting(self) -> None:
+        """Remove the line of `waiting`. Commands with their own progress call this before they show it."""
+        if not self._done.is_set():
+            self._done.set()
+            if sys.stderr.isatty():
+                click.echo("\r\x1b[K", nl=False, err=True)
+
+    def _show_elapsed_time(self) -> None:
+        begin = time.monotonic()
+        while not self._done.wait(1.0):
+            seconds = time.monotonic() - begin
+            click.echo(f"\r\x1b[Kcomputing, {seconds:.0f} s (new programs are compiled once, then stored)", nl=False, err=True)
 
     @staticmethod
     def _make(folder: Path, option: str) -> None:
@@ -92,6 +131,7 @@ class Output:
             return
         from jaxvib.results.csv import write_csv  # slow import, which --help does not need
 
+        self._make(path.parent, "--csv")
         write_csv(result, axis, path, display=True)
         self.files.append(str(path))
 
@@ -100,6 +140,7 @@ class Output:
 
         `result` is the source of the document's numbers; its fields determine their units in the report.
         """
+        self.end_waiting()
         path = self.file(f"{name}.json")
         from jaxvib.results.fields import plain  # slow import, which --help does not need
 
@@ -129,7 +170,8 @@ class Output:
         draws = getattr(jv, "sketch", None)
         arguments = click.get_current_context().find_root().obj or [name]
         found = Report(
-            title=f"jaxvib {name}",
+            title=self.title or (name if self.scene is None else f"{name}: {self.scene.stem}"),
+            author=self.author or "",
             command=" ".join(["jaxvib", *arguments]),
             document=document,
             units={} if result is None else units_of(result),

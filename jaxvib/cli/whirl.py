@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import SPEED_TYPE, Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import CSV
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @app.command("whirl")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--speed", help="Rotor speed, such as '3000 rpm' [the drive's].")
+@click.option("--speed", type=SPEED_TYPE, help="Rotor speed, such as '3000 rpm' [the drive's].")
 @click.option(
     "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Include the masses of the loads."
 )
@@ -30,7 +30,7 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
 
     from jaxvib.units import number
 
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene)
     rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
     found = jv.whirl(loaded, [rotor_speed], loads=loads)
     critical = [

@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import call_user
+from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene, read_unbalance, require_comparable
@@ -96,6 +97,41 @@ def _allowed_value(scene: Scene) -> Array | None:
     except InputError:
         return jnp.asarray(False)
     return None
+
+
+_MAX_SPEED, _MAX_RADIUS, _MAX_SAG, _MIN_MASS = 700.0, 5.0, 1.0, 10.0
+"""Largest usual rotor speed, rad/s, radius of loads, m, and sag of a machine under its own weight, m, judged above this mass:
+machines of dimensionless numbers have masses of about 1."""
+
+
+def implausible_numbers(scene: Scene) -> list[str]:
+    """Return a sentence for each number of a scene that was probably meant in another unit.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(1500.0))
+    >>> implausible_numbers(scene)
+    ["drive.speed is 14324 rpm; a plain number is in rad/s: did you mean '1500 rpm'?"]
+    """
+    notes = []
+
+    def note(name: str, value: str, si: str, meant: str) -> None:
+        notes.append(f"{name} is {value}; a plain number is in {si}: did you mean '{meant}'?")
+
+    for k, exciter in enumerate(scene.exciters):
+        place, loads = scene.place_of(k), exciter.loads
+        speed = float(exciter.drive.speed)
+        if speed > _MAX_SPEED:
+            note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
+        radius = 0.0 if loads is None else float(np.max(getattr(loads, "radius", 0.0)))
+        if radius > _MAX_RADIUS:
+            note(f"{place}loads.radius", f"{radius:g} m", "m", f"{radius:g} mm")
+    mass, stiffness = (float(np.sum(getattr(scene.machine, name, 0.0))) for name in ("mass", "stiffness"))
+    if mass >= _MIN_MASS and 0.0 < stiffness * _MAX_SAG < 9.80665 * mass:
+        sag = f"{9.80665 * mass / stiffness:.3g} m"
+        largest = float(np.max(scene.machine.stiffness))  # pyright: ignore[reportAttributeAccessIssue]
+        note("machine.stiffness", f"so small that the machine sags by {sag}", "N/m", f"{largest:g} N/mm")
+    return notes
 
 
 _CARRIED = ("loads", "unbalance")

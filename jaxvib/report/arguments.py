@@ -24,7 +24,7 @@ class Argument(NamedTuple):
     """Argument of a part.
 
     **Attributes**: `name`; `unit`, "" for none; `needed`: True if the argument has no default; `default` as text, or None;
-    `allowed` texts of an argument that is one of several; `bounds` of a number in words.
+    `allowed` texts of an argument that is one of several; `bounds` of a number in words; `meaning` from the docstring.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Argument(NamedTuple):
     default: str | None
     allowed: tuple[str, ...]
     bounds: str
+    meaning: str
 
 
 def arguments_of(build: Callable[..., object]) -> list[Argument]:
@@ -44,12 +45,30 @@ def arguments_of(build: Callable[..., object]) -> list[Argument]:
     >>> [(a.name, a.unit, a.needed, a.default, a.bounds) for a in arguments_of(jv.Stop)][1:3]
     [('gap', 'm', True, None, 'at least 0'), ('damping', 'N s/m', False, '0.0', 'at least 0')]
     """
-    found, specs = [], number_specs(part_of(build))
+    found, specs, meanings = [], number_specs(part_of(build)), _meanings(inspect.getdoc(build) or "")
     for name, parameter in inspect.signature(build).parameters.items():
         default = None if parameter.default in (parameter.empty, None) else _shown(parameter.default)
         spec = specs.get(name, PLAIN)
         needed = parameter.default is parameter.empty
-        found.append(Argument(name, spec.unit, needed, default, _choices(build, parameter), spec.bounds.words))
+        meaning = meanings.get(name, spec.words)
+        found.append(Argument(name, spec.unit, needed, default, _choices(build, parameter), spec.bounds.words, meaning))
+    return found
+
+
+def _meanings(text: str) -> dict[str, str]:
+    """Return the text of each argument in the list of arguments of a docstring, by name, without the names.
+
+    >>> _meanings("**Arguments**\\n\\n- `mass` M, kg; typical: 5\\n- `low` and `high`: the ends\\n  of a range\\n\\nEnd.")
+    {'mass': 'M, kg; typical: 5', 'low': 'the ends of a range', 'high': 'the ends of a range'}
+    """
+    _, _, listed = text.partition("**Arguments**")
+    found = {}
+    for entry in re.findall(r"^- (`.*(?:\n  .*)*)", listed.partition("**Returns**")[0], re.MULTILINE):
+        line = " ".join(entry.split())
+        head = re.match(r"`\w+`(?:(?:, | and | or )`\w+`)*", line)
+        if head is not None:
+            meaning = line[head.end() :].lstrip(":, ").replace("`", "")
+            found |= dict.fromkeys(re.findall(r"\w+", head[0].replace(" and ", " ").replace(" or ", " ")), meaning)
     return found
 
 

@@ -33,7 +33,7 @@ class Report:
     """Contents of a page.
 
     **Arguments**: `title`; `document`, plain values as in JSON; `units` of its numbers by name; `command` that computed the
-    result; `text` of the result on the terminal; `scene` of the result and a `sketch` of it; `figures` by name.
+    result; `text` of the result on the terminal; `scene` of the result and a `sketch` of it; `figures` by name; `author`.
     """
 
     title: str
@@ -44,22 +44,28 @@ class Report:
     scene: Scene | None = None
     figures: Sequence[tuple[str, Figure]] = ()
     sketch: Figure | None = None
+    author: str = ""
 
     def html(self) -> str:
         """Return the page as HTML with embedded style and figures; it loads nothing from a network. All text is escaped."""
         parts = [f"<h1>{escaped(self.title)}</h1>"]
+        if self.author:
+            parts.append(f"<p>{escaped(self.author)}</p>")
         if self.command:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
         units = self.units if self.scene is None else _of_coordinates(self.units, self.scene)
         document, units = in_display_units(self.document, units)
-        parts += [_section("Accuracy", worth(document, units))]
-        parts += [_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures))]
-        parts += [_section("Results", results(document, units))]
+        numbers = [_section("Accuracy", worth(document, units)), _section("Numbers", results(document, units))]
+        if self.text:
+            parts.append(_section("Results", f"<pre>{escaped(self.text)}</pre>"))
+        parts.append(_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures)))
+        if not self.text:
+            parts += numbers
         if self.scene is not None:
             sketch = "" if self.sketch is None else _figure("sketch", self.sketch)
             parts += [_section("Machine", sketch + parameters(self.scene))]
         if self.text:
-            parts.append(f"<details><summary>Output of the terminal</summary><pre>{escaped(self.text)}</pre></details>")
+            parts.append(f"<details><summary>All numbers</summary>{''.join(numbers)}</details>")
         parts.append(_section("Made with", _versions()))
         return _PAGE.format(title=escaped(self.title), style=_STYLE, body="\n".join(filter(None, parts)))
 
@@ -70,6 +76,7 @@ def html_report(
     path: str | Path,
     *,
     title: str = "",
+    author: str = "",
     scene: Scene | None = None,
     figures: Sequence[tuple[str, Figure]] | None = None,
 ) -> Path:
@@ -82,6 +89,7 @@ def html_report(
     - `result` of any kind
     - `path` of the file, which is overwritten
     - `title`; default: the name of the result's class
+    - `author` of the report; default: none
     - `scene` whose parameters are listed; default: the scene of the result if it has one
     - `figures`: pairs of a name and a matplotlib figure; default: the figure of the result's method `plot`
 
@@ -101,7 +109,7 @@ def html_report(
     if scene is None and isinstance(own, Scene):
         scene = own
     drawn = [(kind, result.plot())] if figures is None else figures
-    page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn)
+    page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn, author=author)
     with written(path) as part:
         part.write_text(page.html(), encoding="utf-8", errors="replace")
     return path
@@ -188,6 +196,7 @@ pre { overflow-x: auto; font-size: 0.75rem; line-height: 1.25; }
 details { margin-top: 2rem; }
 summary { cursor: pointer; }
 @media screen and (max-width: 40rem) { figure img { max-width: none; width: 44rem; } }
+@page { margin: 18mm; }
 @media print {
   body { font-size: 10pt; max-width: none; padding: 0; }
   .wide { overflow: visible; }

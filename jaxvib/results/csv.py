@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import csv
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -45,7 +46,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(table)
-        writer.writerows([_shown(x) for x in row] for row in zip(*table.values(), strict=True))
+        rows = ([_shown(x) for x in row] for row in zip(*table.values(), strict=True))
+        writer.writerows(row for row, _ in itertools.groupby(rows))  # curves repeat the points at which pieces of them meet
     return path
 
 

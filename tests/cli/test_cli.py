@@ -11,6 +11,7 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.machine.structures.screens import SCREENS
+from jaxvib.machine.validation import implausible_numbers
 
 
 @pytest.mark.parametrize("kind", [*TEMPLATES, *SCREENS])
@@ -39,8 +40,8 @@ def test_modes_json_has_the_promised_keys(typed):
 
 def test_modes_writes_table_and_picture(typed, tmp_path):
     code, out, _ = typed("modes", "machine.toml", "--out", "pictures")
-    assert code == 0 and "mode" in out and "by slope: loads that stay together" in out and "wrote" in out
-    assert "stable (-" in out and "unstable (" in out
+    assert code == 0 and "mode" in out and "stays" in out and "wrote" in out
+    assert " yes " in out and " no " in out and "no: the loads spread" in out and max(map(len, out.splitlines())) <= 110
     assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
 
@@ -64,7 +65,7 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     (tmp_path / "one_plane.toml").write_text(one_plane)
     code, _, err = typed("modes", "one_plane.toml", "--exact")
     assert code == 2 and "machine.kind is 'rotor'; jam modes are defined for platforms; use phase_jams" in err
-    code, _, err = typed("whirl", "stations.toml", "--speed", "-5")
+    code, _, err = typed("whirl", "stations.toml", "--speed", "-5 rad/s")
     assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
 
 
@@ -240,11 +241,13 @@ def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, say
         (("modes", "nothing.toml"), 2, "cannot be read"),
         (("modes", "machine.toml", "--speed", "5 kg"), 2, "is not in rad/s"),
         (("modes",), 2, "Missing argument 'SCENE': a scene file, such as `jaxvib new two-mass"),
-        (("mode", "machine.toml"), 2, "No such command"),
+        (("mode", "machine.toml"), 2, "No such command 'mode'. Did you mean 'modes'?"),
+        (("modes", "machine.toml", "--speed", "1200"), 2, "--speed is '1200', a number without a unit; write '1200 rpm' or"),
+        (("simulate", "machine.toml", "--until", "1s", "--start", "spinup"), 2, "Did you mean 'spin_up'?"),
         (("simulate", "machine.toml"), 2, "Missing option '--until': End time, such as 20s"),
         (("simulate", "machine.toml", "--until", "5 kg"), 2, "until is '5 kg', which is not in s"),
         (("simulate", "machine.toml", "--until", "-1"), 2, "until is -1 s; it must be greater than 0"),
-        (("simulate", "machine.toml", "--until", "1s", "--start", "jam"), 2, "mode is missing"),
+        (("simulate", "machine.toml", "--until", "1s", "--start", "jam"), 2, "--mode is missing; --start jam needs"),
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "9"), 2, "numbered 1 to 5"),
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "1"), 1, "does not exist at rotor speed"),
         (("simulate", "machine.toml", "--until", "9s", "--max-steps", "50"), 1, "max_steps_reached"),
@@ -269,12 +272,27 @@ def test_refusal_of_an_effect_names_the_option_that_removes_it(typed, tmp_path):
         (["modes", "--exact"], "--without static_imbalance"),
         (
             ["settle", "--drift", "-1"],
-            "constant speed of 4392.68 rpm: the final speed of the drive (run_up)\njaxvib: drift is -1",
+            "constant speed of 4392.68 rpm: the final speed of the drive (run_up)\njaxvib: --drift is -1",
         ),
-        (["growth", "--until", "2s", "--speed", "0"], "drive.speed is 0 rad/s; it must be greater than 0"),
+        (["growth", "--until", "2s", "--speed", "0"], "jaxvib: --speed is 0 rad/s; it must be greater than 0"),
     ):
         code, out, err = typed(words[0], "rotor.toml", *words[1:])
         assert (code, out) == (2, "") and option in err
+
+
+def test_implausible_numbers_of_a_file_are_noted(typed, tmp_path):
+    wrong = TEMPLATES["two_mass"].replace('"1500 rpm"', "1500").replace('"120 mm"', "120").replace("5.0e4", "50.0")
+    (tmp_path / "wrong.toml").write_text(wrong)
+    _, _, err = typed("sketch", "wrong.toml")
+    assert err.splitlines() == [
+        "note: drive.speed is 14324 rpm; a plain number is in rad/s: did you mean '1500 rpm'?",
+        "note: loads.radius is 120 m; a plain number is in m: did you mean '120 mm'?",
+        "note: machine.stiffness is so small that the machine sags by 23.3 m; a plain number is in N/m: "
+        "did you mean '50 N/mm'?",
+    ]
+    for kind, text in {**TEMPLATES, **SCREENS}.items():
+        (tmp_path / f"{kind}.toml").write_text(text)
+        assert typed("describe")[2] == "" and not implausible_numbers(jv.load_scene(tmp_path / f"{kind}.toml"))
 
 
 def test_failure_with_json_is_one_document(typed):
@@ -282,7 +300,7 @@ def test_failure_with_json_is_one_document(typed):
     error = json.loads(out)["error"]
     assert code == 1 and error["kind"] == "computation" and error["status"] == "max_steps_reached"
     code, out, _ = typed("modes", "machine.toml", "--speed", "0", "--json")
-    assert code == 2 and json.loads(out)["error"]["field"] == "drive.speed"
+    assert code == 2 and json.loads(out)["error"]["field"] == "--speed"
 
 
 def test_new_never_overwrites(typed):

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, app, loaded_scene, shared, table
 from jaxvib.cli.document import SEPARATION
 
 
@@ -28,7 +28,7 @@ def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output
 
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
     steps = None if tolerance is None else jv.Tolerance(tolerance)
-    found = jv.run_ups(jv.load_scene(scene), drag=each, stepsize_controller=steps, **options)
+    found = jv.run_ups(loaded_scene(scene), drag=each, stepsize_controller=steps, **options)
     output.picture("run_ups.png", found.plot)
     output.keep("run_ups.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))

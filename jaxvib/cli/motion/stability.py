@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
 
@@ -23,7 +23,12 @@ _VARY = click.option(
     help="Name of a parameter of the scene, such as loads.mass or machine.stiffness[0].",
 )
 _OMEGA = click.option(
-    "--omega", nargs=2, required=True, metavar="FROM TO", help="Range of load speeds, such as '20 rad/s' '60 rad/s'."
+    "--omega",
+    nargs=2,
+    type=SPEED_TYPE,
+    required=True,
+    metavar="FROM TO",
+    help="Range of load speeds, such as '20 rad/s' '60 rad/s'.",
 )
 _POINTS_OPTION = click.option("--points", type=int, default=300, show_default=True, help="Load speeds of each diagram.")
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
 
     from jaxvib.motion.start import Rotation
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Initial rotation of the balls: rolling, or none, so that they slide at first (needs the effect sliding).",
 )
+@click.option("--all", "show_all", is_flag=True, help="List every initial speed.")
 @shared
 def capture(
     scene: Path,
@@ -51,6 +53,7 @@ def capture(
     turns: int,
     resolution: float | None,
     rotation: Rotation,
+    show_all: bool,
     output: Output,
 ) -> None:
     """Find the initial speeds from which the balls in a torus of SCENE reach the rotor speed; --out adds pictures."""
@@ -58,7 +61,7 @@ def capture(
 
     if not -1.0 <= low < high <= 0.0:
         raise jv.InputError("--from", f"is {low:g} with --to {high:g}; the speeds must ascend and lie between -1 and 0")
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene)
     found = jv.capture(
         loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, rotation=rotation
     )
@@ -82,11 +85,18 @@ def capture(
 
     def text() -> str:
         rows = [
-            [f"{v:.5f}", f"{f:.3f}", f"{e:.3f}"]
+            [f"{v:.5f}", f"{f:.3f}", f"{e:.3f}" if starts > 1 else ""]
             for v, f, e in zip(found.speed, found.fraction, found.standard_error, strict=True)
         ]
         head = ["initial speed / rotor speed", "share captured", "standard error"]
-        return table("starts captured", head, rows) + "\n" + found.summary()
+        rows = [row for k, row in enumerate(rows) if show_all or _is_near_change(found.fraction, k)]
+        title = "starts captured" if show_all else "starts captured, where the share changes (all speeds: --all)"
+        return found.summary() + "\n" + table(title, head, rows)
 
     document = {**found.as_dict(), **fields_of(found, "fraction", "standard_error")}
     output.done(document, text, "capture", found)
+
+
+def _is_near_change(share: np.ndarray, k: int) -> bool:
+    """Return True at both ends, and if a neighbour has another share."""
+    return k in (0, len(share) - 1) or share[k] != share[k - 1] or share[k] != share[k + 1]

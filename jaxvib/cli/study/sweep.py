@@ -44,6 +44,7 @@ def sweep(
     if not resume and path.exists():
         raise InputError("--no-resume", f"is given, but {quoted(str(path))} exists already; give another folder with --store")
     definition = load_study(study)
+    output.end_waiting()
     show = _Lines()
     try:
         found = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)

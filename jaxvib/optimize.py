@@ -1,0 +1,38 @@
+"""Alias of the package `optimize`, which a file optimize.py beside a user's script does not hide."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+
+def _package() -> ModuleType:
+    """Return the package beside `jaxvib`, not the first `optimize` on the path. **Raises** `ImportError` if another module has
+    its name."""
+    source = Path(__file__).parents[1] / "optimize" / "__init__.py"
+    found = sys.modules.get("optimize")
+    if found is not None:
+        if Path(getattr(found, "__file__", None) or "").resolve() != source.resolve():
+            raise ImportError(
+                f"the module 'optimize' is {getattr(found, '__file__', found)}, not the package of jaxvib; "
+                "import jaxvib.optimize before it, or rename it"
+            )
+        return found
+    spec = importlib.util.spec_from_file_location("optimize", source, submodule_search_locations=[str(source.parent)])
+    assert spec is not None and spec.loader is not None
+    package = sys.modules["optimize"] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(package)
+    except BaseException:
+        del sys.modules["optimize"]
+        raise
+    return package
+
+
+def __getattr__(name: str) -> Any:
+    return getattr(_package(), name)
+
+
+def __dir__() -> list[str]:
+    return dir(_package())

@@ -1,0 +1,3 @@
+"""Names of the package `optimize`, for type checkers."""
+
+from optimize import *  # noqa: F403
