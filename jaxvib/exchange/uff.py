@@ -1,7 +1,7 @@
 """Universal files (UFF, UNV) of modal analysis, written and read through pyuff.
 
-A machine is represented by a row of nodes: its platforms, or points on a rotor's axis. The direction +X is along the axis, +Y
-across, +Z up.
+A machine is represented by nodes: its platforms, points on a rotor's axis, or points of bodies in a plane. The direction +X is
+along the axis, +Y across, +Z up.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from jaxvib.equations.linear import estimated_frequencies, linear_model
 from jaxvib.errors import InputError, open_regular, quoted, require_one_of, written
 from jaxvib.exchange.optional import optional_module, require_writable
 from jaxvib.exchange.state_space import state_space
+from jaxvib.machine.mount import Place, on_body
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
@@ -99,7 +100,7 @@ def export_uff(
 ) -> Path:
     """Write a universal file (58, 55, 15, 82, 151, 164) of a scene or of a run.
 
-    - Frequency responses of a `Scene`: one function for each node and direction, to a force at the exciter in each of its
+    - Frequency responses of a `Scene`: one function for each node and direction, to a force at each exciter in each of its
       directions, at evenly spaced frequencies
     - Natural modes of a `Scene`: undamped (normal modes) for machines that move up and down; damped, at the rotor speed
       (complex modes, the whirl), for machines that move across and up
@@ -150,22 +151,42 @@ def export_uff(
 
 
 def _nodes(scene: Scene) -> list[_Node]:
-    """Return the nodes of a machine."""
-    machine, mount = scene.machine, scene.mount()
+    """Return the nodes of a machine; points that always move alike are one node."""
+    found: dict[bytes, _Node] = {}
+    for place, position in _places(scene):
+        rows = np.asarray(scene.machine.rows_at(place))
+        found.setdefault(rows.tobytes(), _Node(len(found) + 1, position, rows))
+    return list(found.values())
+
+
+def _places(scene: Scene) -> list[tuple[Place, tuple[float, float, float]]]:
+    """Return the places of the nodes and their positions (x, y, z), m."""
+    machine, exciters = scene.machine, scene.exciters
     if machine.places == "platform":
-        places = [(k + 1, float(k)) for k in range(machine.structure().mass.shape[0])]
-    elif machine.places == "shaft":
-        supports = [position for position, *_ in machine.shaft_supports() or []]
-        stations = np.asarray(mount.distances(scene.loads.count)).tolist()
-        places = [(jnp.asarray(s, scene.drive.speed.dtype), s) for s in sorted({0.0, *supports, *stations})]
-    else:
-        places = [(None, 0.0)]
-    return [_Node(k, (x, 0.0, 0.0), np.asarray(machine.rows_at(place))) for k, (place, x) in enumerate(places, 1)]
+        return [(k + 1, (float(k), 0.0, 0.0)) for k in range(machine.structure().mass.shape[0])]
+    if machine.places == "number":
+        return [(k, (float(k), 0.0, 0.0)) for k in sorted({each.at if isinstance(each.at, int) else 1 for each in exciters})]
+    if machine.places == "shaft":
+        distances = [position for position, *_ in machine.shaft_supports() or []]
+        for each in exciters:
+            mount = machine.mount(each.place)
+            distances += np.asarray(mount.distances(1 if each.loads is None else each.loads.count)).tolist()
+        dtype = machine.structure().mass.dtype
+        return [(jnp.asarray(s, dtype), (s, 0.0, 0.0)) for s in sorted({0.0, *distances})]
+    if machine.places == "plane":
+        points: list[tuple[Any, int]] = [(None, body) for body in range(machine.body_count)]
+        for each in machine.supports:  # pyright: ignore[reportAttributeAccessIssue]
+            points += [(each.at, each.body)] + ([] if each.to is None else [(each.at_other, each.to)])
+        points += [(each.at, each.body) for each in exciters]
+        return [
+            (on_body(at, body), (0.0, 0.0, 0.0) if at is None else (0.0, float(at[0]), float(at[1]))) for at, body in points
+        ]
+    return [(None, (0.0, 0.0, 0.0))]
 
 
 def _directions(scene: Scene) -> list[int]:
     """Return the numbers of the directions of a node's rows: 2 (+Y) across, 3 (+Z) up."""
-    return [2 + axis for axis in scene.mounting.axes]
+    return [2 + axis for axis in scene.machine.mounting(scene.exciters[0].place).axes]
 
 
 def _head(scene: Scene, path: Path) -> list[dict[str, Any]]:
@@ -221,13 +242,15 @@ def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_s
     model = state_space(scene, rotor_speed=rotor_speed)
     nd, start = len(model.A) // 2, list(_ORDERS).index(quantity)
     found = model.frequency_response(2.0 * np.pi * x)[:, start * nd : (start + 1) * nd, nd:]
-    mounted = np.asarray(scene.mount().rows[0])
-    exciter = next((node.number for node in nodes if np.array_equal(node.rows, mounted)), 0)
+    references: dict[tuple[int, int], np.ndarray] = {}  # exciters at one place are one reference
+    columns = iter(np.moveaxis(found, 2, 0))
+    for each in scene.exciters:
+        mounted = np.asarray(scene.machine.mount(each.place).rows[0])
+        node = next((node.number for node in nodes if np.array_equal(node.rows, mounted)), 0)
+        references |= {(node, direction): next(columns) for direction in directions}
     return [
-        _function(
-            x, (node.rows @ found)[:, k, j], _RESPONSE, quantity, (node.number, direction), (exciter, reference), _FREQUENCY
-        )
-        for j, reference in enumerate(directions)
+        _function(x, (node.rows @ moved.T)[k], _RESPONSE, quantity, (node.number, direction), reference, _FREQUENCY)
+        for reference, moved in references.items()
         for node in nodes
         for k, direction in enumerate(directions)
     ]

@@ -47,6 +47,54 @@ def test_responses_go_through_pyuff_and_back(responses):
     assert read.nodes == {1: (0.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0), 3: (2.0, 0.0, 0.0)}
 
 
+def screen(*others):
+    """A body in a plane with two unbalances of opposite directions, and two more at the place of the first."""
+    supports = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.2, 1.2)]
+    motor = jv.DCMotor(120.0, stall_torque=8.0, inertia=0.2)
+    places = [((-0.2, 0.4), 1), ((0.3, 0.4), -1), *others]
+    exciters = [jv.Exciter(drive=motor, unbalance=0.2, at=at, direction=direction) for at, direction in places]
+    return jv.Scene(jv.plane_body(mass=2000.0, inertia=600.0, supports=supports), exciters=exciters)
+
+
+def test_responses_of_a_body_are_those_of_its_points(home):
+    """A point (a, b) moves by (x - b psi, y + a psi), and a force there has the moment of its lever."""
+    path = jv.export_uff(screen(((-0.2, 0.4), -1)), home / "screen.unv", frequencies=np.arange(1.0, 40.0))
+    read, model = jv.read_uff(path), jv.state_space(screen())
+    assert read.nodes == {
+        1: (0.0, 0.0, 0.0), 2: (0.0, -1.2, -0.2), 3: (0.0, 1.2, -0.2), 4: (0.0, -0.2, 0.4), 5: (0.0, 0.3, 0.4)
+    }  # fmt: skip
+    found = {(each.response, each.reference): each.values for each in read.functions}
+    assert len(found) == len(read.functions) == 5 * 2 * 2 * 2
+    by_force = model.frequency_response(2.0 * np.pi * read.functions[0].x)[:, :3, :3]
+    for ((node, way), (at, along)), values in found.items():
+        rows = [np.array([[1.0, 0.0, -read.nodes[n][2]], [0.0, 1.0, read.nodes[n][1]]]) for n in (node, at)]
+        expected = np.einsum("i,wij,j->w", rows[0][way - 2], by_force, rows[1][along - 2])
+        np.testing.assert_allclose(values, expected, rtol=1e-9, atol=1e-11 * np.max(np.abs(expected)))
+    sets = pyuff.UFF(str(path)).read_sets()
+    modes = [each for each in sets if each["type"] == 55]
+    assert len(modes) == 3 and {each["analysis_type"] for each in modes} == {3}
+    for each in modes:  # a rigid body: two points determine the third
+        turn = (each["r2"][0] - each["r2"][3]) / 0.4
+        np.testing.assert_allclose(each["r3"][4] - each["r3"][0], 0.3 * turn, atol=2e-5)
+
+
+def test_responses_have_a_reference_for_each_exciter(home):
+    balls = loads()["balls"]
+    two = [jv.Exciter(balls, jv.ConstantSpeed(120.0), at=k) for k in (1, 2)]
+    read = jv.read_uff(jv.export_uff(jv.Scene(jv.two_mass(**TWO_MASS), exciters=two), home / "two.unv")).functions
+    assert [(each.response, each.reference) for each in read] == [((k, 3), (j, 3)) for j in (1, 2) for k in (1, 2)]
+    np.testing.assert_allclose(read[1].values, read[2].values, rtol=1e-9, atol=1e-16)  # reciprocity
+
+
+def test_histories_of_a_body_are_those_of_its_points(home):
+    run = jv.simulate(screen(), 1.0, estimate=False)
+    read = {e.response: e for e in jv.read_uff(jv.export_uff(run, home / "screen_run.unv")).functions if e.kind == "history"}
+    x, y, psi = np.asarray(run.trajectory.state.displacement).T
+    np.testing.assert_allclose(read[5, 2].values, x - 0.4 * psi, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(read[5, 3].values, y + 0.3 * psi, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(read[0, 2].values, run.trajectory.foundation_force[:, 0], rtol=1e-9, atol=1e-9)
+
+
 def test_histories_go_through_pyuff_and_back(run, histories):
     read, kept = jv.read_uff(histories), run.trajectory
     found = {each.response: each for each in read.functions if each.kind == "history"}

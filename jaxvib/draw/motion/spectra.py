@@ -18,8 +18,8 @@ _DECADES = 1e-4
 def spectrum_chart(
     frequency: np.ndarray,
     series: Mapping[str, np.ndarray],
-    rotor_speed: np.ndarray,
-    load_speed: np.ndarray,
+    rotor_speeds: np.ndarray,
+    load_speeds: np.ndarray,
     resonances: np.ndarray,
     *,
     unit: SpeedUnit | None = None,
@@ -27,8 +27,8 @@ def spectrum_chart(
 ) -> Drawn:
     """Draw amplitudes (nf,) by name with unit, on a log scale, over frequency (nf,), with reference lines.
 
-    Vertical lines are the rotor speed (1,), the mean load speed and the resonances. Frequencies and speeds are in rad/s, drawn
-    in `unit`.
+    Vertical lines are the rotor speeds (1, E), the load speeds (1, L) and the resonances. Frequencies and speeds are in rad/s,
+    drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
@@ -38,8 +38,10 @@ def spectrum_chart(
         axis.plot(scale * frequency, values, label=name, **look)
     for k, w in enumerate(resonances):
         axis.axvline(scale * w, color=GUIDE, lw=0.9, ls=":", label=None if k else "resonances")
-    axis.axvline(scale * float(np.mean(load_speed)), color="black", lw=0.9, ls=(0, (5, 3)), label="speed of the loads")
-    axis.axvline(scale * float(np.mean(rotor_speed)), color="black", lw=0.9, ls="-.", label="speed of the rotor")
+    marks = (("speed of the loads", load_speeds, (0, (5, 3))), ("speed of the rotor", rotor_speeds, "-."))
+    for name, speeds, stroke in marks:
+        for k, speed in enumerate(np.abs(speeds[0])):
+            axis.axvline(scale * float(speed), color="black", lw=0.9, ls=stroke, label=None if k else name)
     axis.set_yscale("log")
     axis.set_ylim(_DECADES * top, 2.0 * top)
     axis.set_xlim(0.0, scale * float(frequency[-1]))
@@ -54,8 +56,8 @@ def waterfall_chart(
     frequency: np.ndarray,
     name: str,
     values: np.ndarray,
-    rotor_speed: np.ndarray,
-    load_speed: np.ndarray,
+    rotor_speeds: np.ndarray,
+    load_speeds: np.ndarray,
     resonances: np.ndarray,
     *,
     unit: SpeedUnit | None = None,
@@ -63,8 +65,8 @@ def waterfall_chart(
 ) -> Drawn:
     """Draw amplitudes (P, nf) as shades of grey over time (P,), s, and frequency (nf,); `name` includes their unit.
 
-    The rotor speed and the load speed (P,) are drawn as lines, resonances as horizontal lines. Frequencies and speeds are in
-    rad/s, drawn in `unit`.
+    The rotor speeds (P, E) and the load speeds (P, L) are drawn as lines, resonances as horizontal lines. Frequencies and
+    speeds are in rad/s, drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.4), ax=ax)
@@ -82,8 +84,10 @@ def waterfall_chart(
     axis.grid(False)
     for k, w in enumerate(resonances):
         axis.axhline(scale * w, color=COLORS[0], lw=1.0, ls=":", label=None if k else "resonances")
-    axis.plot(time, scale * load_speed, color=COLORS[1], lw=1.4, ls=(0, (5, 3)), label="speed of the loads")
-    axis.plot(time, scale * rotor_speed, color=COLORS[2], lw=1.4, ls="-.", label="speed of the rotor")
+    marks = (("speed of the loads", load_speeds, COLORS[1], (0, (5, 3))), ("speed of the rotor", rotor_speeds, COLORS[2], "-."))
+    for name, speeds, color, stroke in marks:
+        for k, speed in enumerate(np.abs(speeds).T):
+            axis.plot(time, scale * speed, color=color, lw=1.4, ls=stroke, label=None if k else name)
     axis.set_ylim(0.0, scale * float(frequency[-1]))
     axis.set_xlabel("time, s")
     axis.set_ylabel(f"frequency, {unit}")

@@ -45,7 +45,8 @@ class Spectrum(Result):
     - `frequency` (nf,), rad/s; its resolution is about 2 pi divided by the duration of a segment
     - `amplitude` (P, nf, nd), m (rad for tilts)
     - `force` (P, nf, nb), N, on the foundation
-    - `rotor_speed` and `load_speed` (P,), rad/s: means over the segments
+    - `rotor_speeds` (P, E), rad/s, of the E exciters, and `load_speeds` (P, L), rad/s, of the L exciters with loads: means over
+      the segments and the loads
     - `resonances` (nd,), rad/s: estimated natural frequencies
     - `coordinates` and `units` (nd,): names of the coordinates, and their units
     """
@@ -56,8 +57,8 @@ class Spectrum(Result):
     frequency: np.ndarray = eqx.field(metadata=in_unit("rad/s", "frequency"))
     amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "piece", "frequency", "coordinate"))
     force: np.ndarray = eqx.field(metadata=in_unit("N", "piece", "frequency", "direction"))
-    rotor_speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece"))
-    load_speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece"))
+    rotor_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece", "exciter"))
+    load_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece", "exciter_with_loads"))
     resonances: np.ndarray = eqx.field(metadata=in_unit("rad/s", "resonance"))
     coordinates: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
@@ -112,7 +113,7 @@ class Spectrum(Result):
         else:
             wanted = [k for k, name in enumerate(self.coordinates) if coordinate in (None, name)]
             series = {f"{self.coordinates[k]}, m{self.units[k]}": 1e3 * self.amplitude[:, :, k] for k in wanted}
-        marks = (self.rotor_speed, self.load_speed, self.resonances)
+        marks = (self.rotor_speeds, self.load_speeds, self.resonances)
         if self.time.size == 1:
             return spectrum_chart(self.frequency, {k: v[0] for k, v in series.items()}, *marks, unit=unit, ax=ax)
         strongest = max(series, key=lambda name: np.max(series[name]))
@@ -136,8 +137,9 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     step = float(time[1] - time[0])
     points = _ZERO_PADDING_FACTOR * 2 ** int(np.ceil(np.log2(size)))
     frequency = 2.0 * np.pi * np.fft.rfftfreq(points, step)
-    speed = np.asarray(kept.rotor_speed, float)
-    keep = frequency <= _MAX_FREQUENCY_RATIO * max(float(np.max(np.abs(speed))), 1e-300)
+    speeds = np.stack([np.asarray(each, float) for each in kept.rotor_speeds], axis=1)
+    rates = [np.mean(np.asarray(each.rate[0], float), axis=1) for each in kept.state.exciters if each.rate]
+    keep = frequency <= _MAX_FREQUENCY_RATIO * max(float(np.max(np.abs(speeds))), 1e-300)
     weight = np.hanning(size)
 
     def amplitudes(values: np.ndarray) -> np.ndarray:
@@ -146,7 +148,7 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
         return 2.0 / np.sum(weight) * np.abs(np.fft.rfft(pieces, points, axis=1))[:, keep]
 
     def means(values: np.ndarray) -> np.ndarray:
-        return np.array([np.mean(values[s : s + size]) for s in starts])
+        return np.array([np.mean(values[s : s + size], axis=0) for s in starts])
 
     structure = scene.machine.structure()
     return Spectrum(
@@ -154,8 +156,8 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
         frequency=frequency[keep],
         amplitude=amplitudes(np.asarray(kept.state.displacement, float)),
         force=amplitudes(np.asarray(kept.foundation_force, float)),
-        rotor_speed=means(speed),
-        load_speed=means(np.mean(np.asarray(kept.state.azimuth_rate, float), axis=1)),
+        rotor_speeds=means(speeds),
+        load_speeds=means(np.stack(rates, axis=1) if rates else np.zeros((time.size, 0))),
         resonances=np.asarray(estimated_frequencies(scene), float),
         coordinates=structure.coordinates,
         units=structure.units,

@@ -31,3 +31,18 @@ def test_pieces_of_a_spectrum_share_their_halves(parts, size):
     peak, row = found.amplitude[-1, :, 0], 2.0 * np.pi / (size * step)
     at = np.interp(28.0 + row * np.array([-2.0, -1.0, 0.0, 1.0, 2.0]), found.frequency, peak)
     np.testing.assert_allclose(at, [0.0, 0.5, 1.0, 0.5, 0.0], atol=0.03)
+
+
+def test_spectrum_marks_the_speed_of_each_exciter():
+    """Unbalances at 60 and 90 rad/s, clockwise and anticlockwise, on a platform far above its resonance: a peak at each."""
+    exciters = [jv.Exciter(drive=jv.ConstantSpeed(w), unbalance=0.1, direction=d, at=1) for w, d in ((60.0, 1), (90.0, -1))]
+    scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e3, damping=300.0), exciters=exciters)
+    found = jv.simulate(scene, 20.0, estimate=False).spectrum()
+    np.testing.assert_allclose(found.rotor_speeds, [[60.0, -90.0]])
+    assert found.load_speeds.shape == (1, 0)
+    for w, expected in ((60.0, 0.1 * 60.0**2), (90.0, 0.1 * 90.0**2)):
+        near = np.abs(found.frequency - w) < 5.0
+        height = expected / abs(4e3 - 50.0 * w**2 + 300.0j * w)
+        np.testing.assert_allclose(np.max(found.amplitude[0, near, 0]), height, rtol=0.03)
+    drawn = found.plot(unit="rad/s").axes[0]
+    assert sorted(round(line.get_xdata()[0], 6) for line in drawn.lines if line.get_linestyle() == "-.") == [60.0, 90.0]
