@@ -120,6 +120,7 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 # Recorded runs of a machine
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
+from jaxvib.exchange.recordings.read import read_recording, read_run
 
 # Capture in a torus
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
@@ -313,6 +314,8 @@ __all__ = [
     # Recorded runs of a machine
     "Channel",
     "MeasuredRun",
+    "read_run",
+    "read_recording",
     # Capture in a torus
     "capture",
     "Capture",

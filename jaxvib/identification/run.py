@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -14,12 +14,17 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.identification.records.agreement import check_agreement
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.records.pulses import numbered_pulses, rising_edges
+from jaxvib.identification.records.recorded import described_channels, recorded_from_sep005
 from jaxvib.identification.records.sampling import clipped_at, even_samples, require_ascending
 from jaxvib.results.table import is_number
 from jaxvib.units import Number, number
 
 _FULL = 0.999
 """Share of the range of a sensor above which a reading counts as clipped."""
+
+
+_QUANTITIES = {"acceleration": "a", "velocity": "v", "displacement": "d", "force": "f"}
+"""Names of kinds by SEP-005."""
 
 
 class Change(NamedTuple):
@@ -103,6 +108,52 @@ class MeasuredRun(eqx.Module):
         notes += check_agreement(channels, its_times, its_values, source)
         clipped = {name: each.clipped for name, each in found.items()}
         return cls(tuple(channels), its_times, its_values, clipped, parsed, tuple(notes), source)
+
+    @classmethod
+    @validated
+    def from_sep005(
+        cls,
+        channels: Sequence[Channel],
+        timeseries: Sequence[Mapping[str, Any]],
+        change: Mapping[str, Number] | None = None,
+        source: str = "run",
+    ) -> MeasuredRun:
+        """Return a run from dictionaries by SEP-005, the form in which the packages of SDyPy exchange measurements.
+
+        **Arguments**
+
+        - `channels`: one `Channel` for each recorded quantity
+        - `timeseries`: dictionaries with `data`, `name`, `unit_str`, and `fs` (Hz) or `time` (s)
+        - `change` and `source` as for `from_arrays`
+
+        **Returns** `MeasuredRun`. **Raises** `InputError` for a missing entry, and for samples that cannot be used.
+
+        >>> import numpy as np, jaxvib as jv
+        >>> frame = {"name": "frame", "unit_str": "g", "fs": 1000.0, "data": np.sin(0.05 * np.arange(2000))}
+        >>> run = jv.MeasuredRun.from_sep005([jv.Channel("frame", "acceleration", at=1)], [frame])
+        >>> run.to_sep005()[0]["unit_str"], round(float(np.max(run.values["frame"])), 3)
+        ('m/s^2', 9.807)
+        """
+        times, values = described_channels(recorded_from_sep005(timeseries, source), channels, source)
+        return cls.from_arrays(channels, times, values, change, source)
+
+    def to_sep005(self) -> list[dict[str, Any]]:
+        """Return the channels as dictionaries by SEP-005, in SI units: `name`, `data`, `unit_str`, `fs` (Hz) and `quantity`.
+
+        Channels of pulses, and channels that do not begin at 0 s, have a list `time` (s).
+        """
+        found = []
+        for channel in self.channels:
+            time = self.times[channel.name]
+            entry: dict[str, Any] = {"name": channel.name, "data": self.values[channel.name], "unit_str": UNITS[channel.kind]}
+            if channel.kind in _QUANTITIES:
+                entry["quantity"] = _QUANTITIES[channel.kind]
+            if channel.kind != "pulses":
+                entry["fs"] = self.rate(channel.name)
+            if channel.kind == "pulses" or time[0] != 0.0:
+                entry["time"] = time.tolist()
+            found.append(entry)
+        return found
 
     def of_kind(self, *kinds: str) -> tuple[Channel, ...]:
         """Return the channels of the given `kinds`."""

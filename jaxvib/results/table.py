@@ -22,6 +22,10 @@ _MISSING = ("", "-", "nan", "na", "n/a", "#n/a", "null", "none")
 """Texts, in lower case, in place of a reading that is missing."""
 
 
+_ONE_COLUMN_MARK = "\n"
+"""Mark of a table with one column: it occurs in no line."""
+
+
 class TextTable(NamedTuple):
     """Table of numbers in a text file.
 
@@ -32,7 +36,7 @@ class TextTable(NamedTuple):
     - `width`: number of columns
     - `remarks`: lines above the head, and those that begin with #
     - `first`: number of lines with content above the first row of numbers
-    - `mark`: character between columns, None for blanks
+    - `mark`: character between columns, None for blanks, a line break for one column
     """
 
     path: Path
@@ -52,7 +56,8 @@ class TextTable(NamedTuple):
         **Raises** `InputError` with the line, for a row of another width and for a text that is not a finite number.
         """
         try:
-            found = np.loadtxt(self._texts(), delimiter=self.mark, usecols=places, comments=None, quotechar='"', ndmin=2)
+            mark = None if self.mark == _ONE_COLUMN_MARK else self.mark
+            found = np.loadtxt(self._texts(), delimiter=mark, usecols=places, comments=None, quotechar='"', ndmin=2)
         except ValueError:
             found = None
         if found is not None and np.all(np.isfinite(found)):
@@ -113,13 +118,13 @@ def read_table(path: str | Path, needs: str) -> TextTable:
     texts = [text for _, text in itertools.islice(_content(path), _MAX_PREAMBLE + 2)]
     if not texts:
         raise InputError(str(path), f"contains no lines of numbers; it needs {needs}")
-    mark, count = _mark(texts[0]), 0
+    mark, count = _mark(texts), 0
     while count < min(2, len(texts)) and not _has_number(texts[count], mark):
         count += 1
     start = 0
     if not _is_table(texts[: count + 2], mark):
         for k in range(1, len(texts) - 1):
-            own = _mark(texts[k])
+            own = _mark(texts[k:])
             if _has_number(texts[k], own) or not _has_number(texts[k + 1], own) or not _is_table(texts[k : k + 3], own):
                 continue
             alike = [above for above in texts[:k] if _is_table([above, texts[k]], own)]
@@ -156,8 +161,11 @@ def _is_table(texts: list[str], mark: str | None) -> bool:
     return len({len(_cells(text, mark)) for text in texts}) == 1
 
 
-def _mark(text: str) -> str | None:
-    return next((mark for mark in (";", "\t", ",") if mark in text), None)
+def _mark(texts: list[str]) -> str | None:
+    """Return the character between columns from the first lines of a table; None for blanks, a line break for one column."""
+    mark = next((mark for mark in (";", "\t", ",") if mark in texts[0]), None)
+    row = next((text for text in texts if _has_number(text, mark)), texts[0])
+    return _ONE_COLUMN_MARK if mark is None and len(row.split()) == 1 else mark
 
 
 def _cells(text: str, mark: str | None) -> list[str]:

@@ -51,19 +51,27 @@ _SPELLINGS: dict[str, dict[str, float]] = {
 }
 """Units in the heads of columns by the SI unit, in lower case; heads may be in upper or lower case."""
 
+_MULTIPLE = re.compile(r"^(\d+\.?\d*(?:[eE][+-]?\d+)?)\s+([^\s\d/].*)$")
 _HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[{]\s*(?P<unit>[^)\]}]*?)\s*[)\]}]|/\s*(?P<per>\S+))$")
 _TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
 
 
 def unit_factor(unit: str, si: str) -> float | None:
-    """Return the factor from a unit in the head of a column to an SI unit; None for another dimension or an unknown unit.
+    """Return the factor from a unit in the head of a column, or from a multiple of a unit, to an SI unit; None for another
+    dimension or an unknown unit.
 
-    >>> unit_factor("G", "m/s^2"), unit_factor("mm/s", "m/s"), unit_factor("mm", "N")
-    (9.80665, 0.001, None)
+    >>> unit_factor("G", "m/s^2"), unit_factor("mm/s", "m/s"), unit_factor("mm", "N"), unit_factor("50 kN", "N")
+    (9.80665, 0.001, None, 50000.0)
     """
     unit = unit.strip()
     factor = _SPELLINGS.get(si, {}).get(unit.lower())
-    return factor if factor is not None else unit_ratio(unit, si) if unit and si else None
+    if factor is not None:
+        return factor
+    multiple = _MULTIPLE.match(unit)
+    if multiple is not None:
+        one = unit_factor(multiple[2], si)
+        return None if one is None or float(multiple[1]) == 0.0 else float(multiple[1]) * one
+    return unit_ratio(unit, si) if unit and si else None
 
 
 def split_head(head: str, si: str) -> tuple[str, str]:

@@ -48,7 +48,8 @@ class Channel(eqx.Module):
       place of the exciter
     - `direction` in which a positive reading points: "up", "down", "across", "-across", or a pair (across, up) of any length;
       default: up
-    - `unit` of the samples, such as "g", "mm/s" or "rpm"; default: the unit stated in the file, otherwise the SI unit
+    - `unit` of the samples, such as "g", "mm/s" or "rpm", or a multiple of a unit, such as "10 g" for a file in V of a sensor
+      with 100 mV/g; default: the unit stated in the file, otherwise the SI unit
     - `gain_error`: relative standard uncertainty of the gain; default: 0.01 for acceleration, 0 for other kinds; typical: 0.01
       to 0.05
     - `delay`, s, of the readings behind the motion; typical: 0 to 1e-3

@@ -1,0 +1,240 @@
+"""Files of recorders: CSV, TDMS, universal files (UFF 58), MATLAB, WAV, MF4.
+
+Each reader returns the channels of a file with their names, units and times. Libraries of formats other than CSV are optional.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxvib.errors import InputError, open_regular, quoted
+from jaxvib.exchange.optional import optional_module
+from jaxvib.exchange.uff import read_uff
+from jaxvib.identification.records.recorded import Recorded
+from jaxvib.results.table import read_table
+from jaxvib.units.columns import split_head, unit_factor
+
+_MAX_BYTES = 2**32
+_TIME_NAMES = ("time", "t", "times", "timestamp", "x_value", "zeit", "время")
+"""Names of a channel of times, in lower case."""
+
+_RATE_NAMES = ("rate", "fs", "sampling rate", "sample rate", "samplerate", "sampling frequency", "sampling_rate", "abtastrate")
+"""Names of the sampling rate, in lower case."""
+
+_RATE = re.compile(rf"^\W*({'|'.join(_RATE_NAMES)})\b[^\d;,\t]*[;,\t:=\s]\W*([\d.]+(?:e\d+)?)\s*(k?hz)?", re.IGNORECASE)
+
+_SI = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force": "N"}
+
+
+def read_channels(path: Path, rate: float | None) -> list[Recorded]:
+    """Return the channels of a file; its name ends in the name of its format.
+
+    **Arguments**: `rate`, Hz, replaces the times of the file.
+
+    **Raises** `InputError` for a file that cannot be read or has no channel, and if a library is not installed.
+    """
+    reader = _READERS.get(path.suffix.lower(), _read_text)
+    try:
+        with open_regular(path) as file:
+            size = file.seek(0, os.SEEK_END)
+    except OSError as error:
+        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a recording") from error
+    if size > _MAX_BYTES:
+        raise InputError(str(path), f"is larger than {_MAX_BYTES >> 30} GB; split it")
+    try:
+        channels = list(reader(path, rate))
+    except InputError:
+        raise
+    except Exception as error:  # libraries raise any class of error for a damaged file
+        kind = _NAMES.get(reader, "recording")
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(str(path), f"cannot be read as a {kind} file ({why}); export it again") from error
+    if not channels:
+        raise InputError(str(path), "contains no channel of numbers; export the channels that were recorded")
+    channels = [each._replace(values=np.asarray(each.values, float)) for each in _with_own_names(channels)]
+    if rate is None:
+        return channels
+    return [each._replace(time=np.arange(each.values.size) / rate) for each in channels]
+
+
+def _with_own_names(channels: list[Recorded]) -> list[Recorded]:
+    """Return channels of which each has its own name: a number follows a name that occurs more than once."""
+    counts, seen = Counter(each.name for each in channels), Counter()
+    found = []
+    for each in channels:
+        seen[each.name] += 1
+        found.append(each._replace(name=f"{each.name} {seen[each.name]}") if counts[each.name] > 1 else each)
+    return found
+
+
+def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
+    table = read_table(path, "time and readings")
+    heads = table.heads or [f"column {k + 1}" for k in range(table.width)]
+    split = [split_head(head, "s") for head in heads]
+    if table.units:
+        split = [(name, unit or below) for (name, unit), below in zip(split, table.units, strict=True)]
+    clocks = [k for k, (name, _) in enumerate(split) if name.lower() in _TIME_NAMES]
+    if not table.heads and table.width > 1 and rate is None:
+        clocks = [0]
+    if rate is None and not clocks:
+        rate = _stated_rate(table.remarks)
+        if rate is None:
+            names = ", ".join(heads)
+            raise InputError(
+                str(path),
+                f"has no column of times; its columns are {names}: name one 'time (s)', write a line '# rate: 2000 Hz', or "
+                "give rate",
+            )
+    places = [k for k in range(table.width) if k not in clocks]
+    if not places:
+        raise InputError(str(path), "has a column of times only; give a file with readings")
+    time = None
+    if rate is None:
+        unit = split[clocks[0]][1] or "s"
+        factor = unit_factor(unit, "s")
+        if factor is None:
+            raise InputError(f"{path}: unit of time", f"is {quoted(unit)}, which is not a unit of time; write s, ms, us or min")
+        time = table.values(clocks[:1], ["time"])[:, 0] * factor
+    values = table.values(places, [split[k][0] for k in places], missing=True)
+    if time is None and rate is not None:
+        time = np.arange(len(values)) / rate
+    for n, k in enumerate(places):
+        yield Recorded(split[k][0], split[k][1], time, values[:, n])
+
+
+def _stated_rate(remarks: list[str]) -> float | None:
+    """Return the sampling rate, Hz, that a line above the table states."""
+    for line in remarks:
+        found = _RATE.match(line)
+        if found is not None and float(found[2]) > 0.0:
+            return float(found[2]) * (1e3 if (found[3] or "").lower() == "khz" else 1.0)
+    return None
+
+
+def _read_tdms(path: Path, rate: float | None) -> Iterator[Recorded]:
+    tdms = optional_module("nptdms", "tdms").TdmsFile.read(str(path))
+    for group in tdms.groups():
+        channels = [each for each in group.channels() if np.issubdtype(each.dtype, np.number)]
+        clock = next((each for each in channels if each.name.lower() in _TIME_NAMES), None)
+        for each in channels:
+            if each is clock:
+                continue
+            time = None
+            if each.properties.get("wf_increment"):
+                time = each.properties.get("wf_start_offset", 0.0) + each.properties["wf_increment"] * np.arange(len(each))
+            elif clock is not None:
+                time = np.asarray(clock[:], float)
+            unit = each.properties.get("unit_string") or each.properties.get("NI_UnitDescription") or ""
+            yield Recorded(each.name, str(unit), time, each[:])
+
+
+def _read_uff(path: Path, rate: float | None) -> Iterator[Recorded]:
+    for each in read_uff(path).functions:
+        if each.kind == "history":
+            yield Recorded(each.about or f"node {each.response[0]}", _SI.get(each.quantity, ""), each.x, np.real(each.values))
+
+
+def _read_wav(path: Path, rate: float | None) -> Iterator[Recorded]:
+    wavfile = optional_module("scipy.io.wavfile", "mat")
+    with warnings.catch_warnings():  # of chunks with notes
+        warnings.simplefilter("ignore", wavfile.WavFileWarning)
+        own, data = wavfile.read(path)
+    if np.issubdtype(data.dtype, np.integer):
+        half = 2.0 ** (8 * data.dtype.itemsize - 1)
+        data = (data.astype(float) - (half if data.dtype == np.uint8 else 0.0)) / half
+    columns = data.reshape(len(data), -1).T
+    for k, values in enumerate(columns, 1):
+        yield Recorded(f"channel {k}", "", np.arange(values.size) / own, values)
+
+
+def _read_mf4(path: Path, rate: float | None) -> Iterator[Recorded]:
+    with optional_module("asammdf", "mf4").MDF(path) as file:
+        for signal in file.iter_channels():
+            if signal.samples.ndim == 1 and np.issubdtype(signal.samples.dtype, np.number):
+                yield Recorded(signal.name, signal.unit or "", np.array(signal.timestamps, float), np.array(signal.samples))
+
+
+def _read_mat(path: Path, rate: float | None) -> Iterator[Recorded]:
+    scipy_io = optional_module("scipy.io", "mat")
+    objects: list[str] = []
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = scipy_io.loadmat(path, squeeze_me=True)
+        plain = dict(_flat({k: v for k, v in content.items() if not k.startswith("__")}, "", objects))
+    except NotImplementedError:  # version 7.3
+        with optional_module("h5py", "mat").File(path) as file:
+            plain = dict(_flat_hdf(file, "", objects))
+    clocks = {
+        name: value for name, value in plain.items() if name.rpartition(".")[2].lower() in _TIME_NAMES and value.ndim == 1
+    }
+    scalars = {name.lower(): float(value) for name, value in plain.items() if value.size == 1}
+    stated = next((scalars[name] for name in _RATE_NAMES if scalars.get(name, 0.0) > 0.0), None)
+    found = False
+    for name, value in plain.items():
+        if name in clocks or value.size < 2:
+            continue
+        columns = [value] if value.ndim == 1 else list(value if value.shape[0] < value.shape[1] else value.T)
+        folder = name.rpartition(".")[0]
+        near = [clock for each, clock in clocks.items() if each.rpartition(".")[0] == folder] or list(clocks.values())
+        for k, column in enumerate(columns):
+            fits = next((clock for clock in near if clock.size == column.size), near[0] if near else None)
+            time = np.asarray(fits, float) if fits is not None else np.arange(column.size) / stated if stated else None
+            found = True
+            yield Recorded(name if len(columns) == 1 else f"{name}[{k}]", "", time, column)
+    if objects and not found:
+        raise InputError(
+            str(path),
+            f"holds objects of MATLAB ({', '.join(objects[:5])}), such as timetables or Simulink data, which only MATLAB can "
+            "read; save arrays there, for example t = x.Time; a = x.Data; save('run.mat', 't', 'a')",
+        )
+
+
+def _flat(value: Any, name: str, objects: list[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the arrays of numbers in variables and structures by dotted names; names of objects are added to `objects`."""
+    if type(value).__name__ in ("MatlabOpaque", "MatlabFunction", "MatlabObject"):
+        objects.append(name if name not in ("", "None") else "a variable without a name")
+        return
+    array = np.asarray(value)
+    if isinstance(value, dict) or (array.dtype.names is not None and array.ndim == 0):
+        for key in value if isinstance(value, dict) else array.dtype.names or ():
+            yield from _flat(
+                value[key] if isinstance(value, dict) else array[key][()], f"{name}.{key}" if name else key, objects
+            )
+    elif array.dtype.kind in "iufb" and array.ndim <= 2:
+        yield name, array
+
+
+def _flat_hdf(group: Any, name: str, objects: list[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the arrays of numbers of a file of version 7.3, as `_flat` does."""
+    for key, each in group.items():
+        if key.startswith("#"):  # storage of references and of objects
+            continue
+        own = f"{name}.{key}" if name else key
+        kind = each.attrs.get("MATLAB_class", b"")
+        kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+        if "MATLAB_object_decode" in each.attrs or kind in ("timetable", "table", "timeseries", "string"):
+            objects.append(own)
+        elif hasattr(each, "items"):
+            yield from _flat_hdf(each, own, objects)
+        elif each.dtype.kind in "iuf" and kind not in ("char", "cell") and each.ndim <= 2:
+            yield own, np.squeeze(each[()])
+
+
+_READERS = {
+    ".tdms": _read_tdms,
+    **dict.fromkeys((".uff", ".unv", ".uf", ".58"), _read_uff),
+    ".mat": _read_mat,
+    ".wav": _read_wav,
+    **dict.fromkeys((".mf4", ".mdf"), _read_mf4),
+}
+
+_NAMES = {_read_tdms: "TDMS", _read_uff: "UFF", _read_mat: "MATLAB", _read_wav: "WAV", _read_mf4: "MF4"}
