@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import operator
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +14,25 @@ from jax import Array
 NODES = 4
 """Number of neighbouring samples whose values and slopes a polynomial interpolates."""
 
-
-def _hermite() -> np.ndarray:
-    """Matrix from values and slopes at the nodes 0, 1, 2, 3 to polynomial coefficients, lowest power first."""
-    nodes, powers = np.arange(NODES)[:, None], np.arange(2 * NODES)[None, :]
-    return np.linalg.inv(np.concatenate([1.0 * nodes**powers, powers * 1.0 * nodes ** np.maximum(powers - 1, 0)]))
+_MIDDLE = (NODES - 1) / 2.0
+"""Origin of the polynomial, in steps from its first sample."""
 
 
-_COEFFICIENTS = _hermite()
+def _hermite() -> tuple[np.ndarray, np.ndarray]:
+    """Matrices (4, 3) and (4, 4) to the even and the odd coefficients, see `_polynomial`.
+
+    They act on the sums and the differences of two values or slopes: those at -1/2 and 1/2, and those at -3/2 and 3/2. The sum
+    of the inner values is not among them, since the values are relative to it.
+    """
+    nodes, even = np.asarray([[0.5], [1.5]]), np.asarray([0, 2, 4, 6])
+
+    def inverse(powers: np.ndarray) -> np.ndarray:
+        return 0.5 * np.linalg.inv(np.concatenate([nodes**powers, powers * nodes ** np.maximum(powers - 1, 0)]))
+
+    return inverse(even)[:, 1:], inverse(even + 1)
+
+
+_EVEN, _ODD = _hermite()
 
 
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -38,23 +51,12 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """
     n, half = len(x), len(x) // 2
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
-    before = jnp.asarray(np.arange(n - 1) - first, x.dtype)
-    polynomial = _polynomial(jnp.stack([x[first + k] for k in range(NODES)]), jnp.stack([v[first + k] for k in range(NODES)]))
-    slope = _derivative(polynomial)
-    bend = _derivative(slope)  # the second derivative
-    # `turns`: True if an extremum lies between two samples.
-    turns = v[:-1] * v[1:] < 0.0
-
-    def nearer(_: int, share: Array) -> Array:
-        """Newton step for the zero of the slope."""
-        curved = _at(bend, before + share)
-        change = _at(slope, before + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
-        return jax.lax.optimization_barrier(jnp.clip(share - change, 0.0, 1.0))
-
-    # Without barriers the compiler computes the polynomials anew for each use of their values.
-    start = jnp.clip(-v[:-1] / jnp.where(turns, v[1:] - v[:-1], 1.0), 0.0, 1.0)
-    share = jax.lax.fori_loop(0, 4, nearer, start, unroll=True)
-    inner = jax.lax.optimization_barrier(jnp.where(turns, _at(polynomial, before + share), x[:-1]))
+    # The first and the last four samples serve two steps each. (Slices are read faster than samples at given indices.)
+    last = n - NODES + 1
+    windows = (
+        [jnp.concatenate([y[k : k + 1], y[k : last + k], y[last + k - 1 : last + k]]) for k in range(NODES)] for y in (x, v)
+    )
+    share, inner = _extrema_between(x, v, _polynomial(*windows), np.arange(n - 1) - first - _MIDDLE)
 
     def greatest(sign: Array) -> tuple[Array, Array, Array]:
         """Maxima of `sign` times the motion over the first half of the samples, the second half and the step between them.
@@ -93,12 +95,12 @@ def extremum_value(x: Array, v: Array, place: Array) -> Array:
 
     x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` counts from the first, in steps.
     """
-    polynomial = _polynomial(x, v)
+    polynomial, s = _polynomial(x, v), place - _MIDDLE
     slope = _derivative(polynomial)
-    curved = _at(_derivative(slope), place)
+    curved = _at(_derivative(slope), s)
     inside = (place != jnp.round(place)) & (curved != 0.0)
-    move = jnp.where(inside, _at(slope, place), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
-    return _at(polynomial, place - move + jax.lax.stop_gradient(move))
+    move = jnp.where(inside, _at(slope, s), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
+    return _at(polynomial, s - move + jax.lax.stop_gradient(move))
 
 
 def greatest(values: Array) -> Array:
@@ -107,18 +109,52 @@ def greatest(values: Array) -> Array:
     return values[jnp.argmax(values)]
 
 
-def _polynomial(x: Array, v: Array) -> Array:
-    """Return the coefficients (8, ...) of the polynomial through values and slopes (4, ...) at 0, 1, 2, 3."""
-    # Relative to the first sample, so that a common offset causes no rounding.
-    changes = jnp.concatenate([x - x[:1], v])
-    found = jnp.tensordot(jnp.asarray(_COEFFICIENTS, x.dtype), changes, 1, precision="highest")
-    return jnp.concatenate([found[:1] + x[:1], found[1:]])
+def _extrema_between(x: Array, v: Array, polynomial: list[Array], start: np.ndarray) -> tuple[Array, Array]:
+    """Return the place of the extremum between each two neighbouring samples, from 0 to 1, and the value there.
+
+    Without an extremum the value is that of the first of the two samples.
+
+    **Arguments**: x, v (n,) samples and slopes, a `polynomial` for each step, and the place where the step starts on it.
+    """
+    rise, begin, end, origin = x[1:] - x[:-1], v[:-1], v[1:], jnp.asarray(start, x.dtype)
+    slope = _derivative(polynomial)
+    curvature = _derivative(slope)
+    turns = begin * end < 0.0
+    # From the zero of the slope of the cubic between the two samples, two Newton steps reach rounding.
+    bend = 3.0 * rise - 2.0 * begin - end
+    root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))
+    divisor = bend + jnp.where(begin > 0.0, -root, root)
+    share = jnp.clip(-begin / jnp.where(turns & (divisor != 0.0), divisor, 1.0), 0.0, 1.0)
+    for _ in range(2):
+        curved = _at(curvature, origin + share)
+        change = _at(slope, origin + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
+        share = jnp.clip(share - change, 0.0, 1.0)
+    # Without a barrier the compiler computes the polynomials anew for each use of their values.
+    return jax.lax.optimization_barrier((share, jnp.where(turns, _at(polynomial, origin + share), x[:-1])))
 
 
-def _derivative(polynomial: Array) -> Array:
-    powers = jnp.arange(1, len(polynomial), dtype=polynomial.dtype)
-    return polynomial[1:] * powers.reshape(-1, *(1,) * (polynomial.ndim - 1))
+def _polynomial(x: Sequence[Array] | Array, v: Sequence[Array] | Array) -> list[Array]:
+    """Return the 8 coefficients, lowest power first, of the polynomial through four values and slopes.
+
+    They are those at -3/2, -1/2, 1/2 and 3/2.
+    """
+    # Relative to the mean value of the inner samples, so that a common offset causes no rounding.
+    inner = x[1] + x[2]
+    even = x[0] + x[3] - inner, v[2] - v[1], v[3] - v[0]
+    odd = x[2] - x[1], x[3] - x[0], v[1] + v[2], v[0] + v[3]
+    parts = zip(_products(_EVEN, even), _products(_ODD, odd), strict=True)
+    constant, *found = [coefficient for pair in parts for coefficient in pair]
+    return [constant + 0.5 * inner, *found]
 
 
-def _at(polynomial: Array, s: Array) -> Array:
-    return functools.reduce(lambda value, c: value * s + c, reversed(jnp.unstack(polynomial)))
+def _products(matrix: np.ndarray, vector: Sequence[Array]) -> list[Array]:
+    """Return a product, written out because a matrix product would be computed apart from the operations beside it."""
+    return [functools.reduce(operator.add, [float(m) * y for m, y in zip(row, vector, strict=True)]) for row in matrix]
+
+
+def _derivative(polynomial: Sequence[Array]) -> list[Array]:
+    return [k * c for k, c in enumerate(polynomial)][1:]
+
+
+def _at(polynomial: Sequence[Array], s: Array) -> Array:
+    return functools.reduce(lambda value, c: value * s + c, reversed(polynomial))
