@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.cli.output import fields_of
 
@@ -40,6 +39,8 @@ def optimize(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from jaxvib.machine.files import read_toml
+    from jaxvib.machine.rewrite import rewrite_scene
     from optimize import Synthesis, load_design, synthesize
 
     loaded = load_design(design)
@@ -66,7 +67,8 @@ def optimize(
     output.keep("search.npz", best)
     path = output.file("found.toml")
     if path is not None:
-        jv.save_scene(best.scene, path)
+        source = design.parent / read_toml(design)["scene"]
+        path.write_text(rewrite_scene(source.read_text(encoding="utf-8"), best.scene), encoding="utf-8")
     output.picture("before_after.png", best.plot)
     output.picture("convergence.png", best.plot_convergence)
     if best.run is not None:

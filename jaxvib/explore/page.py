@@ -99,7 +99,7 @@ def _(mo, pictures, scene):
 def _(machine, mo, path, pictures):
     mo.sidebar(
         mo.download(
-            data=pictures.toml(machine).encode(),
+            data=pictures.toml(machine, path).encode(),
             filename=f"{path.stem}-explored.toml",
             mimetype="text/plain",
             label="Save this machine as TOML",

@@ -7,6 +7,7 @@ import functools
 import gc
 import html
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.explore.sliders import scene_at, sliders_of
 from jaxvib.machine.files import scene_to_toml
+from jaxvib.machine.rewrite import rewrite_scene
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.branches import branches
 from jaxvib.steady.jams.jam import jam_modes
@@ -75,9 +77,11 @@ def _shown(make: Callable[[], str], scene: SceneOrProblem) -> str:
     return f"<p><b>No figure:</b> {html.escape(problem)}</p>"
 
 
-def toml(scene: SceneOrProblem) -> str:
-    """Return the scene file of the scene; an empty text if there is no scene."""
-    return "" if scene.value is None else scene_to_toml(scene.value)
+def toml(scene: SceneOrProblem, source: Path | None = None) -> str:
+    """Return the scene file of the scene, with the comments and units of the file `source`; "" if there is no scene."""
+    if scene.value is None:
+        return ""
+    return scene_to_toml(scene.value) if source is None else rewrite_scene(source.read_text(encoding="utf-8"), scene.value)
 
 
 def prepare(scene: Scene) -> None:

@@ -1,0 +1,99 @@
+"""Scene files with other numbers, in which comments and units stay."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from typing import Any
+
+from jaxvib.machine.files import scene_from_toml, scene_to_toml
+from jaxvib.machine.scene import Scene
+
+_TABLE = re.compile(r"\s*\[([\w.]+)\]")
+_ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)((?:[^\"'#]|\"[^\"]*\"|'[^']*')*?)(\s*)(#\s*(.*))?")
+_NUMBER_AND_UNIT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)")
+
+_DIGITS = 8
+"""Digits of changed numbers. More would hide the size of a number from a reader."""
+
+
+def rewrite_scene(text: str, scene: Scene) -> str:
+    """Return the text of a scene file with the numbers of another scene of the same kind.
+
+    Comments, order and units stay. A changed number has 8 digits, and a comment with its old value. If the text cannot be
+    changed in this way, for example because the scene has other effects, the result is `scene_to_toml(scene)`.
+
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> scene = jv.scene_from_toml(TEMPLATES["one_mass"].replace("50 N/mm", "44 N/mm"))
+    >>> print(rewrite_scene(TEMPLATES["one_mass"], scene).splitlines()[5])
+    stiffness = "44 N/mm"  # was "50 N/mm"; of the support
+    """
+    read, new = tomllib.loads(text), tomllib.loads(scene_to_toml(scene))
+    old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
+    section, lines = "", []
+    for line in _whole_entries(text):
+        table, entry = _TABLE.match(line), _ENTRY.fullmatch(" ".join(line.split("\n")))
+        section = table[1] if table else section
+        if entry:
+            path = (*section.split("."), entry[2])
+            line = _rewritten_line(line, entry, *(_value_at(tables, path) for tables in (read, old, new)))
+        lines.append(line)
+    result = "\n".join(lines) + "\n"
+    try:
+        is_same = _is_close(tomllib.loads(scene_to_toml(scene_from_toml(result))), new)
+    except ValueError:  # the changed text is no scene file
+        is_same = False
+    return result if is_same else scene_to_toml(scene)
+
+
+def _whole_entries(text: str) -> list[str]:
+    """Return the lines of a text; the lines of a list are one entry."""
+    found: list[str] = []
+    for line in text.splitlines():
+        is_open = bool(found) and re.search(r"=\s*\[", found[-1]) and found[-1].count("[") > found[-1].count("]")
+        found[-1:] = [f"{found[-1]}\n{line}"] if is_open else [*found[-1:], line]
+    return found
+
+
+def _value_at(tables: Any, path: tuple[str, ...]) -> Any:
+    for name in path:
+        tables = tables.get(name) if isinstance(tables, dict) else None
+    return tables
+
+
+def _rewritten_line(line: str, entry: re.Match[str], read: Any, old: Any, new: Any) -> str:
+    """Return a line whose value, `read` in the file, is `old` in SI, with the value `new` in SI."""
+    if old is None or new is None or _is_close(old, new):
+        return line
+    comment = f"; {entry[6]}" if entry[6] else ""
+    former = " ".join(entry[3].split()).replace(", ]", "]").replace("[ ", "[")
+    return f"{entry[1]}{_with_unit(read, old, new)}  # was {former}{comment}"
+
+
+def _with_unit(read: Any, old: Any, new: Any) -> str:
+    """Return a value in SI as TOML, in the unit of the value that a file has: a list, a text with a unit or a number."""
+    if isinstance(new, list):
+        size = len(new)
+        reads, olds = (each if isinstance(each, list) and len(each) == size else [each] * size for each in (read, old))
+        return f"[{', '.join(map(_with_unit, reads, olds, new))}]"
+    written = _NUMBER_AND_UNIT.fullmatch(read) if isinstance(read, str) else None
+    if isinstance(new, str):
+        return f'"{new}"'
+    if not isinstance(new, float):
+        return str(new).lower()
+    if written is None or not isinstance(old, float) or old == 0.0 or float(written[1]) == 0.0:
+        return f"{new:.{_DIGITS}g}"
+    return f'"{new * float(written[1]) / old:.{_DIGITS}g}{written[2]}"'
+
+
+def _is_close(one: Any, other: Any) -> bool:
+    """Return True if two values of TOML are equal, numbers to the digits of changed numbers."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_is_close(one[name], other[name]) for name in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_is_close, one, other))
+    if isinstance(one, bool) or isinstance(other, bool) or not isinstance(one, (int, float)):
+        return one == other
+    return isinstance(other, (int, float)) and math.isclose(one, other, rel_tol=10.0 ** (1 - _DIGITS))

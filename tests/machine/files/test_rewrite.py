@@ -1,0 +1,48 @@
+"""Scene files with other numbers."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.machine.files import TEMPLATES
+from jaxvib.machine.rewrite import rewrite_scene
+
+CHANGES = [("stiffness", (1.1, 0.7)), ("mass", (1.01, 2.0))]
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_unchanged_scene_keeps_its_text(kind):
+    assert rewrite_scene(TEMPLATES[kind], jv.scene_from_toml(TEMPLATES[kind])) == TEMPLATES[kind]
+
+
+@pytest.mark.parametrize(("name", "factors"), CHANGES)
+def test_changed_numbers_are_read_back(name, factors):
+    scene = jv.scene_from_toml(TEMPLATES["two_mass"])
+    values = getattr(scene.machine, name) * np.array(factors)
+    changed = eqx.tree_at(lambda s: getattr(s.machine, name), scene, values)
+    text = rewrite_scene(TEMPLATES["two_mass"], changed)
+    again = jv.scene_from_toml(text)
+    np.testing.assert_allclose(getattr(again.machine, name), values, rtol=1e-7)
+    assert text.count("# was") == 1 and "# number of the platform with the exciter" in text
+    assert len(text.splitlines()) == len(TEMPLATES["two_mass"].splitlines())
+
+
+def test_units_of_the_source_stay():
+    source = TEMPLATES["two_mass"].replace("[5.0e4, 5.0e4]", '["50 N/mm", 5.0e4]')
+    scene = jv.scene_from_toml(source.replace("1500 rpm", "157 rad/s").replace('"50 N/mm", 5.0e4', "44e3, 6e4"))
+    text = rewrite_scene(source, scene)
+    assert 'stiffness = ["44 N/mm", 60000]  # was ["50 N/mm", 5.0e4]; N/m, of the supports to the foundation' in text
+    assert 'speed = "1499.2396 rpm"  # was "1500 rpm"' in text
+
+
+def test_lists_over_several_lines_become_one_line():
+    scene = jv.scene_from_toml(TEMPLATES["two_mass"])
+    text = rewrite_scene(jv.scene_to_toml(scene), eqx.tree_at(lambda s: s.machine.stiffness, scene, np.array([5e4, 6e4])))
+    assert "stiffness = [50000, 60000]  # was [50000.0, 50000.0]\n" in text and "mass = [\n    120.0,\n" in text
+
+
+def test_other_effects_give_a_new_file():
+    scene = jv.scene_from_toml(TEMPLATES["one_mass"])
+    shaken = jv.Scene(scene.machine, scene.loads, scene.drive, (jv.Gravity(),))
+    assert rewrite_scene(TEMPLATES["one_mass"], shaken) == jv.scene_to_toml(shaken)
