@@ -8,7 +8,7 @@ loads' masses, become without any approximation
     Y' = V - i Omega Y
     V' = A - i Omega V,     M A = - (C + n G) V - K Y + B^T e sum_j S_j e^{i psi_j} (w_j^2 - i w_j'),     S_j = m_j R_j
 
-A is the complex amplitude of the acceleration. No derivative of Y is dropped. Beats, the ringing after the passage of a
+A is the complex amplitude of the acceleration. No derivative of Y is dropped. Beats, free vibrations after the passage of a
 resonance, and the coupling of coordinates by the rotor speed are therefore included exactly.
 
 **Averaged loads.** Let I_j = kappa_j m_j R_j^2 and D_j = b_Wj R_j^2. The load's equation contains the product of two quantities
@@ -32,12 +32,12 @@ circle (two equal directions), e^T B A = 0 and the averaged equations are exact.
 The equilibria are exactly the leading-order jams: V = i Omega Y and A = -Omega^2 Y turn the equations into those of
 `steady_displacement` and `jam_rotor_speed`. Gravity and every other potential of the load's angle have mean torque 0.
 
-**Several exciters.** The same equations hold for every rotating mass, a load or an unbalanced rotor, in either direction: its
-angle in the fixed frame is sigma phi with sigma = +1 (anticlockwise) or -1, and e = (1, -i sigma). The motor of an unbalance
-gives the torque T(w) in place of that of the drag, and I is the inertia of its rotor; under an ideal drive I is infinite. All
-exciters share the amplitudes Y and V. A set of amplitudes Y_k for each exciter, Y_k' = V_k - i w_k Y_k, describes the same
-motion with Y = sum_k Y_k e^{i psi_k}, because the equations are linear in them. The rotation of a housing with the machine,
-which changes the torque of a motor by -T'(w) c q', is left out.
+**Several exciters.** The same equations are valid for every rotating mass, a load or an unbalanced rotor, in either direction:
+its angle in the fixed frame is sigma phi with sigma = +1 (anticlockwise) or -1, and e = (1, -i sigma). The motor of an
+unbalance gives the torque T(w) in place of that of the drag, and I is the inertia of its rotor; under an ideal drive I is
+infinite. All exciters share the amplitudes Y and V. A set of amplitudes Y_k for each exciter, Y_k' = V_k - i w_k Y_k,
+describes the same motion with Y = sum_k Y_k e^{i psi_k}, because the equations are linear in them. The rotation of a housing
+with the machine, which changes the torque of a motor by -T'(w) c q', is neglected.
 
 Source: the method of averaging, N. N. Bogoliubov, Yu. A. Mitropolsky, Asymptotic Methods in the Theory of Non-linear
 Oscillations, 1961; I. I. Blekhman, Synchronization in Science and Technology, 1988. The averaged equations are (1), (2) of the
@@ -75,16 +75,16 @@ LATE = math.inf
 _CIRCLE = (1.0, -1.0j)
 
 
-def mean_torque(unbalance: Array, felt: Array) -> Array:
+def mean_torque(unbalance: Array, acceleration: Array) -> Array:
     """Return -(S/2) Im(e^{-i psi} a), N m: the mean torque of a vibration on a load.
 
     **Arguments**, arrays of one shape
 
     - `unbalance` S = m R, kg m
-    - `felt` e^{-i psi} a, m/s^2: the forward circular part a = e^H B A of the acceleration of the point that carries the load,
-      relative to the phase psi of the load
+    - `acceleration` e^{-i psi} a, m/s^2: the forward circular part a = e^H B A of the acceleration of the point that carries
+      the load, relative to the phase psi of the load
     """
-    return -unbalance * felt.imag / 2.0
+    return -unbalance * acceleration.imag / 2.0
 
 
 class Amplitudes(eqx.Module):
@@ -147,20 +147,20 @@ class Averaged(eqx.Module):
             unforced = unforced - self.gyroscopic_speed(speeds) * times(self.gyroscopic, state.velocity)
 
         circle, levers = self._circle(), self.levers
-        push = jnp.sum(self.input_matrix * circle, axis=1)
+        input_column = jnp.sum(self.input_matrix * circle, axis=1)
         output_row = jnp.sum(self.port * jnp.conj(circle), axis=1)
-        accelerance = jnp.sum(output_row[:, None, :] * push[None, :, :], axis=-1)
+        accelerance = jnp.sum(output_row[:, None, :] * input_column[None, :, :], axis=-1)
 
-        def pushes(rate: Array) -> Array:
+        def unbalance_force(rate: Array) -> Array:
             return jnp.sum(levers * (self.unbalance * at * (state.rate**2 - 1j * rate))[None, :], axis=-1)
 
         share = levers[:, None, :] * levers[None, :, :] * (self.unbalance**2 / (4.0 * self.inertia))[None, None, :]
         alone = jnp.eye(levers.shape[0]) - _product(accelerance, jnp.sum(share, axis=-1))
         mirrored = _product(accelerance, jnp.sum(share * (at**2)[None, None, :], axis=-1))
-        felt = _with_conjugate(alone, mirrored, times(output_row, unforced) + times(accelerance, pushes(free)))
-        felt = jnp.sum(levers * felt[:, None], axis=0)
-        rate = free + mean_torque(self.unbalance, jnp.conj(at) * felt) / self.inertia
-        acceleration = unforced + jnp.sum(push * pushes(rate)[:, None], axis=0)
+        forward = _with_conjugate(alone, mirrored, times(output_row, unforced) + times(accelerance, unbalance_force(free)))
+        forward = jnp.sum(levers * forward[:, None], axis=0)
+        rate = free + mean_torque(self.unbalance, jnp.conj(at) * forward) / self.inertia
+        acceleration = unforced + jnp.sum(input_column * unbalance_force(rate)[:, None], axis=0)
         turn = 1j * jnp.mean(state.rate)
         return Amplitudes(
             displacement=state.velocity - turn * state.displacement,
@@ -240,7 +240,9 @@ def require_rotating_masses(scene: Scene) -> None:
             if exciter.loads is None:
                 continue
             if exciter.unbalance is not None:
-                problem = "is given beside loads; this theory has either an unbalance or loads on a rotor: simulate both"
+                problem = (
+                    "is given together with loads; this theory includes only one of them on a rotor: use simulate for both"
+                )
                 raise InputError("unbalance", problem)
             require_circular(exciter.loads, exciter.drive)
     require_terms(scene.all_effects, AVERAGED_TERMS)
@@ -331,14 +333,14 @@ def _block_diagonal(blocks: Sequence[Array]) -> Array:
 def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: Array, neutral: Array | int = 1) -> Array:
     """Return the growth rate of small disturbances of rotating masses that turn at one speed, 1/s.
 
-    It is the largest real part of the eigenvalues of the averaged equations, linearized about the motion. The eigenvalue 0 of a
-    common shift of all phases is left out. The result is NaN if the motion is not finite.
+    It is the largest real part of the eigenvalues of the averaged equations, linearized about the motion. The eigenvalue 0 of
+    a common shift of all phases is omitted. The result is NaN if the motion is not finite.
 
     **Arguments**
 
     - `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The drives have constant speed,
       or their torque is a function of the speed
-    - `neutral`: number of eigenvalues 0 to leave out, 1 and one for each direction of a family of motions
+    - `neutral`: number of eigenvalues 0 to omit: 1, and one more for each direction of a family of motions
     """
     nd, count = displacement.shape[0], phase.shape[0]
     free = np.flatnonzero(~field.is_prescribed)
@@ -361,7 +363,7 @@ def largest_growth(matrix: Array, neutral: Array | int) -> Array:
 
     The result is NaN if the matrix is not finite.
     """
-    # The library routine for eigenvalues does not return for a matrix that is not finite.
+    # The library routine for eigenvalues does not terminate for a matrix that is not finite.
     finite = jnp.all(jnp.isfinite(matrix))
     values = eigenvalues_in_turn(jnp.where(finite, matrix, 0.0))
     rank = jnp.argsort(jnp.argsort(jnp.abs(values)))
@@ -374,7 +376,7 @@ def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
 
     The state determines only these real parts. The imaginary parts follow from the assumption that the carrier vibrates at the
     loads' mean speed. If the loads turn at less than half the lowest natural frequency, they cannot have caused the vibration,
-    and the carrier is assumed to ring at its natural frequencies. Each load's rate is used as its mean rate.
+    and the carrier is assumed to vibrate freely at its natural frequencies. Each load's rate is used as its mean rate.
     """
     (angle,), (rate,) = state.angle, state.rate
     model = linear_model(scene)
@@ -396,7 +398,7 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _with_conjugate(a: Array, b: Array, right: Array) -> Array:
-    """Return x of a x + b conj(x) = right: in closed form for one number, otherwise from twice as many real equations."""
+    """Return x of a x + b conj(x) = right: in closed form for one unknown, otherwise from twice as many real equations."""
     if right.shape[0] == 1:
         a, b = a[0], b[0]
         return (jnp.conj(a) * right - b * jnp.conj(right)) / (a.real**2 + a.imag**2 - b.real**2 - b.imag**2)

@@ -33,7 +33,8 @@ from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, t
 
 
 class _Support(eqx.Module):
-    """Place of a `SupportForce`: `rows` (k, nd) of its displacements; `input_matrix` (nd, k), accelerations per force there."""
+    """Place of a `SupportForce`: `rows` (k, nd) of its displacements; `input_matrix` (nd, k), accelerations per force at this
+    place."""
 
     rows: Array
     input_matrix: Array
@@ -42,8 +43,8 @@ class _Support(eqx.Module):
 class Dynamics(eqx.Module):
     """Equations of a scene for time integration. Everything that does not change with time is computed once.
 
-    The accelerations of the carrier are those without exciters plus those due to the forces of the exciters. P contains the
-    rows of all mounts that move loads or an unbalanced rotor, one below the other.
+    The accelerations of the carrier are those without exciters plus those due to the forces of the exciters. P contains, one
+    below the other, the rows of all mounts on which loads or an unbalanced rotor act.
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
     - `input_matrix` M^-1 P^T (nd, nP): acceleration per force on the rows
@@ -82,7 +83,7 @@ class Dynamics(eqx.Module):
         def solve(contacts: Sequence[ContactSolution]) -> tuple[list[tuple[Eliminated, list[Array]]], Array]:
             cases = zip(self.exciters, motions, contacts, strict=True)
             parts = [exciter.eliminate(motion, contact) for exciter, motion, contact in cases]
-            accelerations, carrier = self._close(parts, unforced)
+            accelerations, carrier = self._solve_rows(parts, unforced)
             return list(zip(parts, accelerations, strict=True)), carrier
 
         contacts = [motion.rolling for motion in motions]
@@ -111,7 +112,7 @@ class Dynamics(eqx.Module):
             flow = flow - times(support.input_matrix, term.force(x, v))
         return flow
 
-    def _close(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
+    def _solve_rows(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
         """Return the accelerations of the rows of each exciter, and those of the carrier."""
         ends = np.cumsum([len(part.reaction) for part in parts]).tolist()
         blocks = [range(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
@@ -124,12 +125,12 @@ class Dynamics(eqx.Module):
             carrier = self._solve_in_coordinates(self.mass, unforced, weights, reaction)
             return [[jnp.sum(self.rows[k] * carrier) for k in block] for block in blocks], carrier
 
-        def felt(i: int, k: int) -> Array | float:
+        def row_coupling(i: int, k: int) -> Array | float:
             """Return the acceleration of row i per that of row k due to the added mass, which acts within an exciter."""
             return sum(self.accelerance[i, j] * weights[j][k] for j in own[k])
 
         n, free = ends[-1], times(self.rows, unforced)
-        matrix = [[(1.0 if i == k else 0.0) + felt(i, k) for k in range(n)] for i in range(n)]
+        matrix = [[(1.0 if i == k else 0.0) + row_coupling(i, k) for k in range(n)] for i in range(n)]
         right = tuple(free[i] - sum(self.accelerance[i, j] * reaction[j] for j in range(n)) for i in range(n))
         a = small_inverse(matrix)(right)
         push = [-sum(w * a[k] for k, w in weights[i].items()) - reaction[i] for i in range(n)]
@@ -139,11 +140,12 @@ class Dynamics(eqx.Module):
     def _solve_in_coordinates(
         self, mass: Array, unforced: Array, weights: list[dict[int, Array | float]], reaction: list[Array | float]
     ) -> Array:
-        """Return the accelerations of the carrier from the added mass of each row with other rows, and its reaction."""
+        """Return the accelerations of the carrier from the added masses that couple the rows, and from the reaction on each
+        row."""
         force = times(mass, unforced)
         for row, line, g in zip(self.rows, weights, reaction, strict=True):
-            felt = functools.reduce(operator.add, (w * self.rows[k] for k, w in line.items()))
-            mass = mass + row[:, None] * felt[None, :]
+            weighted_row = functools.reduce(operator.add, (w * self.rows[k] for k, w in line.items()))
+            mass = mass + row[:, None] * weighted_row[None, :]
             force = force - row * g
         return solve_definite(mass, force)
 
@@ -159,7 +161,7 @@ def vector_field(scene: Scene) -> Dynamics:
     **Arguments**: `scene`, on any machine, with any drive and effects.
 
     **Returns** `Dynamics`, a pure function of time (s) and `State` that gives the state's time derivative. `jit`, `vmap` and
-    `grad` go through it and through the scene. The cost of an evaluation grows in proportion to the number of loads.
+    `grad` apply to it and to the scene. The cost of an evaluation is proportional to the number of loads.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

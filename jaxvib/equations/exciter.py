@@ -51,7 +51,7 @@ Axes = dict[int, Array]
 
 
 class Motion(NamedTuple):
-    """State of an exciter, and quantities that follow from it without the accelerations.
+    """State of an exciter, and quantities that follow from it without knowing the accelerations.
 
     **Attributes**
 
@@ -128,7 +128,7 @@ class RotorDynamics(eqx.Module):
         return False
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
-        """Return the quantities that do not need the accelerations, for a rotor that turns at `speed`."""
+        """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
         drag, weight = jnp.zeros_like(speed), self.weight(t, state)
         return Motion(state, speed, self._imbalance_derivatives(t, state), no_loads, drag, weight, no_contact, housing, t)
@@ -179,14 +179,14 @@ class RotorDynamics(eqx.Module):
                 reaction = [g + b for g, b in zip(reaction, motion.imbalance_derivatives[1], strict=True)]
             return added_mass, reaction, None
         torque, inertia = motor
-        taken, felt = self._taken_torque(motion, drag, coupling)
-        free = (torque - taken) / inertia
-        row = [f / inertia for f in felt] + [jnp.zeros_like(free)] * (len(reaction) - len(felt))
+        braking, slopes = self._braking_torque(motion, drag, coupling)
+        free = (torque - braking) / inertia
+        row = [f / inertia for f in slopes] + [jnp.zeros_like(free)] * (len(reaction) - len(slopes))
         if motion.imbalance_derivatives is None:
             return added_mass, reaction, (free, row)
-        along, bend = motion.imbalance_derivatives
-        added_mass = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(added_mass, along, strict=True)]
-        reaction = [g + b + d * free for g, b, d in zip(reaction, bend, along, strict=True)]
+        first, curvature = motion.imbalance_derivatives
+        added_mass = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(added_mass, first, strict=True)]
+        reaction = [g + b + d * free for g, b, d in zip(reaction, curvature, first, strict=True)]
         return added_mass, reaction, (free, row)
 
     def _motor(self, motion: Motion) -> tuple[Array, Array] | None:
@@ -194,8 +194,8 @@ class RotorDynamics(eqx.Module):
         speed = motion.speed if motion.housing is None else motion.speed - motion.housing
         return self.drive.torque_and_inertia(motion.time, speed)
 
-    def _taken_torque(self, motion: Motion, drag: Array, coupling: Axes) -> tuple[Array, list[Array]]:
-        """Return (T, c) of the torque T + c . a, N m, that loads, gravity and imbalance take from the rotor.
+    def _braking_torque(self, motion: Motion, drag: Array, coupling: Axes) -> tuple[Array, list[Array]]:
+        """Return (T, c) of the torque T + c . a, N m, with which loads, gravity and imbalance brake the rotor.
 
         c has an entry for each of the first rows of the mount; the torque does not depend on the other rows.
         """
@@ -213,7 +213,7 @@ class RotorDynamics(eqx.Module):
             return part
         motor, n = self._motor(motion), len(part.reaction)
         if motor is None:
-            torque, row = self._taken_torque(motion, drag, coupling)
+            torque, row = self._braking_torque(motion, drag, coupling)
         else:
             torque, row = motor[0], []
         zero = jnp.zeros_like(torque)
@@ -246,12 +246,12 @@ class RotorDynamics(eqx.Module):
         def slope(angle: Array) -> tuple[Array, ...]:
             return jax.jvp(imbalance, (angle,), (jnp.ones_like(angle),))[1]
 
-        along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
-        push = [b * rate**2 for b in bend]
+        first, curvature = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
+        second = [c * rate**2 for c in curvature]
         change = self.drive.rotor_acceleration(t)
         if change is not None:
-            push = [p + d * change for p, d in zip(push, along, strict=True)]
-        return list(along), push
+            second = [s + d * change for s, d in zip(second, first, strict=True)]
+        return list(first), second
 
     def weight(self, t: Array, state: ExciterState) -> Array | None:
         """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's rotation.
@@ -279,7 +279,7 @@ class ExciterDynamics(RotorDynamics):
         return has_term(self.effects, SlipRelease)
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
-        """Return the quantities that do not need the accelerations, for a rotor that turns at `speed`."""
+        """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         imbalance_derivatives = self._imbalance_derivatives(t, state)
         found = kinematics(self.loads, state.angle, state.rate)
         drag, force = self._forces(state, speed)
@@ -306,7 +306,7 @@ class ExciterDynamics(RotorDynamics):
         rows = {axis: [m * column[axis] for column in found.columns] for axis in axes}
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, coupling, strict=True)] for axis, row in rows.items()}
         response_to_carrier = {axis: solve(tuple(row)) for axis, row in rows.items()}
-        added_mass, reaction = self._felt_by_mount(found, free, response_to_carrier)
+        added_mass, reaction = self._reaction_of_loads(found, free, response_to_carrier)
         added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag, coupling[0])
         part = Eliminated(free, response_to_carrier, added_mass, reaction, rotor)
         return self._add_housing(motion, part, drag, coupling[0])
@@ -385,12 +385,12 @@ class ExciterDynamics(RotorDynamics):
                     coupling[i] = {axis: lever * each.normal[axis] + coupling[i].get(axis, 0.0) for axis in self.axes}
         return drag, force, coupling
 
-    def _felt_by_mount(
+    def _reaction_of_loads(
         self, found: Kinematics, free: tuple[Array, ...], response_to_carrier: Mapping[int, tuple[Array, ...]]
     ) -> tuple[list[list[Array | float]], list[Array | float]]:
         """Return added mass and reaction of the loads.
 
-        Each load acts on a row of the mount with its lever on that row, and not on rows that move no load.
+        Each load acts on a row of the mount with its lever on this row. Rows that move no load are left out.
         """
         m, axes, levers = self.loads.mass, self.axes, self.levers
         across = {axis: [column[axis] for column in found.columns] for axis in axes}
@@ -403,8 +403,8 @@ class ExciterDynamics(RotorDynamics):
         }
         rows = [(row, axis) for row in range(self.row_count) for axis in axes]
         added_mass = [[moments.get((i, k, min(one, two), max(one, two)), 0.0) for two, k in rows] for one, i in rows]
-        push = {i: m * (dot(across[i], free) + found.curvature[i]) for i in axes}
-        return added_mass, [self._total(push[i], levers[row]) if row < len(levers) else 0.0 for row, i in rows]
+        load_reaction = {i: m * (dot(across[i], free) + found.curvature[i]) for i in axes}
+        return added_mass, [self._total(load_reaction[i], levers[row]) if row < len(levers) else 0.0 for row, i in rows]
 
     def _slip_change(
         self, motion: Motion, slip: tuple[Array, ...], rolling: ContactSolution, change: tuple[Array, ...], at_loads: Axes

@@ -74,7 +74,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     - `t`, s: the time, which determines the angle of an ideal drive's rotor. It matters only for a rotor with an imbalance;
       typical: 0 (the default) without an imbalance
 
-    **Returns** a scalar, J. `jit`, `vmap` and `grad` go through it.
+    **Returns** a scalar, J. `jit`, `vmap` and `grad` apply to the function.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -148,7 +148,8 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
         P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of supports and contacts
         M_j = b_W R^2 (speed - phi_j') + friction
 
-    The torque T turns an ideal drive's rotor against loads, their spin and the imbalance d. Loads that slide also dissipate
+    T is the torque with which an ideal drive turns its rotor against loads, their spin and the imbalance d. Loads that slide
+    also dissipate
     - F_t.c. The rate of the energy is the difference, dE/dt = P_in - P_diss.
 
     **Arguments**
@@ -205,8 +206,8 @@ def _drive_torque(
 ) -> Array:
     """Return the torque of a drive, N m.
 
-    It follows from the `acceleration` of the carrier, and from the angle, the speed relative to the housing and the braking by
-    the loads of the `rotor`.
+    **Arguments**: `acceleration` of the carrier; `rotor`: its angle, its speed relative to the housing, and the braking torque
+    of its loads.
     """
     turn, driven, braking = rotor
     motor = dynamics.drive.torque_and_inertia(t, driven)
@@ -242,7 +243,8 @@ def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tupl
 def _load_power(
     exciter: ExciterDynamics, state: ExciterState, change: ExciterState, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[Array, Array, list[Array]]:
-    """Return the torque of the rotor on the loads, N m, its power to spinning and sliding loads, W, and the lost powers, W."""
+    """Return the torque of the rotor on the loads, N m, its power to spinning and sliding loads, W, and the dissipated powers,
+    W."""
     loads, g = exciter.loads, total_gravity(exciter.effects)
     taken = loads.resistance(state.angle, state.rate, speed)
     sliding, (supplied, lost_in_contact) = _spin_power(exciter, state, change, at_load, speed)

@@ -54,7 +54,7 @@ JAM_TERMS = (*TURNING_TERMS, ContactFriction)
 """Terms that analyses of jams include."""
 
 
-_DIRECT = 3
+_MAX_DIRECT_SIZE = 3
 """Largest number of coordinates for which `small_solve` writes the equations out."""
 
 
@@ -80,7 +80,7 @@ class LinearModel(Model):
     @property
     def direction(self) -> Array:
         """B^T e (nd,) complex. A unit force that turns at the mount acts on the coordinates with Re(B^T e exp(i w t))."""
-        return self.mount.rows[0].T @ turning(self.mount)
+        return self.mount.rows[0].T @ rotating_direction(self.mount)
 
     def damping(self, speed: Array) -> Array:
         """Return C + n G (nd, nd) N s/m at the rotor's `speed` n, rad/s, or at the mean speed of several rotors."""
@@ -147,7 +147,7 @@ class JammedModel(LinearModel):
         return cast(CircularLoads, self.scene.loads)
 
     def force(self, omega: Array) -> Array:
-        """Return the amplitudes (nd,), N, of the force on the coordinates of loads that turn at `omega`."""
+        """Return the amplitudes (nd,), N, of the force that loads turning at `omega` exert on the coordinates."""
         return self.unbalance * omega**2 * self.force_direction
 
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
@@ -173,7 +173,7 @@ class JammedModel(LinearModel):
     def forward_acceleration(self, omega: Array) -> Array:
         """Return w^2 e^H B Y (scalar, m/s^2) at the load speed `omega`: minus the forward circular acceleration of the mount.
 
-        If the model has a modal form, the cost is O(nd), and derivatives with respect to parameters of the scene are missing.
+        If the model has a modal form, the cost is O(nd), and there are no derivatives with respect to parameters of the scene.
         """
         if self.modal is None:
             return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))
@@ -184,7 +184,7 @@ class JammedModel(LinearModel):
 
         Models of up to 3 coordinates are returned without it, because a direct solution takes no longer.
         """
-        if self.mass.shape[0] <= _DIRECT or self.mount.gyroscopic is not None:
+        if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mount.gyroscopic is not None:
             return self
         frozen = jax.lax.stop_gradient(self)
         frequencies, shapes = frozen.modes()
@@ -212,13 +212,13 @@ def natural_frequencies(scene: Scene) -> Array:
 
         det(K - w^2 (M + sum_j m_j B^T B)) = 0
 
-    **Arguments**: `scene`, of which only the machine and the loads matter.
+    **Arguments**: `scene`; only its machine and its loads are used.
 
     **Returns** an array (nd,), rad/s; typical: 10 to 100 for platforms on springs, 100 to 500 for rotors. Derivatives are
     finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
 
     **Raises** `ComputationError` (status "lost_digits") if rounding hides a frequency, for example in single precision that of
-    a soft spring beside a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN.
+    a soft spring next to a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -275,7 +275,7 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     return jammed_model(scene).displacement(omega, speed)
 
 
-def turning(mount: Mount, direction: int = 1) -> Array:
+def rotating_direction(mount: Mount, direction: int = 1) -> Array:
     """Return e (np,): a point on a unit circle with angle w t, clockwise -w t, moves by Re(e exp(i w t)) in the mount's
     directions.
 
@@ -290,14 +290,14 @@ def peak_force(force: Array) -> Array:
 
 
 def circular_loads(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene, for a formula that holds only for loads on a circle at one point of the machine."""
+    """Return the loads of a scene, for an analysis that requires loads on a circle at one point of the machine."""
     loads, mount = _turning_loads(scene, TURNING_TERMS)
     _require_one_point(mount)
     return loads
 
 
 def jammed_loads(scene: Scene) -> CircularLoads:
-    """Return the loads of a scene, for a formula of jams: the loads slip on the rotor, with or without dry friction.
+    """Return the loads of a scene, for an analysis of jams, in which loads slip on the rotor with or without dry friction.
 
     Otherwise the requirements are those of `circular_loads`.
     """
@@ -307,7 +307,7 @@ def jammed_loads(scene: Scene) -> CircularLoads:
 
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
-    """**Raises** `InputError` if no load has drag or, with `each`, if any load has none. Traced numbers are not checked."""
+    """**Raises** `InputError` if no load has drag or, with `each`, if any load has none. Traced values are not checked."""
 
     def check(drag: np.ndarray | float) -> None:
         if not (np.all if each else np.any)(np.asarray(drag) > 0.0):

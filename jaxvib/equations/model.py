@@ -34,7 +34,7 @@ class Model(eqx.Module):
 
     @property
     def mount(self) -> Mount:
-        """Mount of the exciter of a scene that has one. **Raises** `InputError` if it has several."""
+        """Mount of the only exciter. **Raises** `InputError` if the scene has several."""
         _, mount = self.scene.exciter, self.mounts[0]
         return mount
 

@@ -109,24 +109,26 @@ def resolve_contact(
     """
     kappa = loads.inertia_factor()
     normal = normal_force.at(a)
-    hold = limit.coefficient * (jnp.maximum(normal, 0.0) if loads.one_sided else jnp.abs(normal))
-    wanted = [f - hold * c / limit.width for f, c in zip(needed, slip, strict=True)]
+    friction_limit = limit.coefficient * (jnp.maximum(normal, 0.0) if loads.one_sided else jnp.abs(normal))
+    required = [f - friction_limit * c / limit.width for f, c in zip(needed, slip, strict=True)]
     fast = dot(slip, slip) > limit.width**2
-    slides = fast | (dot(wanted, wanted) > hold**2)
-    along = [jnp.where(fast, -c, f) for c, f in zip(slip, wanted, strict=True)]
+    slides = fast | (dot(required, required) > friction_limit**2)
+    along = [jnp.where(fast, -c, f) for c, f in zip(slip, required, strict=True)]
     size = jnp.sqrt(jnp.where(slides, dot(along, along), 1.0))
     levers = [jnp.where(slides, limit.coefficient * f / size, 0.0) * arm for f, arm in zip(along, found.sizes, strict=True)]
-    rubbing = Friction(levers[0], normal_force.reaction, normal_force.normal, tuple(levers[1:]), loads.one_sided).signed(a)
+    sliding_friction = Friction(
+        levers[0], normal_force.reaction, normal_force.normal, tuple(levers[1:]), loads.one_sided
+    ).signed(a)
     # A slip smaller than the width decays while the load rolls.
-    dying = [arm * kappa * hold * c / limit.width for c, arm in zip(slip, found.sizes, strict=True)]
-    force = [jnp.where(slides, c, r - d) for c, r, d in zip(centre, rolling, dying, strict=True)]
-    kept = [
+    slip_decay = [arm * kappa * friction_limit * c / limit.width for c, arm in zip(slip, found.sizes, strict=True)]
+    force = [jnp.where(slides, c, r - d) for c, r, d in zip(centre, rolling, slip_decay, strict=True)]
+    rolling_friction = [
         each._replace(
             lever=jnp.where(slides, 0.0, each.lever), others=tuple(jnp.where(slides, 0.0, lever) for lever in each.others)
         )
         for each in friction
     ]
-    return ContactSolution(jnp.where(slides, 1.0, kappa), force, [*kept, rubbing])
+    return ContactSolution(jnp.where(slides, 1.0, kappa), force, [*rolling_friction, sliding_friction])
 
 
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:

@@ -74,8 +74,9 @@ class State(eqx.Module):
     - `displacement` q (nd,), m, and `velocity` q' (nd,), m/s, of the carrier's coordinates; tilts in rad and rad/s; typical:
       0.1 to 10 mm
     - `angle`, `rate`, `rotor`, `spin` of the exciter of a scene with one exciter, see `ExciterState`
-    - `exciters`: instead of these, an `ExciterState` for each exciter. Beside a single one they replace its values, so that
-      `dataclasses.replace(state, spin=None)` returns the state without a spin
+    - `exciters`: instead of these, an `ExciterState` for each exciter. If one `ExciterState` is given together with `angle`,
+      `rate`, `rotor` or `spin`, these replace its values. Therefore `dataclasses.replace(state, spin=None)` returns the state
+      without a spin
 
     **Attributes**: `displacement`, `velocity` and `exciters`. Those of the only exciter are `angle`, `rate`, `rotor`, `spin`.
 
@@ -112,7 +113,7 @@ class State(eqx.Module):
 
     @property
     def exciter(self) -> ExciterState:
-        """State of the exciter of a scene that has one. **Raises** `InputError` if it has several."""
+        """State of the only exciter. **Raises** `InputError` if there are several."""
         if len(self.exciters) != 1:
             raise InputError("state", f"has {len(self.exciters)} exciters; read state.exciters[0].angle and so on")
         return self.exciters[0]

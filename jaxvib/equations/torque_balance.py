@@ -1,4 +1,4 @@
-"""Balance of the mean torques on rotating masses that turn with one speed: influence coefficients, vibrational torques.
+"""Balance of the mean torques on rotating masses that turn at one speed: influence coefficients, vibrational torques.
 
 The angle of rotating mass k in the fixed frame is th_k = sigma_k (Omega t + alpha_k), with sigma_k = +1 anticlockwise, -1
 clockwise, and e_k = (1, -i sigma_k). B_k (np, nd) are the rows of its point, S_k is its unbalance, and L_k its driving torque:
@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
-from jaxvib.equations.linear import LinearModel, linear_model, turning
+from jaxvib.equations.linear import LinearModel, linear_model, rotating_direction
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve, times
@@ -35,7 +35,7 @@ class TorqueBalance(eqx.Module):
 
     **Attributes**: the linear `model`; the `averaged` equations at the working speed of ideal drives; `direction` (count, nd),
     complex: generalized force of each mass per unit of its centrifugal force; `motor_torque` (count,) N m, the
-    largest torque of the motor of an unbalance from rest to its working speed, 1 without a torque, 0 for a load.
+    largest torque of the motor of an unbalance from rest to its working speed; 1 if the motor has no torque, 0 for a load.
     """
 
     model: LinearModel
@@ -84,7 +84,8 @@ class TorqueBalance(eqx.Module):
     def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
         """Return `driving_torque`, with all its differences between the masses multiplied by `factor`.
 
-        If an ideal drive turns an unbalance, the torques of all others are multiplied: the ideal drive balances any torque.
+        If an ideal drive turns an unbalance, the torques of all others are multiplied, because the ideal drive balances any
+        torque.
         """
         torque = self.driving_torque(omega)
         if factor is None:
@@ -105,7 +106,7 @@ def assemble_torque_balance(scene: Scene) -> TorqueBalance:
     directions = []
     for exciter, mount, count in zip(scene.exciters, model.mounts, averaged.counts, strict=True):
         rows = mount.load_rows(count) if count else mount.rows[0][None]
-        directions.append(jnp.einsum("jka,k->ja", rows, turning(mount, exciter.direction)))
+        directions.append(jnp.einsum("jka,k->ja", rows, rotating_direction(mount, exciter.direction)))
     drives = tuple(ConstantSpeed(drive.speed) if drive.ideal else drive for drive in averaged.drives)
     averaged = eqx.tree_at(lambda field: field.drives, averaged, drives)
     direction = directions[0] if len(directions) == 1 else jnp.concatenate(directions)
@@ -133,8 +134,8 @@ def influence_of(balance: TorqueBalance, omega: Array) -> tuple[Array, Array]:
     response of the carrier.
     """
     dynamic = balance.dynamic_stiffness(omega)
-    answer = small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
-    return balance.direction.conj() @ answer, answer
+    response = small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
+    return balance.direction.conj() @ response, response
 
 
 def torques_at(balance: TorqueBalance, influence: Array, omega: Array, turn: Array) -> Array:

@@ -31,7 +31,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import REFUSED
-from jaxvib.steady.points import Harmonic, PointAnswers
+from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number
 from jaxvib.units.known import when_known
 
@@ -79,7 +79,7 @@ _MIN_TURNS = 3
 """Smallest number of turns of the exciters to which a harmonic is fitted."""
 
 
-class Run(AbstractMeasured, PointAnswers, Result):
+class Run(AbstractMeasured, PathsOfPoints, Result):
     """Run of a scene: the quantities measured over its last turns (see `AbstractMeasured`), and the motion itself.
 
     `ellipse` and `deck` describe the motion of points by the harmonic of `omega` that fits the window by least squares.

@@ -1,4 +1,4 @@
-"""Branch diagram: load speeds of jams over the rotor speed."""
+"""Branch diagram: load speeds of jams as a function of the rotor speed."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Branches(AbstractJam):
         **Arguments**
 
         - `unit` of the speeds on the axes, "rad/s", "rpm" or "Hz"
-        - `most`: the greatest rotor speed shown, rad/s; default: a third above the scene's
+        - `most`: the greatest rotor speed shown, rad/s; default: 4/3 of the scene's rotor speed
         - `show`: names of the panels, such as `("force",)`
         - `ax`: axes to draw onto, as many as there are panels
 
@@ -110,22 +110,22 @@ def branches(
     least: Number | None = None,
     accuracy: float = 1e-8,
 ) -> Branches | ExactBranches:
-    """Return the branch n(Omega) of jams of coincident loads through all its folds: of light loads, or `exact`.
+    """Return the branch n(Omega) of jams of coincident loads, through all its folds: in the limit of light loads, or `exact`.
 
         n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 
-    For light loads n(Omega) is explicit (`jam_rotor_speed`). Every point is computed on its own, also of the exact branch: no
-    continuation, so no part of the branch is missed.
+    For light loads n(Omega) is explicit (`jam_rotor_speed`). Every point, also of the exact branch, is computed separately,
+    without continuation. Therefore no part of the branch is missed.
 
     **Arguments**
 
     - `scene`; its rotor speed only determines the default of `most`
-    - `points` along Omega, denser near the resonances, at least 2; typical: 200 to 2000 (the default). The time grows in
-      proportion
-    - `most`: the greatest load speed, rad/s or text; default: a third above the scene's rotor speed
+    - `points` along Omega, denser near the resonances, at least 2; typical: 200 to 2000 (the default). The time is
+      proportional to this number
+    - `most`: the greatest load speed, rad/s or text; default: 4/3 of the scene's rotor speed
     - `exact`: True for the periodic motions of the full equations in place of their limit for light loads, with Floquet
       multipliers and all special points
-    - `least`: the least load speed, with `exact`; default: a fifth of the lowest resonance
+    - `least`: the lowest load speed, with `exact`; default: a fifth of the lowest resonance
     - `accuracy` of the rotor speeds, relative, with `exact`; typical: 1e-4 to 1e-8 (the default)
 
     **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for fewer than 2 points or a speed that is
@@ -159,7 +159,7 @@ def branches(
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     model = jammed_model(scene).decomposed()
     crowded, resonances = fold_points(model, per_side)
-    # The requested number of points is taken evenly from the dense grid and moved into the range.
+    # The requested number of points is taken evenly from the dense grid. Points above the range get evenly spaced places in it.
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
     share = jnp.linspace(0.0, 1.0, points)
     omega = jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))

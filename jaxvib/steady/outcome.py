@@ -37,8 +37,8 @@ def outcome(
     failures: Collection[str] = (),
     hint: Callable[[str], str] = lambda _: "",
 ) -> Found:
-    """Return the result of a computation for `scene` up to the time `end`, or raise an error if its status is known and a
-    failure.
+    """Return the result of a computation for `scene` up to the time `end`, or raise an error if its status is known and
+    denotes a failure.
 
     **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: function from the name of a
     status to the text that is appended to its message.

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 STANDARD_GRAVITY = 9.80665
 """Acceleration 1 g, m/s^2."""
 
-_CIRCLE = 1e-12
-"""Smallest share of the semi-axes by which they differ, if the long axis has a direction."""
+_MIN_AXES_DIFFERENCE = 1e-12
+"""Relative difference of the semi-axes below which the path counts as a circle, whose long axis has no direction."""
 
 
 class Ellipse(eqx.Module):
@@ -51,8 +51,10 @@ class Ellipse(eqx.Module):
     - `direction` of the long axis, rad from x anticlockwise, above -pi/2 and at most pi/2; the throw angle of a point that
       moves on a straight line. It is 0 for a circle, which has no long axis
     - `acceleration`, in g: w^2 a / g, with g = 9.80665 m/s^2; typical: 3 to 6
-    - `throw_number`: the amplitude of the acceleration perpendicular to the deck, divided by that part of g; typical: 2 to 5
-    - `remainder`: root-mean-square displacement that is not on the ellipse, relative to that on it; 0 for averaged motions
+    - `throw_number`: the amplitude of the acceleration perpendicular to the deck, divided by the component of g in this
+      direction; typical: 2 to 5
+    - `remainder`: root-mean-square displacement that is not on the ellipse, relative to the root-mean-square displacement on
+      it; 0 for averaged motions
 
     >>> import jax.numpy as jnp
     >>> path = ellipse_of(jnp.array([0.003 + 0.0j, 0.003 + 0.0j]), 100.0)        # 3 mm in x and in y, in phase
@@ -70,12 +72,12 @@ class Ellipse(eqx.Module):
     @property
     def is_circle(self) -> Array:
         """True if the semi-axes are equal to rounding; `direction` is then 0 and has no meaning."""
-        return self.semi_major - jnp.abs(self.semi_minor) <= _CIRCLE * self.semi_major
+        return self.semi_major - jnp.abs(self.semi_minor) <= _MIN_AXES_DIFFERENCE * self.semi_major
 
     @property
     def sense(self) -> Array:
         """Sense of rotation: 1 anticlockwise, -1 clockwise, 0 on a straight line (to rounding)."""
-        return jnp.where(jnp.abs(self.semi_minor) > _CIRCLE * self.semi_major, jnp.sign(self.semi_minor), 0.0)
+        return jnp.where(jnp.abs(self.semi_minor) > _MIN_AXES_DIFFERENCE * self.semi_major, jnp.sign(self.semi_minor), 0.0)
 
     def summary(self) -> str:
         """Return the ellipse as a line of text."""
@@ -104,8 +106,8 @@ def ellipse_of(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0
     - `slope` of the deck, rad from x anticlockwise; typical: 0 to -0.4
     - `remainder` of the motion, see `Ellipse`
 
-    **Returns** `Ellipse`. Derivatives are finite everywhere. At a circle, where the derivative of |P| or |N| does not exist, it
-    is 0. **Raises** `InputError` for numbers that are not finite, and for another number of amplitudes.
+    **Returns** `Ellipse`. Derivatives are finite everywhere. At a circle, where the derivative of |P| or |N| does not exist,
+    it is set to 0. **Raises** `InputError` for numbers that are not finite, and for another number of amplitudes.
 
     >>> import jax.numpy as jnp
     >>> print(ellipse_of(jnp.array([0.005, -0.005j]), 100.0).summary())
@@ -124,11 +126,11 @@ def _require_finite(amplitude: np.ndarray) -> None:
 
 
 def _ellipse_of(amplitude: Array, speed: Array, slope: Array, remainder: Array) -> Ellipse:
-    """Return `ellipse_of` numbers that are validated already."""
+    """Return `ellipse_of` for validated values."""
     x, y = amplitude[0], amplitude[1]
     forward, backward = (x + 1j * y) / 2.0, jnp.conj(x - 1j * y) / 2.0
     one, other = magnitude(forward), magnitude(backward)
-    is_circle = 2.0 * jnp.minimum(one, other) <= _CIRCLE * (one + other)
+    is_circle = 2.0 * jnp.minimum(one, other) <= _MIN_AXES_DIFFERENCE * (one + other)
     product = jnp.where(is_circle, 1.0, forward * backward)
     normal = magnitude(-jnp.sin(slope) * x + jnp.cos(slope) * y)
     factor = speed**2 / STANDARD_GRAVITY
@@ -152,7 +154,8 @@ class Deck(Result):
     - `points` (n, 2), m, of the body
     - `amplitude` U (n, 2), m: complex amplitudes across and up
     - `ellipses`: an `Ellipse` whose arrays are (n,)
-    - `straightness`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points move alike; typical:
+    - `straightness`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points have the same motion;
+      typical:
       0.01 to 0.3
     """
 
@@ -171,7 +174,7 @@ class Deck(Result):
 
     @property
     def direction_spread(self) -> Array:
-        """Range of the directions of the long axes about their mean direction, rad; a direction and its opposite are one."""
+        """Range of the directions of the long axes about their mean direction, rad; opposite directions count as equal."""
         turn = jnp.exp(2j * self.ellipses.direction)
         away = 0.5 * jnp.angle(turn / jnp.mean(turn))
         return jnp.max(away) - jnp.min(away)
@@ -207,7 +210,8 @@ class Harmonic(NamedTuple):
     - `machine` that moves
     - `speed` w, rad/s
     - `amplitude` Y (nd,), complex
-    - `rest` (nd, nd): mean of r r^T, where r is the motion about its mean that is not in the harmonic; None if there is none
+    - `rest` (nd, nd): mean of r r^T, where r is the part of the motion about its mean that the harmonic does not contain; None
+      if there is no such part
     """
 
     machine: Machine
@@ -216,7 +220,7 @@ class Harmonic(NamedTuple):
     rest: Array | None = None
 
 
-class PointAnswers(eqx.Module):
+class PathsOfPoints(eqx.Module):
     """Base of results whose motion at the points of a machine is known."""
 
     @abc.abstractmethod

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class ModeShapes(Result):
-    """Undamped free vibrations, by ascending frequency.
+    """Undamped free vibrations, in the order of their frequencies.
 
     Returned by `mode_shapes`.
 
@@ -69,15 +69,15 @@ class ModeShapes(Result):
 
 @validated
 def mode_shapes(scene: Scene) -> ModeShapes:
-    """Return the natural frequencies and mode shapes of the machine with its loads on it, no damping, rotor at rest.
+    """Return the natural frequencies and mode shapes of the machine with its loads, without damping and with the rotor at rest.
 
         K X = w^2 (M + sum_j m_j B^T B) X
 
-    **Arguments**: `scene`; only its machine and its loads count.
+    **Arguments**: `scene`; only its machine and its loads are used.
 
     **Returns** `ModeShapes`; typical: frequencies of 10 to 100 rad/s for platforms, 100 to 500 rad/s for rotors.
 
-    **Raises** `InputError` for an argument that is no scene.
+    **Raises** `InputError` for an argument that is not a scene.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

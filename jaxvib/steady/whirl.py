@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 Weights = Literal["fixed", "none"]
 
-_TIE, _TIE_ROUNDINGS = 1e-9, 100.0
+_COUPLING, _MIN_COUPLING_ROUNDINGS = 1e-9, 100.0
 """Size of the added coupling that separates two whirls of one speed, relative to the matrices of the machine, and its minimum
 in units of the rounding."""
 
@@ -44,16 +44,17 @@ class WhirlStatus(eqx.Enumeration):
     done = "the result was computed"
     refused = REFUSED
     lost_digits = (
-        "rounding errors hide some of these motions, whose values are NaN: use double precision, or numbers that differ less"
+        "rounding errors hide some of these motions, whose values are NaN: use double precision, "
+        "or parameters whose sizes differ less"
     )
 
 
 class CriticalSpeeds(Result):
-    """Rotor speeds at which a whirl turns as fast as the rotor, no damping.
+    """Rotor speeds at which a whirl turns as fast as the rotor, without damping.
 
     **Attributes**
 
-    - `speed` (nd,), rad/s, ascending, inf for an absent one (a thin disc has no second forward one)
+    - `speed` (nd,), rad/s, ascending; inf for a speed that does not exist (a thin disc has no second forward critical speed)
     - `forward` (nd,): True if the whirl turns in the direction of the rotor. On supports that are equal in both directions an
       imbalance excites forward whirls only
     - `status`: a `WhirlStatus`
@@ -90,9 +91,9 @@ class Whirl(Result):
 
     - `rotor_speed`: (ns,) rad/s
     - `speed`: (ns, nd) rad/s of the whirl, 0 if damping allows no oscillation
-    - `decay`: (ns, nd) 1/s, negative if the motion grows. An overdamped motion has two decays; this is the smaller, of the
-      displacement that creeps back. Several of them are ordered by rising decay
-    - `forward`: (ns, nd) True if it goes round with the rotor, False if it turns against it or not at all
+    - `decay`: (ns, nd) 1/s, negative if the motion grows. An overdamped motion has two decay rates; `decay` is the smaller
+      one, with which the displacement creeps back. Several overdamped motions are in the order of increasing decay
+    - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
     - `critical`: the synchronous speeds
     - `status`: a `WhirlStatus`; motions that rounding hides are NaN
     """
@@ -134,7 +135,7 @@ class Whirl(Result):
 
 @validated
 def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = "fixed") -> Whirl:
-    """Return the whirl speeds of the scene's rotor, with its damping, at each of some rotor speeds.
+    """Return the whirl speeds of the scene's rotor, with its damping, at one or several rotor speeds.
 
         (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex
 
@@ -146,9 +147,9 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = 
     - `rotor_speed`, rad/s, one or a list (default: the drive's); typical: 50 values from 0 to 500 for a Campbell diagram
     - `loads`: "fixed" counts the loads' masses at their track (the default), "none" leaves them out
 
-    **Returns** `Whirl`. Gradients go through speeds and decays if no two are equal.
+    **Returns** `Whirl`. Speeds and decays have derivatives if no two of them are equal.
 
-    **Raises** `InputError` for a machine that does not move in two directions or has a motion that no spring holds, and for
+    **Raises** `InputError` for a machine that does not move in two directions or has a motion that no spring resists, and for
     values that are not allowed.
 
     >>> import jaxvib as jv
@@ -175,7 +176,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
     carrier, mass = model.carrier, _mass(model, loads)
     nd = mass.shape[0]
     gyroscopic = jnp.zeros_like(mass) if model.mount.gyroscopic is None else model.mount.gyroscopic
-    part = _tie(mass.dtype) * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(model.mount)
+    part = _coupling(mass.dtype) * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(model.mount)
 
     def first_order(resisting: Array) -> Array:
         flow = jnp.linalg.solve(mass, jnp.concatenate([-carrier.stiffness, -resisting], axis=1))
@@ -215,8 +216,8 @@ def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
     return Whirl(status, speeds, speed, decay, forward, critical=_critical_speeds(model, loads))
 
 
-def _tie(dtype: np.dtype) -> float:
-    return max(_TIE, _TIE_ROUNDINGS * float(jnp.finfo(dtype).eps))
+def _coupling(dtype: np.dtype) -> float:
+    return max(_COUPLING, _MIN_COUPLING_ROUNDINGS * float(jnp.finfo(dtype).eps))
 
 
 def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array) -> tuple[Array, Array]:
@@ -226,7 +227,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
     The kind is - Re(2 s + c/m). For the two real roots of a single equation it is negative at the slower one, at which damping
     balances the spring, and positive at the faster one, at which damping stops the mass. It is the sign characteristic of the
-    Hermitian matrix polynomial, and therefore distinguishes several overdamped motions too, whatever their roots.
+    Hermitian matrix polynomial, and therefore also distinguishes several overdamped motions, for any roots.
 
     The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.
 
@@ -246,7 +247,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
 @validated
 def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
-    """Return the synchronous critical speeds: (K - w^2 (M - i G)) X = 0, the whirl turning at the rotor's own speed w.
+    """Return the synchronous critical speeds: (K - w^2 (M - i G)) X = 0, where the whirl turns at the speed w of the rotor.
 
     The eigenproblem is Hermitian. On supports that are equal in both directions, a forward tilt has the inertia A - C, a
     backward one A + C.
@@ -270,12 +271,12 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
 def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
     carrier, mount, mass = model.carrier, model.mount, _mass(model, loads)
     inertia = mass if mount.gyroscopic is None else mass - 1j * mount.gyroscopic
-    part = 1j * _tie(mass.dtype) * jnp.trace(mass) * _sense_matrix(model.mount)
+    part = 1j * _coupling(mass.dtype) * jnp.trace(mass) * _sense_matrix(model.mount)
     values, _ = hermitian_modes(relative_to(carrier.stiffness, inertia)[0])
     square, inverse = relative_to(carrier.stiffness, jax.lax.stop_gradient(inertia - part))
     shapes = inverse.T @ hermitian_modes(square)[1]
     values, shapes = values[::-1], shapes[:, ::-1]
-    # A whirl 1e7 times as fast as the slowest one does not count.
+    # A whirl 1e7 times as fast as the slowest one counts as absent.
     none = 1e-14 * jnp.max(values)
     there, decided = values > none, jnp.abs(values) < none
     error = hermitian_error(jax.lax.stop_gradient((inertia, carrier.stiffness)), values, shapes)

@@ -11,7 +11,9 @@ import jaxvib as jv
 
 
 def test_a_mode_that_is_not_there_is_no_start():
-    with pytest.raises(jv.ComputationError, match=r"jam mode 1 does not exist at rotor speed 28.6479 rpm; there: 3, 4, 5"):
+    with pytest.raises(
+        jv.ComputationError, match=r"jam mode 1 does not exist at rotor speed 28.6479 rpm; existing modes: 3, 4, 5"
+    ):
         jv.simulate(published().scene(), 10.0, start="jam", mode=1)
 
 

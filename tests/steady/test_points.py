@@ -7,7 +7,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.motion.analysis.points import fit_harmonic
-from jaxvib.steady.points import Harmonic, PointAnswers
+from jaxvib.steady.points import Harmonic, PathsOfPoints
 
 SPEED, G = 90.0, 9.80665
 
@@ -80,7 +80,7 @@ SPRINGS = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e4, 4e4)) fo
 SCREEN = jv.plane_body(mass=2000.0, inertia=600.0, supports=SPRINGS)
 
 
-class Known(PointAnswers):
+class Known(PathsOfPoints):
     """Result with given complex amplitudes, as steady motions have."""
 
     amplitude: jax.Array

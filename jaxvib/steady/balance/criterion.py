@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import speed_unit
-from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, turning
+from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, rotating_direction
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.terms import (
     ContactFriction,
@@ -49,7 +49,8 @@ class Criterion(Result):
     - `gathering` (nd, 2): intervals in which f > 0 and loads gather, with the machine's damping
     - `undamped_balancing` and `undamped_gathering` (nd, 2): the same without damping
 
-    Intervals are rows [from, to] in rad/s. `inf` is an interval without an end; a row of NaN is no interval.
+    Intervals are rows [from, to] in rad/s. An end `inf` means that the interval has no upper end; a row of NaN means that
+    there is no interval.
     """
 
     status: CriterionStatus
@@ -107,11 +108,10 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
 
         f(S, w) = (S^2 w^2 / 2) Re(e^H A(w) e)
 
-    S is the loads' common unbalance and r the displacement of the exciter's axis under it, A the receptance of the
-    port and e the direction that turns; for a port of two directions e^H A e is the trace of A, plus what a
-    gyroscopic coupling adds. If f < 0, the axis moves away from the loads and they spread until they balance; if f > 0,
-    they gather. The paper states this for two or more loads, as an approximation; see `balanced_stability` for the exact
-    result.
+    S is the common unbalance of the loads, r the displacement of the exciter's axis that it causes, A the receptance of the
+    port and e the rotating direction of the force. For a port with two directions e^H A e is the trace of A plus a term of the
+    gyroscopic coupling. If f < 0, the axis moves away from the loads and they spread until they balance; if f > 0, they
+    gather. The paper states this for two or more loads, as an approximation; see `balanced_stability` for the exact result.
 
     **Arguments**: `unbalance` S kg m; default: that of all loads at one point.
 
@@ -123,7 +123,7 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
 
     Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
     """
-    direction = turning(scene.mounting)
+    direction = rotating_direction(scene.mounting)
     size = circular_loads(scene).unbalance() if unbalance is None else unbalance
     receptance = jnp.sum(direction.conj() * (port_receptance(scene, omega) @ direction)).real
     return size**2 * omega**2 / 2.0 * receptance
@@ -138,7 +138,7 @@ CRITERION_TERMS = (
     SlipRelease,
     SupportForce,
 )
-"""Terms that the criterion allows: terms without a separate force on each load, such as the force of a potential."""
+"""Terms that the criterion allows. A term with a separate force on each load, such as that of a potential, is not allowed."""
 
 
 @validated
@@ -147,16 +147,16 @@ def criterion(scene: Scene) -> Criterion:
 
         f(q) = (s^2 q^2 / 2) Re of the port receptance averaged over a revolution;    f < 0: balancing,    f > 0: gathering
 
-    The functional f of `criterion_functional` changes sign at the characteristic speeds alone, from + to - at a resonance and
-    back at an additional speed, so these are the ends of the intervals.
+    The functional f of `criterion_functional` changes sign only at the characteristic speeds: from + to - at a resonance, and
+    from - to + at an additional speed. These speeds are therefore the ends of the intervals.
 
-    **Arguments**: `scene` with at least two loads; typical: loads of 0.1 % to 1 % of the machine's mass. The share of right
-    predictions on random machines was 0.99 for loads of 0.1 %, and 0.55 for 10 %.
+    **Arguments**: `scene` with at least two loads; typical: loads of 0.1 % to 1 % of the machine's mass. The share of correct
+    predictions for random machines was 0.99 for loads of 0.1 %, and 0.55 for 10 %.
 
     **Returns** `Criterion`; derivatives and `vmap` as `characteristic_speeds`.
 
-    **Raises** `InputError` as `characteristic_speeds`, for a single load, and for effects whose potential turns a load by
-    itself (`Gravity`).
+    **Raises** `InputError` as `characteristic_speeds`, for a single load, and for effects whose potential exerts a torque on
+    each single load (`Gravity`).
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
@@ -200,10 +200,10 @@ def _gathering(resonances: Array, additional: Array) -> Array:
 def criterion_table(result: Criterion) -> dict[str, Any]:
     """Return the result of the criterion as plain lists and numbers for JSON, with speeds in rad/s.
 
-    **Returns** a dict: `status` a sentence; `resonances`, `additional` lists of speeds without damping,
-    `damped_resonances`, `damped_additional` with; `balancing`, `gathering` lists of [from, to] with damping,
-    `undamped_balancing`, `undamped_gathering` without. `to` is None if the interval has no end. Intervals that
-    touch are joined; empty ones are omitted.
+    **Returns** a dict: `status` a sentence; `resonances`, `additional` lists of speeds without damping, `damped_resonances`,
+    `damped_additional` with damping; `balancing`, `gathering` lists of [from, to] with damping, `undamped_balancing`,
+    `undamped_gathering` without. `to` is None if the interval has no end. Intervals that touch are joined; empty ones are
+    omitted.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=1e6, damping=30.0)

@@ -27,8 +27,9 @@ BATCH = 16
 _MIN_DECAY_EXPONENT = 40.0
 """Exponent of the decay in a turn, exp(-40), above which a vibration is below the rounding of multipliers."""
 
-_FEWEST, _MOST = 16, 2**17
-"""Maximum number of steps in a turn; slower rotors are allowed only if the carrier comes to rest within a turn."""
+_MIN_STEPS, _MAX_STEPS = 16, 2**17
+"""Limits of the number of steps in a turn. A rotor that needs more steps is allowed only if the carrier comes to rest within a
+turn."""
 
 
 def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
@@ -49,7 +50,7 @@ def _steps_for(scene: Scene) -> Array:
     if linear.mount.gyroscopic is not None:
         half = jnp.linalg.inv(jnp.linalg.cholesky(linear.mass))
         fastest = fastest + speed * jnp.linalg.norm(half @ linear.mount.gyroscopic @ half.T)
-    return jnp.clip(radau.steps_for(2.0 * jnp.pi * (fastest / speed + 2.0)), _FEWEST, _MOST)
+    return jnp.clip(radau.steps_for(2.0 * jnp.pi * (fastest / speed + 2.0)), _MIN_STEPS, _MAX_STEPS)
 
 
 def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
@@ -96,8 +97,8 @@ def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array
     return monodromy(scene, angles, fine), monodromy(scene, angles, fine // 2)
 
 
-def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | None:
-    """Return `steps` if they are a count, or None if they are to be chosen for each speed.
+def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | None:
+    """Return the validated number of `steps`; None if it is chosen for each speed.
 
     **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor so slow that the allowed steps do
     not resolve a vibration of the carrier that outlasts the turn; the method would damp it.
@@ -110,9 +111,9 @@ def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | N
         return count(steps, "steps", low=2, each=64.0)
     slowest = float(np.min(np.asarray(speeds), initial=np.inf))
     decay, wanted = (float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest)))
-    if wanted >= _MOST and decay * 2.0 * np.pi / slowest < _MIN_DECAY_EXPONENT:
+    if wanted >= _MAX_STEPS and decay * 2.0 * np.pi / slowest < _MIN_DECAY_EXPONENT:
         problem = (
-            f"is {slowest:g} rad/s, at which a turn takes more than {_MOST} steps, and the carrier still vibrates at its "
+            f"is {slowest:g} rad/s, at which a turn takes more than {_MAX_STEPS} steps, and the carrier still vibrates at its "
             f"end (it decays at {max(decay, 0.0):.2g} 1/s); use a higher speed, or give machine.damping"
         )
         raise InputError("drive.speed", problem)

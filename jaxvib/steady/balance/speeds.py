@@ -34,7 +34,7 @@ _GRID_POINTS = 24
 
 
 class CriterionStatus(eqx.Enumeration):
-    """Outcome of the criterion for a machine; the members are the sentences a user reads."""
+    """Outcome of the criterion for a machine. The value of each member is the message shown to the user."""
 
     judged = "stability was decided at every rotor speed"
     free = "no support resists one of the motions of the machine: its lowest resonance is 0, and it can drift"
@@ -42,17 +42,18 @@ class CriterionStatus(eqx.Enumeration):
 
 
 class CharacteristicSpeeds(Result):
-    """Speeds at which the real part of the port's receptance changes sign, ascending, rad/s; NaN for an absent one.
+    """Speeds at which the real part of the port's receptance changes sign, ascending, rad/s; NaN for a speed that does not
+    exist.
 
     **Attributes** (nd coordinates)
 
     - `resonances` (nd,): poles of the receptance without damping, at which loads change from gathering to balancing
-    - `additional` (nd - 1,): its zeros, at which they change back; these are the resonances of the machine with its port held
-    - `shapes` (nd, nd): the resonances' mode shapes, a column each, of unit modal mass, the sign free
+    - `additional` (nd - 1,): its zeros, at which they change back; these are the resonances of the machine with its port fixed
+    - `shapes` (nd, nd): the mode shapes of the resonances, one column each, with unit modal mass and an arbitrary sign
     - `damped_resonances` (nd,) and `damped_additional` (nd - 1,): the same changes of sign with the machine's damping
     - `coordinates`: the names of the rows of `shapes`
 
-    A mode that does not move the port has its resonance among the additional speeds too: no sign changes there.
+    If a mode does not move the port, its resonance is also one of the additional speeds, and no sign changes there.
     """
 
     resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
@@ -136,21 +137,21 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     """Return resonances and additional speeds of a scene's machine with its loads, without and with damping.
 
-    Coincident loads push the port with S w^2 Re(e exp(i w t)), e the direction that turns (one number for a port with
+    Coincident loads exert the force S w^2 Re(e exp(i w t)) on the port; e is its rotating direction (a scalar for a port with
     one direction, (1, -i) for two). The criterion is the mean of force times displacement, with b = B^T e:
 
         Re(e^H A(w) e) = Re(b^H [K - w^2 (M_S - i G) + i w C]^-1 b)
 
-    which is the trace of A without coupling by the rotor speed. Undamped, its poles are the eigenvalues of
-    K y = w^2 (M_S - i G) y, its zeros those of the same problem on b^H y = 0 (the port held), and they interlace.
-    Damped, its sign changes are bracketed on a grid between the lowest and the highest undamped resonance: outside that
-    range damping cannot change the sign, since Re(b^H D^-1 b) = y^H (K - w^2 M_S) y with y = D^-1 b. A damper between
-    the exciter's platform and the foundation moves no speed at all: it adds to the imaginary part of 1/A alone.
+    which is the trace of A without coupling by the rotor speed. Without damping, its poles are the eigenvalues of K y = w^2
+    (M_S - i G) y, and its zeros are those of the same problem on b^H y = 0 (the port fixed); poles and zeros interlace. With
+    damping, its sign changes are bracketed on a grid between the lowest and the highest undamped resonance: outside this range
+    damping cannot change the sign, because Re(b^H D^-1 b) = y^H (K - w^2 M_S) y with y = D^-1 b. A damper between the
+    exciter's platform and the foundation changes none of these speeds, because it adds only to the imaginary part of 1/A.
 
     **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every parameter of the scene,
     forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).
-    Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes judges
-    many machines.
+    Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes evaluates many
+    machines.
 
     **Raises** `InputError` if no coordinate moves the port, a spring is too stiff for the precision compared with the
     others, a gyroscopic carrier has a motion without a spring, or loads have different stations.
@@ -164,7 +165,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     >>> [(label, round(w, 4)) for label, w in speeds.labelled(damped=True)]
     [('resonance 1', 0.3334), ('additional 1', 0.7467), ('resonance 2', 0.998)]
 
-    Source: Filimonikhin et al. 2022, equations (12), (32)-(38), (53)-(59) with their misprints mended, for any carrier.
+    Source: Filimonikhin et al. 2022, equations (12), (32)-(38), (53)-(59) with their misprints corrected, for any carrier.
     """
     scene = validate_scene(scene)
     require_one_point(scene)
@@ -182,13 +183,13 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
     gyroscopic = model.mount.gyroscopic
     if gyroscopic is None:
         square, inverse = relative_to(model.mass, carrier.stiffness)
-        values, vectors, held = _free_and_held_modes(square, inverse @ direction)
+        values, vectors, held = _free_and_fixed_modes(square, inverse @ direction)
         resonances, additional = root_or_zero(values), root_or_zero(held)
         shapes = inverse.T @ vectors
     else:
         # The metric is K, since M_S - i G is not positive definite for a large polar moment, and a resonance is missing.
         square, inverse = relative_to(carrier.stiffness, model.mass - 1j * gyroscopic)
-        values, vectors, held = _free_and_held_modes(square, inverse @ direction)
+        values, vectors, held = _free_and_fixed_modes(square, inverse @ direction)
         resonances, additional = _inverse_root(values)[::-1], _inverse_root(held)[::-1]
         shapes = inverse.T @ vectors[:, ::-1] * jnp.where(jnp.isnan(resonances), 0.0, resonances)[None, :]
     changes = _sign_changes(model, direction, resonances, additional, shapes)
@@ -230,8 +231,9 @@ def _inverse_root(values: Array) -> Array:
     return jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.nan)
 
 
-def _free_and_held_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
-    """Return ascending eigenvalues and vectors of `square` (nd, nd), and its eigenvalues (nd - 1,) on the complement of c."""
+def _free_and_fixed_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
+    """Return ascending eigenvalues and vectors of `square` (nd, nd), and its eigenvalues (nd - 1,) on the orthogonal
+    complement of c."""
     size = magnitude(c[0])
     phase = jnp.where(size > 0.0, c[0] / jnp.where(size > 0.0, size, 1.0), 1.0)
     # A reflection maps c to the first axis; the other axes are then a basis of the complement of c.
@@ -251,11 +253,11 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     carrier = model.carrier
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
     trace = jnp.finfo(last.dtype).eps ** 0.75 * last
-    # This term does not change the real part of 1/A and the sign changes, and makes the function smooth at the poles.
-    mobility = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
-    smooth = 1j * last**2 / mobility * jnp.outer(b, b.conj())
+    # This term changes neither the real part of 1/A nor the sign changes. It makes the function smooth at the poles.
+    participation = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
+    smooth = 1j * last**2 / participation * jnp.outer(b, b.conj())
 
-    def pull(m: LinearModel, w: Array) -> Array:
+    def functional(m: LinearModel, w: Array) -> Array:
         # A small damping is added, since a mode without damping that never moves the port gives 0/0 at its resonance.
         matrix = m.dynamic_stiffness(w) + 2j * w * trace * frozen.mass + smooth
         return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
@@ -278,14 +280,14 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     )
     grid = jnp.concatenate([0.999 * poles[:1], inside.ravel(), 1.001 * poles[-1:]])
 
-    # Below the first resonance the sign is + whatever the damping; a machine that can drift has its change at speed 0.
+    # Below the first resonance the sign is + for any damping; for a machine that can drift, the sign changes at speed 0.
     # A loop over the grid points, so that a batch of machines needs the memory of one grid point for each.
-    positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: pull(frozen, w) > 0.0, grid[1:]))
+    positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: functional(frozen, w) > 0.0, grid[1:]))
     passed = jnp.cumsum(positive[1:] != positive[:-1])
     order = jnp.arange(2 * resonances.shape[0] - 1)
     cell = jnp.minimum(jnp.sum(passed[None, :] <= order[:, None], axis=1), passed.shape[0] - 1)
     found = order < passed[-1]
-    refine = lambda lo, hi: bracketed_root(lambda w: pull(model, w), lo, hi)  # noqa: E731
+    refine = lambda lo, hi: bracketed_root(lambda w: functional(model, w), lo, hi)  # noqa: E731
     roots = jax.vmap(refine)(grid[cell], grid[cell + 1])
     roots = jnp.where((order == 0) & (grid[0] == 0.0), 0.0, roots)
     return jnp.where(found, roots, jnp.nan)

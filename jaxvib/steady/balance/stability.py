@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class StabilityStatus(eqx.Enumeration):
-    """Stability of a balanced motion; the members are the sentences a user reads."""
+    """Stability of a balanced motion. The value of each member is the message shown to the user."""
 
     stable = "deviations from the balanced motion decay"
     unstable = "deviations from the balanced motion grow"
@@ -29,11 +29,11 @@ class BalancedStability(Result):
 
     **Attributes**
 
-    - `stable`: True if errors decay
-    - `is_decided`: True if the growth over a turn is larger than its error
-    - `growth`, 1/s: the largest rate at which an error grows (negative: the slowest decay), neutral directions left out
+    - `stable`: True if deviations decay
+    - `is_decided`: True if the growth over a turn is larger than the error of the computation
+    - `growth`, 1/s: the largest growth rate of a deviation (if negative: the slowest decay), without neutral directions
     - `multipliers` (2 (nd + N),), complex, the largest first
-    - `neutral`: the number of those that are 1 because the arrangements form a family (the common turn at least)
+    - `neutral`: the number of multipliers that are 1 because the arrangements form a family (at least by a common rotation)
     - `error` of the multipliers, estimated from half the number of steps
     """
 
@@ -52,11 +52,11 @@ class BalancedStability(Result):
         return StabilityStatus.stable if self.stable else StabilityStatus.unstable
 
     def summary(self) -> str:
-        """Return the stability and the growth of errors as text."""
+        """Return the stability and the growth rate as text."""
         largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
         return (
             f"{self.message} at {self.growth:.4g} 1/s; largest multipliers {largest}, {self.neutral} of them neutral, "
-            f"known to {self.error:.1e}"
+            f"with an error of {self.error:.1e}"
         )
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:

@@ -30,9 +30,9 @@ from jaxvib.steady.balance.monodromy import (
     BATCH,
     at_constant_speed,
     balanced_motion,
-    checked_steps,
     fine_and_coarse,
     monodromies,
+    validate_steps,
 )
 from jaxvib.steady.balance.stability import BalancedStability
 from jaxvib.units import count
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 class BalanceStatus(eqx.Enumeration):
-    """Outcomes of the balance of loads; the members are the sentences a user reads."""
+    """Outcomes of the balance of loads. The value of each member is the message shown to the user."""
 
     unique = "the loads cancel in one arrangement, apart from a common rotation and a mirror image"
     family = "the loads cancel in a family of arrangements, with neutral directions in addition to the common rotation"
@@ -58,9 +58,10 @@ class BalancedStates(Result):
     **Attributes** (N loads)
 
     - `status`: a `BalanceStatus`
-    - `angles` (k, N), rad: one arrangement a row, load 1 at angle 0 unless the rotor has an imbalance; no rows if nothing
-      cancels
-    - `dimension` of the set of arrangements, including the common turn: N - 2, but 1 for two loads on a rotor without imbalance
+    - `angles` (k, N), rad: one arrangement in each row, with load 1 at angle 0 unless the rotor has an imbalance; no rows if
+      the loads cannot cancel
+    - `dimension` of the set of arrangements, including the common rotation: N - 2, but 1 for two loads on a rotor without
+      imbalance
     - `neutral` (k, N, d): orthonormal changes of the angles that keep each arrangement balanced to first order
     - `names` (d,) of these changes: "turn of all loads" first (not if the rotor has an imbalance), then "shape 1", ...
     - `scene`
@@ -80,13 +81,13 @@ class BalancedStates(Result):
         """Return the stability of an arrangement at the scene's rotor speed, see `balanced_stability`.
 
         **Arguments**: `arrangement`: its number, counted from 0; `steps` of Radau's method over one turn (default: as many as
-        the natural frequencies need); the time grows in proportion.
+        the natural frequencies need); the time is proportional to it.
         """
         return balanced_stability(self.scene, self._angles_of(arrangement), steps=steps)
 
     @validated
     def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
-        """Return the growth rate of an arrangement's errors at rotor speeds, 1/s: stable if it is negative, see
+        """Return the growth rate of deviations from an arrangement at rotor speeds, 1/s: stable if negative, see
         `balanced_growth`.
 
         **Arguments**: `speeds`, rad/s; `arrangement`: its number, counted from 0; `steps` as `stability`.
@@ -103,8 +104,8 @@ class BalancedStates(Result):
 
         - `low` and `high`: the range, rad/s
         - `arrangement`: its number, counted from 0
-        - `points`: speeds that are computed in the range; typical: 200 (the default). An interval narrower than their spacing
-          can be missed, and the time grows in proportion
+        - `points`: number of speeds that are computed in the range; typical: 200 (the default). An interval narrower than
+          their spacing can be missed; the time is proportional to this number
         - `steps` as `stability`
         """
         return balanced_intervals(self.scene, low, high, self._angles_of(arrangement), points=points, steps=steps)
@@ -125,7 +126,7 @@ class BalancedStates(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the arrangements in the rotor's frame, a circle each. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the arrangements in the rotor's frame, each on a circle. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import phase_circles  # slow import
 
         return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)], ax=ax)
@@ -139,10 +140,10 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
     - Two loads cancel if they are equal and opposite each other
     - Three loads cancel in one triangle and its mirror image
-    - From four loads on there is a family with N - 2 dimensions. The returned arrangement spreads the loads most (the sides m_j
-      R_j of a polygon inscribed in a circle: equal loads are evenly spaced), with its mirror image; `neutral` gives the
-      directions of the family
-    - A rotor's imbalance is one more side of the polygon, and the loads then have no common turn
+    - Four or more loads cancel in a family of arrangements with N - 2 dimensions. The returned arrangement, with its mirror
+      image, is the most spread one: m_j R_j are the sides of a polygon inscribed in a circle, so that equal loads are evenly
+      spaced. `neutral` gives the directions of the family
+    - An imbalance of the rotor is an additional side of the polygon; the loads then cannot rotate together
 
     Each arrangement has its `stability()`, its `growth(speeds)` and the stable `intervals(low, high)` of rotor speed.
 
@@ -150,8 +151,8 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
     **Returns** `BalancedStates`.
 
-    **Raises** `InputError` for loads that do not run on a circle at one point, and for an imbalance that tilts the rotor, of a
-    moment or static elsewhere on its axis, which they cannot cancel.
+    **Raises** `InputError` for loads that do not run on a circle at one point, and for an imbalance that tilts the rotor,
+    which they cannot cancel: a moment imbalance, or a static imbalance at another point of the axis.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -170,7 +171,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
       330, 210 deg
     neutral directions: none
 
-    Source: Filimonikhin et al. 2022, section 2 (families from three loads on, the common turn counted); derived here.
+    Source: Filimonikhin et al. 2022, section 2 (families of three or more loads, including the common rotation); derived here.
     """
     scene = validate_scene(scene)
     loads = _sides(circular_loads(scene))
@@ -205,9 +206,9 @@ def _sides(loads: CircularLoads) -> np.ndarray:
 
 def _imbalance(scene: Scene) -> complex:
     """Return the imbalance of the rotor, kg m, in its frame. **Raises** `InputError` if loads at one point cannot cancel it."""
-    thrown = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
-    static = [complex(*map(float, each.static)) for each in thrown]
-    moment = [complex(*map(float, each.moment)) for each in thrown]
+    imbalances = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
+    static = [complex(*map(float, each.static)) for each in imbalances]
+    moment = [complex(*map(float, each.moment)) for each in imbalances]
     levers = scene.mount().rotor_levers[1:] if static else ()
     moment += [float(lever) * each for lever in levers if lever is not None for each in static]
     if abs(sum(moment)) > _rounding() * max(map(abs, moment), default=0.0):
@@ -252,7 +253,8 @@ def _inscribed_polygon(sides: np.ndarray) -> np.ndarray:
 
 
 def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np.ndarray:
-    """Return orthonormal changes of the angles (N, d) that keep the sum to first order; a free common turn is the first."""
+    """Return orthonormal changes of the angles (N, d) that keep the sum to first order; the common rotation is the first one,
+    if it is free."""
     n = sides.size
     change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) / sides.max()
     _, values, right = np.linalg.svd(change)
@@ -267,8 +269,8 @@ def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int | None = None) -> BalancedStability:
     """Return the exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
 
-    The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made for
-    heavy loads or weak drag, unlike the criterion.
+    The full equations are linearised about this motion; their coefficients are periodic with the turn of the rotor. No
+    approximation is made for heavy loads or weak drag, unlike the criterion.
 
     **Arguments**
 
@@ -276,13 +278,14 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     - `angles` (N,), rad, in the rotor's frame, at which the loads cancel each other and the scene's `StaticImbalance`; default:
       the first of `balanced_states`
     - `steps` of Radau's method of order 11 over one turn; the default resolves the carrier's natural frequencies; typical: 24
-      to 200. The time grows in proportion. The method holds for loads with any drag and carriers with any damping
+      to 200. The time is proportional to this number. The method is valid for any drag of the loads and any damping of the
+      carrier
 
     **Returns** `BalancedStability`.
 
     **Raises** `InputError` for angles at which the loads do not cancel, for a machine that can drift, for effects that disturb
     the balanced motion (gravity), for a rotor that turns too slowly for an undamped carrier, and as `balanced_states`;
-    `ComputationError` with its status if nothing cancels.
+    `ComputationError` with its status if the loads cannot cancel.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -293,7 +296,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     Source: Floquet's theorem; Radau's method of Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.5.
     """
     angles, neutral = _arrangement(scene, angles)
-    matrix = fine_and_coarse(scene, angles, checked_steps(scene, scene.drive.speed, steps))
+    matrix = fine_and_coarse(scene, angles, validate_steps(scene, scene.drive.speed, steps))
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
     growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
@@ -309,7 +312,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 def balanced_growth(
     scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int | None = None
 ) -> np.ndarray:
-    """Return the growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable if it is negative.
+    """Return the growth rate of deviations from the balanced motion at many rotor speeds, 1/s: stable if negative.
 
     **Arguments**
 
@@ -329,7 +332,7 @@ def balanced_growth(
     flat = np.ravel(np.asarray(speeds, dtype=float))
     # Speeds are padded to whole batches, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % BATCH), mode="edge")
-    flows = monodromies(at_constant_speed(scene), angles, padded, checked_steps(scene, flat, steps))[: flat.size]
+    flows = monodromies(at_constant_speed(scene), angles, padded, validate_steps(scene, flat, steps))[: flat.size]
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
 
 
@@ -339,9 +342,9 @@ def balanced_intervals(
     """Return the intervals [from, to] of rotor speed between `low` and `high` (rad/s) in which the balanced motion is exactly
     stable.
 
-    They are searched on `points` speeds (typical: 200, the default) and refined by halving to 1e-7 of the speed. An interval
-    narrower than the spacing of the points can be missed. The criterion's intervals of the same range are
-    `criterion(scene).balancing`. `angles` and `steps` as `balanced_stability`.
+    They are searched for on `points` speeds (typical: 200, the default), and their ends are refined by bisection to 1e-7 of
+    the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for the same
+    range are `criterion(scene).balancing`. `angles` and `steps` as `balanced_stability`.
 
     **Returns** a list of pairs, rad/s. **Raises** as `balanced_stability`, and `InputError` for an empty range.
 

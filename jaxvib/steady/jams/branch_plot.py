@@ -73,9 +73,9 @@ def plot_branch(
     """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor speed; stable solid, unstable dashed.
 
     **Arguments**: `marks`: special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most`: the
-    greatest rotor speed shown, rad/s (a third above the scene's if None); `judged`: text on how stability is determined;
-    `show`: names of the panels; `ax`: axes to draw onto; `modes`: the number of the jam mode at each point, counted by the
-    resonances and the slope if None; `resonances` (nd,) rad/s, computed if None.
+    greatest rotor speed shown, rad/s (default: 4/3 of the scene's rotor speed); `judged`: text on how stability is determined;
+    `show`: names of the panels; `ax`: axes to draw onto; `modes`: the number of the jam mode at each point, default: from the
+    resonances and the slope; `resonances` (nd,) rad/s, default: computed here.
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel.
     """

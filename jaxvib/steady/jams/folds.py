@@ -32,7 +32,7 @@ _BLOCK_SIZE = 2**16
 class Folds(eqx.Module):
     """Points with dn/dOmega = 0, where two jam modes appear or merge.
 
-    **Attributes**, all (2 nd,), ascending in `omega`, padded at the end if `exists` is False
+    **Attributes**, all (2 nd,), ascending in `omega`; entries whose `exists` is False fill up the end
 
     - `omega`: load speed, rad/s
     - `rotor_speed`, rad/s
@@ -50,11 +50,13 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 
     with Y from `steady_displacement`: the torque of the drag balances the mean torque of the vibration. The formula is explicit
-    in `omega` and single-valued through the folds. If the rotor speed couples the carrier's coordinates, Y is that at `speed`.
+    in `omega` and single-valued through the folds. If the rotor speed couples the carrier's coordinates, Y is computed at the
+    rotor speed `speed`.
 
-    Dry friction adds the torque mu2 (d/2) N sign(n - w) of each load to the drag; n is then the root of that balance between w
-    and the value above, with N = m R w^2. The weight of the loads is neglected, since its average over a turn is zero unless it
-    exceeds N. An imbalance of the rotor acts at the frequency n and not at w, and has no effect here.
+    Dry friction adds the torque mu2 (d/2) N sign(n - w) of each load to the drag; n is then the root of this balance of
+    torques between w and the value above, with N = m R w^2. The weight of the loads is neglected, because its effect on N
+    averages to zero over a turn unless the weight exceeds N. An imbalance of the rotor acts at the frequency n and not at w,
+    and has no effect here.
 
     **Returns** n, a scalar. **Raises** `InputError` for the same scenes as `jam_modes`.
 
@@ -75,7 +77,8 @@ def rotor_speed_at(model: JammedModel, omega: Array, speed: Array | None = None)
 
 
 def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
-    """Return the rotor speed of light loads at a load speed (rad/s), see `jam_rotor_speed`; the start for exact jams.
+    """Return the rotor speed of light loads at a load speed (rad/s), see `jam_rotor_speed`. The search for exact jams starts
+    from it.
 
     If the response of the carrier depends on the rotor speed (gyroscopic), n = w + torque(w, n)/drag can have several roots.
     The result is the lowest one on a grid of rotor speeds from w to 1e4 w.
@@ -114,7 +117,7 @@ def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
 
 
 def scanned_speed(model: JammedModel, omega: Array) -> Array:
-    """Return `rotor_speed_at` in modal form, for a search: O(nd), without derivatives by parameters of the scene."""
+    """Return `rotor_speed_at` in modal form, for a search: O(nd) operations, without derivatives with respect to parameters."""
     return _speed_for(model, omega, model.forward_acceleration(omega))
 
 
@@ -134,7 +137,8 @@ def scanned_slope(model: JammedModel, omega: Array) -> Array:
 
 
 def scanned_slopes(model: JammedModel, omegas: Array) -> Array:
-    """Return `scanned_slope` at many load speeds, in blocks if there are many: at 200 platforms in a sixth of the time."""
+    """Return `scanned_slope` at many load speeds, in blocks if there are many; for 200 platforms this takes a sixth of the
+    time."""
     each, block = partial(scanned_slope, model), _BLOCK_SIZE // (2 * model.mass.shape[0])
     return jax.vmap(each)(omegas) if omegas.shape[0] <= block else jax.lax.map(each, omegas, batch_size=block)
 
@@ -143,7 +147,7 @@ def scanned_slopes(model: JammedModel, omegas: Array) -> Array:
 def _fold_speed(model: JammedModel, omega: Array) -> Array:
     """Return `rotor_speed_at` in modal form, with the derivatives of the dense form.
 
-    They are computed only if they are needed.
+    The derivatives are computed only if they are needed.
     """
     assert model.modal is not None
     return jax.lax.cond(model.modal.is_rough, rotor_speed_at, scanned_speed, model, omega)
@@ -205,7 +209,7 @@ def branch_pieces(model: JammedModel) -> Pieces:
     speeds, speed_end = speeds[:-1], jax.lax.stop_gradient(speeds[-1:])
     main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
     omega, speeds, found = omega[main], speeds[main], found[main]
-    if model.modal is not None:  # again with derivatives by numbers of the scene
+    if model.modal is not None:  # again, with derivatives with respect to parameters
         speeds = jax.vmap(partial(_fold_speed, model))(omega)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
@@ -219,9 +223,10 @@ def branch_pieces(model: JammedModel) -> Pieces:
 
 
 def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
-    """Return mode numbers (2 nd + 1,) of the pieces of a branch; its folds are the load speeds `cuts` (2 nd,) that are `found`.
+    """Return mode numbers (2 nd + 1,) of the pieces of a branch; its folds are the load speeds `cuts` (2 nd,) with `found`
+    True.
 
-    Each peak belongs to the nearest resonance, except that two peaks never share a resonance and every peak has one.
+    Each peak belongs to the nearest resonance, but no two peaks share a resonance, and every peak has one.
     """
     nd = resonances.shape[0]
     peak = np.arange(nd)
@@ -235,7 +240,7 @@ def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
 
 
 def without_ripples(speeds: Array, count: Array, most: int) -> Array:
-    """Return indices of the `most` relevant folds among twice as many with rotor speeds `speeds`; the first `count` exist.
+    """Return the indices of the `most` most relevant folds among 2 `most` with rotor speeds `speeds`; the first `count` exist.
 
     A branch has one peak for each resonance. If it has additional ripples, the pairs of folds with the smallest ratio of rotor
     speeds are dropped.
@@ -259,7 +264,7 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
 
     The grid has `per_side` points on each side of each pole s of det(K + s^2 M + s C) = 0, with a density that follows the
     width of its peak. Undamped resonances are not sufficient: a strong damper between two platforms locks them into one body,
-    whose sharp peak is at neither resonance.
+    whose sharp peak is at neither of their resonances.
     """
     resonances, _ = model.modes()
     fixed = jax.lax.stop_gradient(resonances)
@@ -298,7 +303,7 @@ def _first_places(there: Array, size: int, otherwise: int) -> Array:
 
 
 def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
-    """Return a grid with points added at minima of |slope|, since one interval can contain two folds, and `slopes` on it."""
+    """Return a grid, and `slopes` on it; points are added at minima of |slope|, because one interval can contain two folds."""
     value = slopes(grid)
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])

@@ -22,8 +22,8 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
 
     Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `jam_rotor_speed`. Near a resonance w_r the left side is
     almost proportional to |w - w_r|, therefore a few steps converge from far away. `jam_modes` computes the whole branch and
-    takes a hundred times as long. It determines the number of a mode; this function keeps the number, and does not notice modes
-    that exchange their numbers.
+    takes a hundred times as long. It determines the number of a mode; this function keeps the number, and does not detect that
+    modes exchange their numbers.
 
     **Returns** `Jam`, with NaN if the iteration has not converged or ended on a piece of the branch with the wrong sign of the
     slope. First derivatives are exact.
@@ -37,21 +37,21 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     0.9721
     """
     speed = model.scene.drive.speed
-    still = jax.lax.stop_gradient(model)
+    frozen = jax.lax.stop_gradient(model)
     target = jax.lax.stop_gradient(speed)
 
     def gap(w: Array) -> Array:
-        torque = rotor_speed_at(still, w) - w
+        torque = rotor_speed_at(frozen, w) - w
         return jax.lax.rsqrt(jnp.maximum(torque, 1e-300)) - jax.lax.rsqrt(target - w)
 
     omega = _newton(gap, near, target)
-    ahead, slope = jax.jvp(lambda w: rotor_speed_at(still, w), (omega,), (jnp.ones_like(omega),))
+    ahead, slope = jax.jvp(lambda w: rotor_speed_at(frozen, w), (omega,), (jnp.ones_like(omega),))
     # A Newton step from the root has length zero and the derivatives of the root.
     omega = omega - (rotor_speed_at(model, omega) - speed) / slope
-    met = jnp.abs(ahead - target) < 1e-9 * (target + jnp.abs(slope) * omega)
-    there = met & (omega > 0.0) & (omega < target) & ((slope > 0.0) == (mode % 2 == 1))
-    jam = jam_at(model, jnp.asarray(mode), jnp.where(there, omega, jnp.nan), speed, jnp.asarray(False))
-    return eqx.tree_at(lambda j: j.stable, jam, there & jam.stable)
+    converged = jnp.abs(ahead - target) < 1e-9 * (target + jnp.abs(slope) * omega)
+    is_valid = converged & (omega > 0.0) & (omega < target) & ((slope > 0.0) == (mode % 2 == 1))
+    jam = jam_at(model, jnp.asarray(mode), jnp.where(is_valid, omega, jnp.nan), speed, jnp.asarray(False))
+    return eqx.tree_at(lambda j: j.stable, jam, is_valid & jam.stable)
 
 
 def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
@@ -59,19 +59,19 @@ def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
 
     Newton's method solves n'(w)/(n(w) - w)^2 = 0, which is almost linear near a resonance.
 
-    **Returns** its load speed and rotor speed, rad/s, NaN without convergence. First derivatives are exact; that of the rotor
-    speed does not need that of the load speed, since the branch is flat at a fold.
+    **Returns** the load speed and the rotor speed of the fold, rad/s, NaN without convergence. First derivatives are exact.
+    The derivative of the rotor speed does not need that of the load speed, because the branch is flat at a fold.
     """
-    still = jax.lax.stop_gradient(model)
+    frozen = jax.lax.stop_gradient(model)
 
     def flat(w: Array) -> Array:
-        return branch_slope(still, w) / jnp.maximum(rotor_speed_at(still, w) - w, 1e-300) ** 2
+        return branch_slope(frozen, w) / jnp.maximum(rotor_speed_at(frozen, w) - w, 1e-300) ** 2
 
     omega = _newton(flat, near, jnp.asarray(jnp.inf, near.dtype))
-    slope, bend = jax.jvp(lambda w: branch_slope(still, w), (omega,), (jnp.ones_like(omega),))
-    omega = omega - branch_slope(model, omega) / bend
-    met = jnp.abs(slope) < 1e-7 * jnp.abs(bend * omega)
-    omega = jnp.where(met & (omega > 0.0), omega, jnp.nan)
+    slope, curvature = jax.jvp(lambda w: branch_slope(frozen, w), (omega,), (jnp.ones_like(omega),))
+    omega = omega - branch_slope(model, omega) / curvature
+    converged = jnp.abs(slope) < 1e-7 * jnp.abs(curvature * omega)
+    omega = jnp.where(converged & (omega > 0.0), omega, jnp.nan)
     return omega, rotor_speed_at(model, omega)
 
 

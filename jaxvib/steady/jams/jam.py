@@ -124,7 +124,7 @@ class JamModes(AbstractJam):
 
     Returned by `jam_modes`.
 
-    - A mode that does not exist holds NaN and the status `absent`. Its derivatives are 0 in place of NaN, which keeps the
+    - A mode that does not exist has NaN values and the status `absent`. Its derivatives are 0 in place of NaN, which keeps the
       derivatives of a batch finite: test the status, not the gradient
     - A mode at an undamped resonance has NaN amplitudes and the status `unbounded`
 
@@ -163,7 +163,7 @@ class JamModes(AbstractJam):
             there, rotor = ", ".join(map(str, self.mode_numbers())), speed_text(np.asarray(self.rotor_speed)[0], 6)
             raise ComputationError(
                 "absent",
-                f"jam mode {mode} does not exist at rotor speed {rotor}; there: {there}",
+                f"jam mode {mode} does not exist at rotor speed {rotor}; existing modes: {there}",
             )
 
     @validated
@@ -221,8 +221,8 @@ def jam_modes(scene: Scene) -> JamModes:
     the rotor speed gives one mode.
 
     - Mode numbers follow the resonances: mode 2r - 1 is on the piece that rises to the peak of resonance r, mode 2r on the
-      piece that falls from it, and mode 2 nd + 1 is beyond the last resonance. So mode 3 is the jam just below the second
-      resonance even if the first one is damped so much that modes 1 and 2 have vanished
+      piece that falls from it, and mode 2 nd + 1 is beyond the last resonance. Mode 3 is therefore the jam just below the
+      second resonance, even if the first one is damped so much that modes 1 and 2 have vanished
     - Rising pieces (odd modes) are stable by slope, falling ones are not
     - If the branch has more peaks than resonances, the lowest peaks, each of which covers a narrow range of rotor speeds, are
       ignored

@@ -18,26 +18,26 @@ from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program
 from jaxvib.runtime.compat import jaxpr_as_fun
 
 Given = TypeVar("Given", bound=PyTree[Array])
-Beside = TypeVar("Beside", bound=PyTree[Array])
-_State: TypeAlias = tuple[Array, Beside, Array, Array, Array, Array]
+Auxiliary = TypeVar("Auxiliary", bound=PyTree[Array])
+_State: TypeAlias = tuple[Array, Auxiliary, Array, Array, Array, Array]
 """Best unknowns so far, auxiliary values, residuals, sum of the squared residuals, Jacobian and damping."""
 
 
 def damped_newton(
-    balance: Callable[[Array, Given], tuple[Array, Beside]],
+    balance: Callable[[Array, Given], tuple[Array, Auxiliary]],
     start: Array,
     given: Given,
     iterations: int = 40,
     *,
-    on_numbers: bool = True,
-) -> tuple[Array, Beside]:
+    on_scalars: bool = True,
+) -> tuple[Array, Auxiliary]:
     """Solve `balance(x, given) = 0` from `start` by Newton steps with the damping of Levenberg and Marquardt.
 
     **Arguments**
 
     - `balance(x, given)`: returns the residuals, of size 1 or less far from a root, and auxiliary values
     - `iterations`: maximum number of steps; the iteration ends earlier if only rounding errors are left
-    - `on_numbers`: evaluate on scalars, see `scalarize`, which takes a third of the time for many starts
+    - `on_scalars`: evaluate on scalars, see `scalarize`, which reduces the time to a third for many starts
 
     **Returns** the root and the auxiliary values there.
 
@@ -48,12 +48,12 @@ def damped_newton(
     tiny = float(jnp.finfo(start.dtype).eps) ** 1.5
 
     def step(state: _State, given: Given) -> _State:
-        x, beside, value, size, slopes, damping = state
+        x, auxiliary, value, size, slopes, damping = state
         normal = slopes.T @ slopes
         damped = normal + damping * one * (normal + jnp.finfo(x.dtype).tiny)
         trial = x - jnp.clip(solve_definite(damped, slopes.T @ value), -0.5, 0.5)
 
-        def along(way: ArrayLike) -> tuple[Array, Array, Beside]:
+        def along(way: ArrayLike) -> tuple[Array, Array, Auxiliary]:
             return jax.jvp(lambda y: balance(y, given), (trial,), (way,), has_aux=True)
 
         new, by, found = jax.vmap(along, out_axes=(None, 1, None))(one)
@@ -62,7 +62,7 @@ def damped_newton(
         # An infinite damping ends the iteration.
         more = jnp.where(size < tiny, jnp.inf, jnp.minimum(8.0 * damping, 1e8))
         then = trial, found, new, left, by, jnp.maximum(0.1 * damping, 1e-14)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, (x, beside, value, size, slopes, more))
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, (x, auxiliary, value, size, slopes, more))
 
     one = np.eye(start.shape[0], dtype=start.dtype)
     nothing = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(balance, start, given)[1])
@@ -70,7 +70,7 @@ def damped_newton(
     inf, tenth = jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0.1, start.dtype)
     begin = start, nothing, jnp.zeros_like(start), inf, jnp.asarray(one), tenth
     leaves, structure = jax.tree.flatten(begin)
-    small = on_numbers and sum(leaf.size for leaf in leaves) <= MAX_SCALARS
+    small = on_scalars and sum(leaf.size for leaf in leaves) <= MAX_SCALARS
     program = scalarized_program(step, begin, given) if small else None
     if program is None:
         return jax.tree.unflatten(structure, _iterate(_on_arrays(step, begin, given), leaves, iterations))[:2]
@@ -89,7 +89,8 @@ def _on_arrays(step: Callable[[_State, Given], _State], begin: _State, given: Gi
 
 
 def _iterate(step: Callable[..., Sequence[Array]], begin: Sequence[Array], times: int) -> Sequence[Array]:
-    """Return the state after the first evaluation and `times` steps, or fewer if its last number, the damping, is infinite."""
+    """Return the state after the first evaluation and `times` steps, or fewer steps if the damping, the last entry of the
+    state, becomes infinite."""
 
     def going(now: tuple[Array, list[Array]]) -> Array:
         return (now[0] <= times) & (now[1][-1] < jnp.inf)

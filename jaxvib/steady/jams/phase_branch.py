@@ -28,9 +28,9 @@ _PHASE_JUMP = 0.3
 class PhaseBranch(Result):
     """Phase pattern over the load speed, at a fixed rotor speed.
 
-    **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): the factor on the scene's drag with which the loads jam
-    at this speed, NaN if the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable` (n,) as in `PhaseJam`;
-    `rotor_speed` rad/s; `drag` (count,) N s/m, which the factor multiplies.
+    **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): the factor by which the scene's drag must be multiplied
+    so that the loads jam at this speed, NaN if the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable`
+    (n,) as in `PhaseJam`; `rotor_speed` rad/s; `drag` (count,) N s/m, which the factor multiplies.
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s", "omega"))

@@ -65,9 +65,9 @@ class PhaseJams(AbstractPhaseJam):
 
     Returned by `phase_jams`.
 
-    They are ordered by falling speed of the loads, stable ones first if speeds are equal.
+    The jams are in the order of decreasing load speed; stable ones come first if speeds are equal.
 
-    **Additional attributes**: `starts` (n,): the number of starts that led to each; and the `scene`.
+    **Additional attributes**: `starts` (n,): the number of starts that led to each jam; `scene`.
     """
 
     outer_axes = ("jam",)
@@ -100,8 +100,8 @@ class PhaseJams(AbstractPhaseJam):
 
         Colours show the arrangement of the loads; stable solid, unstable dashed, the jams themselves as points.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit than "rad/s", "rpm", "Hz"
-        (`unit`).
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a `unit` other than "rad/s", "rpm",
+        "Hz".
         """
         from jaxvib.draw.phases import drag_diagram  # slow import
 
@@ -137,31 +137,31 @@ def phase_jams(scene: Scene, *, near: tuple[Array, Array]) -> PhaseJam: ...
 def phase_jams(
     scene: Scene, *, starts: int = 128, seed: int = 0, near: tuple[Array, Array] | None = None
 ) -> PhaseJams | PhaseJam:
-    """Return every way in which the scene's light loads can jam at its rotor speed, whatever their phases.
+    """Return all jams of the scene's light loads at its rotor speed, with any phases.
 
         b_W R^2 (n - Omega) = mean braking torque of the vibration on load j,  for every load j, solved for Omega and the phases
 
     - At each of many load speeds, closer together near resonances, the search finds phases at which all loads need the same
-      multiple of their drag, from `starts` random sets of phases and some regular ones. If that multiple passes 1 from one load
-      speed to the next, the speed is solved for as well (`phase_jam`)
-    - Jams that differ by a common turn, or by an exchange of equal loads, are one jam
+      multiple of their drag, from `starts` random sets of phases and some regular ones. If this multiple passes 1 between two
+      load speeds, the speed is solved for as well (`phase_jam`)
+    - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out
-    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) leaves a jam unchanged: it shakes at the rotor's speed,
-      loads at theirs, so that it has no mean torque at this order. Its vibration and force add to those of the loads; the
-      amplitudes and the foundation force are the loads' alone. If both count, use `simulate`
+    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor speed
+      and that of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The amplitudes and
+      the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use `simulate`
 
     **Arguments**
 
-    - `scene` with a drive of given speed and loads with drag; typical: 2 to 4 loads
+    - `scene` with a drive of prescribed speed and loads with drag; typical: 2 to 4 loads
     - `starts`: random sets of phases at each load speed; typical: 16 to 1024 (default 128). Stable jams are found with a few;
-      unstable ones close to the separation of two patterns take many. The time grows in proportion
+      unstable ones close to the separation of two patterns need many. The time is proportional to this number
     - `seed` of these random phases
     - `near`: (omega, phase), a speed rad/s and the phases (count,) rad of the loads, from which Newton's method finds one jam,
-      see `phase_jam`; `jit`, `vmap` and `grad` go through it then
+      see `phase_jam`; the function can then be used under `jit`, `vmap` and `grad`
 
     **Returns** `PhaseJams`, or `PhaseJam` with `near`.
 
-    **Raises** `InputError` for loads without drag, drives without a given speed, and effects that this function does not
+    **Raises** `InputError` for loads without drag, drives without a prescribed speed, and effects that this function does not
     include.
 
     >>> import jaxvib as jv
@@ -254,7 +254,7 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     """Follow the phase pattern of `jam` over load speeds `omega` (n,) rad/s, ascending, below the rotor speed.
 
     The drag is explicit in the load speed; therefore folds need no continuation: two jams of the pattern merge at an extremum
-    of the drag factor over `omega`. If a pattern ends, the next phases may belong to another pattern: they jump there.
+    of the drag factor over `omega`. If a pattern ends, the next phases may belong to another pattern; the phases then jump.
 
     **Returns** `PhaseBranch`. **Raises** `InputError` for speeds that do not ascend or are not between 0 and the rotor's.
 
@@ -300,7 +300,7 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, anew: Array) -> tu
 
 
 def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:
-    """Return True if two sets of phases differ only by a common turn and by an exchange of equal loads."""
+    """Return True if two sets of phases differ only by a common rotation and by an exchange of equal loads."""
 
     def points(phase: np.ndarray, group: np.ndarray) -> np.ndarray:
         return np.exp(1j * phase[group])

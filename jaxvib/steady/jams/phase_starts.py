@@ -49,9 +49,9 @@ def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
         T_j = (w^4/2) S Im(e^{-i a_j} F),      F = sum_k S_k A_jk e^{i a_k}, equal for equal loads
 
     Equal loads need the same torque, therefore Im(e^{-i a_j} F) is the same for all of them, and at most two phases a_j are
-    possible. Therefore no jam is missed by a search over all divisions of the equal loads into two clusters, with one load in
-    place of each cluster. The unknowns are two phases for each group of equal loads, whatever the number of its loads. The
-    results are not all distinct.
+    possible. For this reason no jam is missed by a search over all divisions of the equal loads into two clusters, with one
+    load in place of each cluster. The unknowns are two phases for each group of equal loads, for any number of its loads. The
+    same solution may occur several times.
     """
     divisions = _divisions(equal_loads(balance))
     each = max(number // len(divisions), min(number, _STARTS_OF_CLUSTERS))
@@ -72,7 +72,7 @@ def solved_clusters(balance: TorqueBalance, number: int, rng: np.random.Generato
 @cached
 def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple[Array, Array]:
     """Return `solve_balance` from many speeds and phases."""
-    return jax.vmap(lambda w, a: solve_balance(balance, w, a, on_numbers=True))(omega, phase)
+    return jax.vmap(lambda w, a: solve_balance(balance, w, a, on_scalars=True))(omega, phase)
 
 
 def equal_loads(balance: TorqueBalance) -> list[np.ndarray]:

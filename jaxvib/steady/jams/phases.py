@@ -60,7 +60,7 @@ class PhaseStatus(eqx.Enumeration):
 
 
 def degrees(angle: float) -> float:
-    """Convert an angle from rad to degrees, rounded for display, so that rounding errors of 0 print as 0.
+    """Convert an angle from rad to degrees, rounded for display: a rounding error of 0 is shown as 0.
 
     >>> degrees(2.5e-19), degrees(3.141592653589793)
     (0.0, 180.0)
@@ -69,8 +69,7 @@ def degrees(angle: float) -> float:
 
 
 class AbstractPhaseJam(Result):
-    """One or several jams whose loads may be at different angles, phi_j = Omega t + phase_j. Numbers are NaN if there is no
-    jam.
+    """One or several jams whose loads may be at different angles, phi_j = Omega t + phase_j. Values are NaN if there is no jam.
 
     **Attributes**
 
@@ -139,8 +138,8 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
 
     L_j (np, nd) maps the carrier's coordinates to the displacement of the port at the station of load j; n is the rotor speed.
 
-    **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a given speed, and
-    effects that this function does not include.
+    **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a prescribed
+    speed, and effects that this function does not include.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -172,7 +171,7 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     from the implicit function theorem. An imbalance of the rotor is not included in amplitudes and forces, see `phase_jams`.
 
     **Raises** `InputError` for loads without drag, a number of phases that differs from the number of loads, drives without a
-    given speed, and effects that this function does not include.
+    prescribed speed, and effects that this function does not include.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -197,11 +196,11 @@ def loads_with_drag(scene: Scene) -> CircularLoads:
     return loads
 
 
-def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_numbers: bool = False) -> tuple[Array, Array]:
+def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_scalars: bool = False) -> tuple[Array, Array]:
     """Solve the torque balance for the load speed and the phases (count,) by Newton's method, differentiable with respect to
     the balance.
 
-    `on_numbers`: evaluate on scalars (`damped_newton`), which is faster for many starts and takes longer to compile.
+    `on_scalars`: evaluate on scalars (`damped_newton`), which is faster for many starts and takes longer to compile.
     """
 
     def residuals(x: Array, given: TorqueBalance) -> tuple[Array, None]:
@@ -209,7 +208,7 @@ def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_numb
 
     frozen = jax.lax.stop_gradient(balance)
     start = jax.lax.stop_gradient(unknowns_of(balance, omega, phase))
-    x, _ = damped_newton(residuals, start, frozen, on_numbers=on_numbers)
+    x, _ = damped_newton(residuals, start, frozen, on_scalars=on_scalars)
     # One more Newton step: its derivative with respect to the scene is that of the implicit function theorem.
     x = x - eliminate(jax.jacfwd(balance_residuals)(x, frozen), balance_residuals(x, balance))
     w, angles = motion_of(balance, x)

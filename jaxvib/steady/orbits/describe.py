@@ -61,18 +61,18 @@ class Orbit(Result):
 
     Returned by `jam_orbit`.
 
-    Numbers are NaN if the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
+    Values are NaN if the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
 
     **Attributes**
 
     - `status`: an `OrbitStatus`
     - `residual` of the torque balance, relative
-    - `error`: estimate of the relative error of the speeds (and, rad, of psi), from the number of harmonics and from rounding
+    - `error`: estimated relative error of the speeds, and error of psi in rad, due to the number of harmonics and to rounding
     - `omega` and `rotor_speed`, rad/s; `slope`: dn/dOmega along the branch
     - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, (max - min)/2 over the period. For two
       directions of the force: root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
     - `power`, W: mean power that the loads take from the rotor, by drag and dry friction
-    - `stable`: True if every load keeps to this motion, that is `multiplier` < 1
+    - `stable`: True if small deviations of the loads from this motion decay, that is `multiplier` < 1
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
     - `multipliers`, complex: all of them, those of loads that separate from each other last
     - `trivial`: the multiplier that is 1, as computed
@@ -135,7 +135,7 @@ class Orbit(Result):
 
     @property
     def judgement(self) -> str:
-        """Text "stable" or "unstable", or that the stability is unknown."""
+        """Stability as text: "stable", "unstable", or that the stability is unknown."""
         return judgement_of(self.multiplier, self.stable)
 
     def force_peaks(self) -> Array:
@@ -188,8 +188,8 @@ def plot_period(
 ) -> Drawn:
     """Plot a period of a motion over the angle Omega t from its harmonics.
 
-    `deviation`: orders and harmonics of the bodies' deviations, the title of their panel, and the names of one of several
-    bodies and of a single one.
+    `deviation`: orders and harmonics of the bodies' deviations, the title of their panel, and the labels of one of several
+    bodies and of a single body.
     """
     from jaxvib.draw.results import signals_chart  # slow import
 
@@ -320,8 +320,8 @@ def orbits(
 def numbers_of(
     model: CoincidentModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
-    """Return fields of one orbit from its known motion, with derivatives, equal to those of `orbits` for the same arguments; 0
-    if these are NaN."""
+    """Return fields of one orbit from its known motion, with derivatives. They are equal to those of `orbits` for the same
+    arguments, or 0 if these are NaN."""
     grid, there = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
     x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
     deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
@@ -355,7 +355,7 @@ def _motion_quantities(
     """Return amplitude, foundation force, power and contact torque between the loads of one motion.
 
     The power is the sum of the dissipation by drag, friction and the carrier. It equals n times the mean torque; for strong
-    drag that product loses its digits, since the torque is computed from a small difference n - phi'.
+    drag this product loses significant digits, because the torque is computed from a small difference n - phi'.
     """
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     torque = model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque)
@@ -371,7 +371,7 @@ def _motion_quantities(
 
 
 def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
-    """Return the smallest mean torque over a period, N m, by which a load pushes the next one; the loads lie side by side.
+    """Return the smallest mean torque over a period, N m, with which a load pushes the next one; the loads lie side by side.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The criterion is
     the mean, since no vibration of a jam presses the loads together at every instant.
@@ -407,11 +407,11 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     # Real and imaginary parts are in one real array, since products of complex numbers take four times as long.
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
     both, none = jnp.concatenate([harmonics.real, harmonics.imag]), np.zeros((k.size, k.size), k.dtype)
-    slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
-    derivatives, values = np.stack([slope, slope @ slope, slope @ slope @ slope]) @ still, waves @ still
+    slope, fixed = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
+    derivatives, values = np.stack([slope, slope @ slope, slope @ slope @ slope]) @ fixed, waves @ fixed
     best = jnp.argmax(jnp.abs(values) if half else values, axis=1)
     begin = waves[np.arange(_PEAK_SEARCH_PARTS), best]
-    side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(_PEAK_SEARCH_PARTS, k.dtype)
+    side = jnp.where(begin @ fixed < 0.0, -1.0, 1.0) if half else np.ones(_PEAK_SEARCH_PARTS, k.dtype)
 
     def halley(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry
@@ -427,11 +427,11 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
 
 
 def swing(orders: np.ndarray, harmonics: Array) -> Array:
-    """Return (max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
+    """Return (max - min)/2 over the period of the signals with these harmonics (n, K), also between the samples."""
     symmetric = bool(np.all(orders % 2 == 1))  # the signal changes its sign in half a period
 
     def highest(c: Array) -> Array:
-        return greatest(_peaks(orders, c, half=symmetric))  # maximum between samples, maybe not next to the largest one
+        return greatest(_peaks(orders, c, half=symmetric))  # the maximum may lie between samples that are not the largest
 
     def one(c: Array) -> Array:
         return highest(c) if symmetric else (highest(c) + highest(-c)) / 2.0

@@ -69,7 +69,7 @@ class ExactBranches(Result):
     - `amplitude` (P, nd), m (rad for tilts), and `foundation_force` (P,), N, zero to peak, as in `Orbit`
     - `power` (P,), W
     - `stable`, `multiplier` (P,) and `multipliers` (P, ...), as in `Orbit`
-    - `residual` and `error` (P,), and `status`, an `OrbitStatus` each
+    - `residual` and `error` (P,), and `status`: an `OrbitStatus` for each point
     - `special`: the special points, ascending in Omega
     - `scene`
     """
@@ -133,7 +133,7 @@ def exact_branches(
 
     **Arguments**
 
-    - `points`: number of points along Omega, crowded about the resonances
+    - `points`: number of points along Omega, denser near the resonances
     - `least`, `most`: limits of the load speed, rad/s or text; default: a fifth of the lowest resonance, and 4/3 of the scene's
       rotor speed
     - `accuracy` of the rotor speeds, relative
@@ -148,18 +148,18 @@ def exact_branches(
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
     count(points, "points", low=2, each=1e4)
-    if not _fold_points.is_ready(scene):
+    if not _search_grid.is_ready(scene):
         lanes = np.ones(_ORBITS_PER_BATCH, scene.drive.speed.dtype)
         in_background(functools.partial(_values.prepare, scene, lanes, _points(scene)[0], accuracy, False))
-    inside, resonances = map(np.asarray, _fold_points(scene))
+    grid, resonances = map(np.asarray, _search_grid(scene))
     lowest = np.min(resonances[resonances > 0.0], initial=np.max(resonances))
     low = float(0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True))
     speed = float(scene.drive.speed)
     high = speed * 4.0 / 3.0 if most is None else float(number(most, "rad/s", "most", low=0.0, open_low=True))
     if not high > low:
-        raise InputError("most", f"is {high:.6g} rad/s; it must be above the lowest, {low:.6g} rad/s")
-    inside = np.concatenate([[low], inside[(inside > low) & (inside < high)], [high]])
-    omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, inside.size), inside)
+        raise InputError("most", f"is {high:.6g} rad/s; it must be above the lowest load speed (least), {low:.6g} rad/s")
+    grid = np.concatenate([[low], grid[(grid > low) & (grid < high)], [high]])
+    omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, grid.size), grid)
     solve = _Solver(scene, accuracy, low)
     values = solve(omega)
     fields = {name: getattr(values, name) for name in ExactBranches.__dataclass_fields__ if name not in ("special", "scene")}
@@ -223,7 +223,7 @@ def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.nd
 
 
 @cached
-def _fold_points(scene: Scene) -> tuple[Array, Array]:
+def _search_grid(scene: Scene) -> tuple[Array, Array]:
     """Return the grid of load speeds for the search for folds, and the resonances."""
     return fold_points(jammed_model(scene), 64)
 

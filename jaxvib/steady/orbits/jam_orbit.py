@@ -49,40 +49,41 @@ def jam_orbit(
     points: int | None = None,
     throw: bool = True,
 ) -> Orbit:
-    """Return the exact motion in which coincident loads jam: they need not be light.
+    """Return the exact motion in which coincident loads of any mass jam.
 
         I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n, a) - S e'(phi) . a,      a = B q''
         D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
-    with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
-    trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton's method from the leading order.
+    with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). The equations
+    are solved by trigonometric collocation of psi. The carrier is eliminated harmonic by harmonic, and Newton's method starts
+    from the leading order.
 
     - Loads that have equal parameters are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
-      arcsin(r/R)) / (r/R); if they would have to pull at each other, on the average of a period, the status is
-      `would_separate`)
+      arcsin(r/R)) / (r/R); if their mean contact force over a period would be tensile, the status is `would_separate`)
     - Loads that differ have a psi_j each: they lie next to each other in the order that their torques require
-    - The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. If friction can
-      hold the loads to the rotor, they stick and slip, which no number of harmonics resolves: the status shows it
+    - The torque is that of drag, gravity and dry friction, whose normal force depends on the acceleration a of the port. If
+      friction can hold the loads on the rotor, they stick and slip. No number of harmonics resolves this motion, and the
+      status shows it
 
-    **Arguments**: `scene`; one of the first three; and the others
+    **Arguments**: `scene`; one of `mode`, `omega` and `near`; and the other arguments
 
-    - `mode`: the number of a jam mode, see `jam_modes`: the motion at the scene's rotor speed that continues it; typical: 1, 3,
-      5. If the leading order lacks it or is too far from it, the whole exact branch is searched (not under a JAX
-      transformation)
-    - `omega`: a load speed, rad/s or text: the motion with that speed; its rotor speed is a result, the scene's is not used
-    - `near`: a load speed to start from: a motion at the scene's rotor speed
+    - `mode`: number of a jam mode, see `jam_modes`; the result is the exact motion of this mode at the scene's rotor speed;
+      typical: 1, 3, 5. If the mode does not exist in leading order, or its leading order is too far from the exact motion, the
+      whole exact branch is searched (not under a JAX transformation)
+    - `omega`: load speed of the motion, rad/s or text; the rotor speed is a result, and that of the scene is not used
+    - `near`: load speed, rad/s or text, from which a motion at the scene's rotor speed is searched for
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-9 (the default; in
       single precision 1e-3). A smaller value costs little, since the error falls exponentially with the number of harmonics
-    - `points`: a fixed number of collocation points (on half a period without gravity, otherwise on a period) in place of that;
-      typical: 12 to 32. The time grows with their square at least. Under `jit` and `vmap` shapes cannot follow numbers: there
-      the default is 16 (33), and the status shows if it is too small
+    - `points`: a fixed number of collocation points (on half a period without gravity, otherwise on a period) in place of an
+      accuracy; typical: 12 to 32. The time grows at least with the square of this number. Under `jit` and `vmap` the values
+      that decide on this number are not known; the default is then 16 (33), and the status shows if it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
-    **Returns** `Orbit`; derivatives of its numbers with respect to every parameter of the scene by the implicit function
-    theorem, forward and reverse.
+    **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,
+    forward and reverse).
 
     **Raises** `InputError` for wrong arguments, loads without drag, and a `mode` of a machine with gyroscopic coupling (its
-    resonances move with the rotor's speed; there a load speed may have motions at several rotor speeds, and `omega` gives that
+    resonances depend on the rotor speed; a load speed may have motions at several rotor speeds, and `omega` gives the motion
     at the lowest one); `ComputationError` with the status "absent" or "not_converged".
 
     >>> import jaxvib as jv
@@ -104,7 +105,7 @@ def jam_orbit(
         return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
     orbit = _solve_accurately(plan)
     if plan.mode is not None and not abs(float(orbit.omega) / float(plan.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
-        # The leading order lacks the mode, or is far from it: search the whole exact branch.
+        # The mode does not exist in leading order, or is far from it: search the whole exact branch.
         orbit = _solve_accurately(_from_search(plan, plan.mode))
     return outcome(orbit, throw=throw, failures=("absent", "not_converged"))
 

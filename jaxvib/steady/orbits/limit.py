@@ -1,4 +1,4 @@
-"""Limits of synchronization: folds of exact synchronous motions over a number of the scene."""
+"""Limits of synchronization: folds of exact synchronous motions over a parameter of the scene."""
 
 from __future__ import annotations
 
@@ -43,28 +43,28 @@ _PHASE_STEP = 0.1
 """Change of the phase between two points of a branch, rad."""
 
 _MAX_BRANCH_POINTS = 70
-"""Number of points in which a fold must be passed; together they are more than a turn of the phase."""
+"""Largest number of points of a branch up to its fold; their phases cover more than a full turn."""
 
 
 class LimitStatus(eqx.Enumeration):
-    """Outcomes of a search for the limit of synchronization. Each member is the sentence shown to the user."""
+    """Outcomes of a search for the limit of synchronization. The value of each member is the message shown to the user."""
 
-    found = "the motion ends here at a fold: beyond it these exciters do not turn together in it"
+    found = "the motion ends at this fold: beyond it the exciters cannot turn together in this way"
     not_found = "no fold was found in this direction: the motion could not be followed to one"
 
 
 class SynchronizationLimit(Result):
-    """Range of a number of the scene in which a synchronous motion exists, (2,): its lower and its upper end.
+    """Range of a parameter of the scene in which a synchronous motion exists, (2,): its lower and its upper end.
 
     Returned by `synchronization_limit`. At both ends the motion meets another one and vanishes.
 
     **Attributes**
 
     - `status`: a `LimitStatus` for each end
-    - `value` (2,) of the number `over`, SI; NaN without a fold
-    - `speed` (2,), rad/s, and `phases` (2, N), rad, of the motion there, see `SynchronousOrbit`
-    - `start`: value of the number in the scene, SI
-    - `branch_values` and `branch_phases` (P,): value of the number over the phase, rad, of one exciter along the branch
+    - `value` (2,) of the parameter `over`, SI; NaN without a fold
+    - `speed` (2,), rad/s, and `phases` (2, N), rad, of the motion at each end, see `SynchronousOrbit`
+    - `start`: value of the parameter in the scene, SI
+    - `branch_values` and `branch_phases` (P,): value of the parameter over the phase, rad, of one exciter along the branch
     """
 
     outer_axes = ("end",)
@@ -85,7 +85,7 @@ class SynchronizationLimit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the number over the phase along the branch. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the parameter over the phase along the branch. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import signals_chart  # slow import
 
         values = [(self.over, np.asarray(self.branch_values)[:, None], [self.over])]
@@ -94,17 +94,17 @@ class SynchronizationLimit(Result):
 
 @validated
 def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str) -> SynchronizationLimit:
-    """Return the range of a number of the scene in which a synchronous motion exists: the folds of the exact motion.
+    """Return the range of a parameter of the scene in which a synchronous motion exists; folds of the exact motion limit it.
 
-    Along a branch of motions the number is a smooth function of the phase of an exciter, which is largest or smallest at a
-    fold. Each point of the branch is therefore solved for the number at a given phase, and the fold is the root of its slope:
-    nothing becomes singular there.
+    Along a branch of motions the parameter is a smooth function of the phase of an exciter; a fold is a maximum or minimum of
+    this function. Each point of the branch is therefore solved for the parameter at a given phase, and the fold is the root of
+    the slope. The equations are not singular at a fold.
 
     **Arguments**
 
-    - `scene` with two exciters or more, whose bodies are not all turned by ideal drives
+    - `scene` with two or more exciters, not all of them turned by ideal drives
     - `regime`: a motion with `speed` and `phases`, such as a `SynchronousOrbit` of the scene
-    - `over`: name of the number, such as "exciters[1].drive.speed", "exciters[0].unbalance"
+    - `over`: name of the parameter, such as "exciters[1].drive.speed", "exciters[0].unbalance"
 
     **Returns** `SynchronizationLimit`; an end without a fold is NaN and has the status "not_found".
 
@@ -160,8 +160,8 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
 
 
 class _Point(NamedTuple):
-    """Point of a branch: `value` of the number, `speed` and `phases` (N,) of the motion; `slope` of the value over the phase;
-    `is_met`: True if the equations are met."""
+    """Point of a branch: `value` of the parameter, `speed` and `phases` (N,) of the motion; `slope` of the value over the
+    phase; `is_met`: True if the equations are satisfied."""
 
     value: np.ndarray
     speed: np.ndarray
@@ -215,7 +215,7 @@ def _branch_point(
     exciter: int,
     points: int,
 ) -> tuple[Array, ...]:
-    """Solve for the motion in which an exciter has its given phase, and for the value of the number `over`.
+    """Solve for the motion in which an exciter has its given phase, and for the value of the parameter `over`.
 
     `points`: number of collocation points on a period.
 

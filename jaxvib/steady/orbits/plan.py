@@ -1,6 +1,7 @@
 """Plans of exact jams: choices that depend on parameters of a scene, made on the host before a program is traced.
 
-Only this module tests which numbers are known. Under a JAX transformation the number of collocation points is fixed.
+Only this module tests which values are known (not traced). Under a JAX transformation the number of collocation points is
+fixed.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ class OrbitPlan:
     """Plan of an exact jam.
 
     **Attributes**: the `scene`; `given`: the name of the prescribed speed; its `value`, and the `start` of the other speed,
-    rad/s; `exists`: true if the leading order has the mode; `direction`: the sign of dn/dOmega that the mode needs, or None;
+    rad/s; `exists`: true if the mode exists in leading order; `direction`: the sign of dn/dOmega that the mode needs, or None;
     `mode`: its number, or None; `points`: numbers of collocation points to try in turn; relative `accuracy`; `implicit`: true
-    for implicit integration of the multipliers; `is_known`: true if all numbers have values; `is_settled_first`: true if
+    for implicit integration of the multipliers; `is_known`: true if no parameter is traced; `is_settled_first`: true if
     Newton's method starts from the motion at the load speed `start`.
     """
 
@@ -108,7 +109,7 @@ def plan_orbit(
         mode=None if mode is None else int(mode),
         points=_points(scene, loads, points, all_known=all_known),
         accuracy=accuracy,
-        # Unknown numbers may include strong drag.
+        # Traced parameters may include a strong drag.
         implicit=bool(_is_stiff(frozen, *speeds)) if all_known else True,
         is_known=all_known,
     )
@@ -124,7 +125,8 @@ def _accuracy(dtype: jnp.dtype, accuracy: float | None, usual: float = 1e-9) -> 
 
 
 def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known: bool) -> tuple[int, ...]:
-    """Return numbers of collocation points to try in turn, on half a period if the motion has that symmetry, else on one."""
+    """Return the numbers of collocation points to try one after the other. The points lie on half a period if the motion has
+    the half-turn symmetry, otherwise on a period."""
     if points is not None:
         bodies = 1 if loads.alike else loads.count
         size = _BYTES_PER_POINT * bodies**2 * float(points if isinstance(points, int) else 1)
@@ -134,7 +136,7 @@ def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known
 
 
 def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
-    """Return True if the leading order has the jam mode, the sign of dn/dOmega there, and its load speed, rad/s."""
+    """Return True if the jam mode exists in leading order, the sign of dn/dOmega there, and its load speed, rad/s."""
     if scene.mounting.gyroscopic is not None:
         raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
     jams = jams_of(scene)
@@ -166,8 +168,8 @@ _SYNCHRONOUS_TERMS = (GravityField, LoadPotential, RotorImbalance, ContactFricti
 class SynchronousPlan:
     """Plan of an exact synchronous motion.
 
-    **Attributes**: the `scene` with drives that no longer change; starts of `speed`, rad/s, and `phases` (N,), rad; numbers of
-    collocation `points` to try in turn; relative `accuracy`; `is_known`: True if all numbers have values.
+    **Attributes**: the `scene` with its drives in their final state; starts of `speed`, rad/s, and `phases` (N,), rad; numbers
+    of collocation `points` to try in turn; relative `accuracy`; `is_known`: True if no parameter is traced.
     """
 
     scene: Scene
@@ -189,7 +191,7 @@ def plan_synchronous(
 ) -> SynchronousPlan:
     """Validate the arguments of `synchronous_orbit`, and choose start and points. **Raises** `InputError`."""
     if regime is not None and (speed is not None or phases is not None):
-        raise InputError("regime", "is given beside speed or phases; give one of them")
+        raise InputError("regime", "is given together with speed or phases; leave one of them out")
     if regime is not None:
         speed, phases = regime.speed, regime.phases
     scene = validate_scene(scene)
@@ -228,12 +230,18 @@ def _require_one_body(exciter: Exciter, place: str) -> None:
         return
     if exciter.unbalance is not None or has_term(exciter.effects, RotorImbalance):
         problem = (
-            "turn at a speed of their own beside the rotor's unbalance, so that no motion repeats; leave one out, or simulate"
+            "do not turn at the speed of the rotor's unbalance, so that no motion repeats; leave one of them out, or simulate"
         )
         raise InputError(f"{place}loads", problem)
     if not drive.ideal:
-        raise InputError(f"{place}drive", f"is {quoted(drive.kind)}; loads need a drive of given speed here, use ConstantSpeed")
+        raise InputError(
+            f"{place}drive", f"is {quoted(drive.kind)}; loads need a drive of prescribed speed here, use ConstantSpeed"
+        )
     if not loads.circular:
-        raise InputError(f"{place}loads.kind", f"is {quoted(loads.kind)}; this holds for loads on a circle, simulate others")
+        raise InputError(
+            f"{place}loads.kind", f"is {quoted(loads.kind)}; this function needs loads on a circle; use simulate for others"
+        )
     if getattr(loads, "ball_radius", None) is not None and loads.count > 1:
-        raise InputError(f"{place}loads.ball_radius", "is given; here loads are at one angle, leave it out, or simulate")
+        raise InputError(
+            f"{place}loads.ball_radius", "is given, but this function places the loads at one angle; leave it out, or simulate"
+        )

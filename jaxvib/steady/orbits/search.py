@@ -1,4 +1,4 @@
-"""Search of the whole exact branch n(Omega) for the jams of a rotor speed."""
+"""Search of the whole exact branch n(Omega) for the jams at one rotor speed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NEAR_FOLD_DISTANCE = 1e-6
 
 
 @cached
-def _fold_points(scene: Scene) -> tuple[Array, Array]:
+def _search_grid(scene: Scene) -> tuple[Array, Array]:
     return fold_points(jammed_model(scene), _BRANCH_POINTS)
 
 
@@ -35,7 +35,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 
     The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`.
     """
-    crowded, resonances = _fold_points(scene)
+    crowded, resonances = _search_grid(scene)
     crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
     crowded = np.unique(np.append(crowded, target))  # a duplicate point would look like a fold
     omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, crowded.size), crowded)

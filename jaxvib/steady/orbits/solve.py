@@ -1,4 +1,4 @@
-"""Periodic motions of coincident loads: the carrier eliminated by harmonics, the loads' phase deviation by collocation."""
+"""Periodic motions of coincident loads, by collocation of their phase deviation; the carrier is eliminated by harmonics."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def periodic_motion(
     - `deviation`: initial psi (G, M); default 0
     - `is_known`: if True, the initial values are the solution and no steps are taken
 
-    Newton steps are shortened until they reduce the residuals. Derivatives with respect to `value` and every number of the
+    Newton steps are shortened until they reduce the residuals. Derivatives with respect to `value` and every parameter of the
     scene, of any order, follow from the implicit function theorem.
     """
     if deviation is None:
@@ -173,7 +173,8 @@ def _newton(
 
     def move(unknowns: tuple[Array, Array], change: Array, length: Array) -> tuple[Array, Array]:
         deviation, x = unknowns
-        # A step changes deviations by at most 1 rad and the load speed by at most half: the linear model is useless beyond.
+        # A step changes deviations by at most 1 rad and the load speed by at most half, because the linear model is not valid
+        # beyond.
         most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
         if given == "rotor_speed":
             most = jnp.minimum(most, 0.5 * jnp.abs(x / change[-1]))
@@ -229,7 +230,7 @@ class BranchTangent(NamedTuple):
     """Tangent of a branch and errors of a point on it.
 
     **Attributes**: `slope` dn/dOmega; `residual` of the torque balance at the points, relative to its torques; `speed_error`:
-    estimated relative error of the rotor speed at this load speed, by the number of points; `deviation_error`: that of psi,
+    estimated relative error of the rotor speed at this load speed, due to the number of points; `deviation_error`: that of psi,
     rad; `response` (K, nd, np): `unbalance_response` of the carrier at the orders of the grid; `acceleration` (np, M) of the
     port at the points, m/s^2."""
 
@@ -244,8 +245,8 @@ class BranchTangent(NamedTuple):
 def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
     """Return the tangent of the branch at a periodic motion, and the error of the motion.
 
-    The error is the change by one Newton step with the residuals at twice as many points; for the deviation the highest
-    harmonic of psi is added.
+    The error is estimated as the change in one Newton step with the residuals at twice as many points; for the deviation the
+    highest harmonic of psi is added.
     """
     deviation, omega, speed = motion
     # Its orders are those of the grid, followed by the higher ones.
@@ -289,7 +290,8 @@ def _append_mean_condition(residual: Array) -> Array:
 
 
 def _bordered(by_deviation: Array, by_unknown: Array) -> Array:
-    """Return the bordered Jacobian: derivatives by psi and by the unknown speed; the last row is the condition mean psi = 0."""
+    """Return the bordered Jacobian: derivatives with respect to psi and to the unknown speed; the last row is the condition
+    mean psi = 0."""
     m = by_deviation.shape[0]
     pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
     return jnp.concatenate([jnp.concatenate([by_deviation, by_unknown[:, None]], axis=1), pin[None, :]])

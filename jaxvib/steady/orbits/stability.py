@@ -60,7 +60,7 @@ class _Rates(NamedTuple):
 def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
     """Return the rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
 
-    A body of loads decays by drag and friction with an inertia that the motion of the carrier reduces:
+    The motion of a body of loads decays by drag and friction; the motion of the carrier reduces its inertia. The rate is
 
         max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
     """
@@ -103,7 +103,7 @@ def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: b
 
 class _Coefficients(NamedTuple):
     """Coefficients of the linear equations at one angle: `moving` s e' with its derivatives `moving1` and `moving2`, and
-    `coupling`, s e' less the share of dry friction, (np, G, P); derivatives of the torque `by_angle`, `by_rate`, (G, P)."""
+    `coupling`, s e' minus the part of dry friction, (np, G, P); derivatives of the torque `by_angle`, `by_rate`, (G, P)."""
 
     moving: Array
     coupling: Array
@@ -170,7 +170,8 @@ class _Disturbances(NamedTuple):
         )
 
     def coefficients(self, grid: Grid, harmonics: Harmonics, theta: Array, waves: Array) -> _Coefficients:
-        """Return coefficients at angles theta (m,), from exp(i k theta), k = 0, 1, ..., and derivatives, `waves` (3, m, K)."""
+        """Return the coefficients at angles theta (m,); `waves` (3, m, K): exp(i k theta), k = 0, 1, ..., and its
+        derivatives."""
         model, omega = self.model, self.omega
         gap = 2 if grid.symmetric else 1
         of_deviation, of_motion = (slice(k[0], k[-1] + 1, gap) for k in (grid.deviation_orders, grid.orders))
@@ -191,8 +192,8 @@ class _Disturbances(NamedTuple):
 
     def damped(self, q1: Array) -> Array:
         """Return the acceleration of the carrier by damping and gyroscopic forces at the velocity q1."""
-        answer = _times(self.damping, q1) / self.w
-        return answer if self.gyroscopic is None else answer + self.n * _times(self.gyroscopic, q1) / self.w
+        acceleration = _times(self.damping, q1) / self.w
+        return acceleration if self.gyroscopic is None else acceleration + self.n * _times(self.gyroscopic, q1) / self.w
 
     def whole_motion(self, c: _Coefficients, x: Array, x1: Array) -> Array:
         """Return second derivatives of carrier and bodies of loads, x = (Q, d)."""
@@ -202,14 +203,14 @@ class _Disturbances(NamedTuple):
         below = q - _times(self.shift, jnp.sum(t * d[None], axis=1))
         below1 = q1 - _times(self.shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
         q2 = -self.damped(below1) - _times(self.stiffness, below) / self.w**2
-        pushed = _times(self.port, q2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
+        driven = _times(self.port, q2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
         torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
         # Acceleration of the port including the motion of the bodies: one equation for each direction.
-        answers = self.lever * c.coupling[:, :, None]
-        weight = jnp.sum(t[:, None] * answers[None], axis=2)
+        responses = self.lever * c.coupling[:, :, None]
+        weight = jnp.sum(t[:, None] * responses[None], axis=2)
         factor = _times(self.accelerance, weight)
-        acceleration = _small_solve(factor, pushed - _times(self.accelerance, jnp.sum(t * torque[None], axis=1)))
-        return jnp.concatenate([q2, torque - jnp.sum(answers * acceleration[:, None], axis=0)])
+        acceleration = _small_solve(factor, driven - _times(self.accelerance, jnp.sum(t * torque[None], axis=1)))
+        return jnp.concatenate([q2, torque - jnp.sum(responses * acceleration[:, None], axis=0)])
 
     @staticmethod
     def relative_motion(c: _Coefficients, x: Array, x1: Array) -> Array:
@@ -252,8 +253,8 @@ def floquet(
     Loads of one body that separate (sum d_j = 0) leave the carrier at rest: they obey the second equation without its last
     term. Loads that lie side by side are pressed together and do not separate.
 
-    All orbits take equal steps of the same length, by Dormand and Prince's method of order 8, or `implicit` ones by
-    `radau.transition`, which resolve any drag of the loads and any damping of the carrier.
+    All orbits are integrated with equal steps of the same length by Dormand and Prince's method of order 8 or, if `implicit`,
+    by `radau.transition`, which resolves any drag of the loads and any damping of the carrier.
 
     **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
     derivatives exist) or a scalar array, see `steps_for`.

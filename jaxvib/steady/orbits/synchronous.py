@@ -35,7 +35,7 @@ from jaxvib.steady.orbits.whole import (
     state_of,
 )
 from jaxvib.steady.outcome import REFUSED, outcome
-from jaxvib.steady.points import Harmonic, PointAnswers
+from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number, Numbers, known_number
 
 if TYPE_CHECKING:
@@ -47,14 +47,17 @@ _UNKNOWN_STEPS = 64
 """Number of integration steps for the multipliers under a JAX transformation; reverse derivatives need a static number."""
 
 _STABLE_MARGIN = 1e3
-"""Distance of the largest multiplier from 1, in units of rounding, below which a disturbance neither grows nor decays."""
+"""Distance of the largest multiplier from 1, in units of rounding, below which a disturbance counts as neither growing nor
+decaying."""
 
 
 class SynchronousStatus(eqx.Enumeration):
-    """Outcomes of a search for a synchronous motion. Each member is the sentence shown to the user."""
+    """Outcomes of a search for a synchronous motion. The value of each member is the message shown to the user."""
 
     found = "the exciters can turn together in this periodic motion"
-    not_converged = "no periodic motion was found near the given speed and phases: the equations of motion could not be met"
+    not_converged = (
+        "no periodic motion was found near the given speed and phases: the equations of motion could not be satisfied"
+    )
     different_speeds = "ideal drives turn unbalances at different speeds, so that no motion repeats"
     under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
     at_fold = "the motion is at a fold or in a family of equal motions: it has no gradient"
@@ -75,11 +78,11 @@ class HasSpeedAndPhases(Protocol):
         ...
 
 
-class SynchronousOrbit(PointAnswers, Result):
+class SynchronousOrbit(PathsOfPoints, Result):
     """Exact synchronous motion: th_k = sigma_k (theta + alpha_k + psi_k(theta)), theta = Omega t, psi_k of mean 0.
 
     th_k is the angle of the rotor of exciter k, or of its loads if its rotor is balanced; sigma_k is the direction of the
-    exciter. Returned by `synchronous_orbit`. Numbers are NaN if the status is `not_converged` or `different_speeds`. Signals
+    exciter. Returned by `synchronous_orbit`. Values are NaN if the status is `not_converged` or `different_speeds`. Signals
     are Re sum_k c_k exp(i k theta).
 
     **Attributes**
@@ -87,16 +90,16 @@ class SynchronousOrbit(PointAnswers, Result):
     - `status`: a `SynchronousStatus`
     - `speed` Omega, rad/s, and `phases` alpha (N,), rad
     - `torque` (N,), N m: mean torque of each drive in the direction of its rotation; `power` (N,), W: its mean power
-    - `amplitude` (nd,), m, of rotations rad, and `foundation_force`, N: zero to peak, (max - min)/2 over the period; for two
+    - `amplitude` (nd,), m (rad for rotations), and `foundation_force`, N: zero to peak, (max - min)/2 over the period; for two
       directions of the force the root of their summed squares
     - `stable`: True if small disturbances decay, that is `multiplier` < 1
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
     - `multipliers`, complex: all of them; `trivial`: the multiplier that is 1, as computed, NaN if an ideal drive turns an
-      unbalance, because then no shift in time is a motion
-    - `residual` of the equations of motion, relative; `error`: estimate of the relative error of speed and displacements, and
-      of the error of angles, rad, from the number of harmonics
-    - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m, of
-      rotations rad, and `force_harmonics` (nb, K), N, of the orders 0, 1, 2, ...
+      unbalance, because a shift in time is then not a solution
+    - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
+      of angles in rad, due to the number of harmonics
+    - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad
+      for rotations), and `force_harmonics` (nb, K), N, of the orders 0, 1, 2, ...
     - `scene`
     """
 
@@ -120,7 +123,7 @@ class SynchronousOrbit(PointAnswers, Result):
 
     @property
     def judgement(self) -> str:
-        """Text "stable" or "unstable", or that the stability is unknown."""
+        """Stability as text: "stable", "unstable", or that the stability is unknown."""
         return judgement_of(self.multiplier, self.stable)
 
     @validated
@@ -154,7 +157,7 @@ class SynchronousOrbit(PointAnswers, Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot a period over the angle Omega t: displacements, angles ahead of uniform rotation, force on the foundation.
+        """Plot a period over the angle Omega t: displacements, angles relative to uniform rotation, force on the foundation.
 
         **Returns** a matplotlib figure, or the given `ax`, which has three axes.
         """
@@ -187,9 +190,9 @@ def synchronous_orbit(
 
         th_k = sigma_k (theta + alpha_k + psi_k(theta)),  q(theta),    theta = Omega t,    psi_k and q periodic
 
-    The full equations of motion are met at equally spaced points of the period (trigonometric collocation of q and all
-    angles), by Newton's method from the given speed and phases. If they are far from every motion, another motion may be found,
-    or none. The turning body of an exciter is
+    The full equations of motion are satisfied at equally spaced points of the period (trigonometric collocation of q and all
+    angles), by Newton's method from the given speed and phases. If this start is far from every motion, another motion may be
+    found, or none. The turning body of an exciter is
 
     - the rotor with its unbalance, without loads. Under a motor, Omega follows from the motors' torques. An ideal drive turns
       it by th_k = sigma_k n t (phase 0) and gives Omega = n
@@ -197,17 +200,18 @@ def synchronous_orbit(
 
     **Arguments**: `scene` with effects without free rotation of loads; and
 
-    - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two numbers:
+    - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two arguments:
     - `speed`: start of Omega, rad/s or text; default: the mean speed of the motors; typical: 60 to 320
-    - `phases` (N,): starts of alpha, rad; default: 0. The first of those that can move is kept, as the origin of time
+    - `phases` (N,): starts of alpha, rad; default: 0. The first phase that is free keeps its value, because it defines the
+      origin of time
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-8 (the default; in
       single precision 1e-3)
-    - `points`: a fixed number of points on a period in place of that; typical: 17 to 65. Under `jit` and `vmap` the default is
-      33, and the status shows if it is too small
+    - `points`: a fixed number of points on a period in place of an accuracy; typical: 17 to 65. Under `jit` and `vmap` the
+      default is 33, and the status shows if it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
-    **Returns** `SynchronousOrbit`; derivatives of its numbers with respect to every number of the scene by the implicit
-    function theorem, forward and reverse.
+    **Returns** `SynchronousOrbit`; its fields have derivatives with respect to every parameter of the scene (implicit function
+    theorem, forward and reverse).
 
     **Raises** `InputError` for wrong arguments and for exciters whose motion has no common period; `ComputationError` with
     the status "not_converged" or "different_speeds".
@@ -221,7 +225,7 @@ def synchronous_orbit(
     >>> round(float(orbit.phases[1]), 6), bool(orbit.stable)
     (3.141593, True)
 
-    Source: Blekhman 1988, Synchronization in Science and Technology, whose averaged motions these continue.
+    Source: Blekhman 1988, Synchronization in Science and Technology, whose averaged motions correspond to these exact ones.
     """
     plan = plan_synchronous(scene, regime, speed=speed, phases=phases, accuracy=accuracy, points=points)
     if not plan.is_known:
@@ -247,7 +251,8 @@ def _solve_program(
 ) -> SynchronousOrbit:
     """Solve for one synchronous motion with a number of collocation points.
 
-    `steps` for the multipliers in a period; None for as many as the machine needs, without reverse derivatives.
+    `steps`: number of integration steps in a period for the multipliers; None: as many as the machine needs, without reverse
+    derivatives.
     """
     whole, grid, forced = periodic_scene(scene, phases), grid_of(points, False), is_forced(scene)
     motion = solve_whole(whole, grid, speed, forced=forced)

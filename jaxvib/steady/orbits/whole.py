@@ -1,4 +1,4 @@
-"""Periodic motions of whole scenes: every coordinate by trigonometric collocation of the full equations of motion."""
+"""Periodic motions of whole scenes by trigonometric collocation of the full equations of motion for all coordinates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from jaxvib.steady.orbits.stability import deflate
 
 
 def body_counts(scene: Scene) -> tuple[int, ...]:
-    """Return for each exciter the number of its bodies: its loads; or a motor's rotor; or none, if an ideal drive turns it."""
+    """Return the number of bodies of each exciter: its loads, or else 1 for the rotor of a motor and 0 for that of an ideal
+    drive."""
     return tuple(int(not e.drive.ideal) if e.loads is None else e.loads.count for e in scene.exciters)
 
 
@@ -48,7 +49,7 @@ def _inertia_of(exciter: Exciter) -> Array:
 
 
 def is_forced(scene: Scene) -> bool:
-    """True if an ideal drive turns an unbalance, and therefore gives the period of the motion."""
+    """True if an ideal drive turns an unbalance, and therefore determines the period of the motion."""
     return any(e.drive.ideal and e.loads is None for e in scene.exciters)
 
 
@@ -145,7 +146,8 @@ class WholeMotion(NamedTuple):
 
 
 class _Collocation(NamedTuple):
-    """Equations at the points of a grid: `residual` (n, M); `scale` of its terms; `matrix`, its derivative by all unknowns."""
+    """Equations at the points of a grid: `residual` (n, M); `scale` of its terms; `matrix`, its derivative with respect to all
+    unknowns."""
 
     residual: Array
     scale: Array
@@ -166,7 +168,7 @@ def residual_of(scene: PeriodicScene, grid: Grid, x: Array, omega: Array) -> Arr
 def collocation(scene: PeriodicScene, grid: Grid, x: Array, omega: Array, *, forced: bool) -> _Collocation:
     """Return residuals and their Jacobian.
 
-    Without forcing, the speed Omega is the last unknown, and the last equation keeps the mean deviation of the first body.
+    Without forcing, the speed Omega is the last unknown, and the last equation prescribes the mean deviation of the first body.
     """
     n, m = x.shape
     rate, second = _rates(grid, x)
@@ -200,7 +202,7 @@ def solve_whole(
         x'' = f(theta, x, x', Omega)    at the M points of the grid,    mean psi of the first body = 0
 
     **Arguments**: `omega`: the speed of a `forced` motion, otherwise its initial value; `known`: the
-    solution, if it is known. Derivatives with respect to every number of the scene, and with respect to `omega` of a forced
+    solution, if it is known. Derivatives with respect to every parameter of the scene, and with respect to `omega` of a forced
     motion, follow from the implicit function theorem.
     """
     if known is None:
@@ -239,7 +241,8 @@ def _solve(
 
     def move(unknowns: tuple[Array, Array], change: Array, length: Array) -> tuple[Array, Array]:
         x, w = unknowns
-        # A step turns bodies by at most 1 rad and changes the speed by at most half: the linear model is useless beyond.
+        # A step turns bodies by at most 1 rad and changes the speed by at most half, because the linear model is not valid
+        # beyond.
         turned = change[:size].reshape(x.shape)[scene.coordinates :]
         most = 1.0 / jnp.max(jnp.abs(turned), initial=1e-30)
         if not forced:
@@ -250,8 +253,8 @@ def _solve(
     def linearize(x: Array, w: Array) -> Linearized:
         found = collocation(scene, on, x, w, forced=forced)
         right = found.residual.ravel() if forced else jnp.append(found.residual.ravel(), 0.0)
-        # Residuals of the carrier count with the torques that they cause. Otherwise no step that turns bodies would reduce the
-        # norm, because the torques between bodies are small beside the forces on the carrier.
+        # Residuals of the carrier are weighted by the torques that they cause. Otherwise no step that turns bodies would
+        # reduce the norm, because the torques between bodies are small compared with the forces on the carrier.
         carrier, bodies = jnp.split(found.residual, [scene.coordinates])
         norm = jnp.sqrt((jnp.sum((weight * carrier) ** 2) + jnp.sum(bodies**2)) / size)
         return Linearized(norm, found.scale, lambda: -solve_in_turn(found.matrix, right))
@@ -276,8 +279,8 @@ def _solve_jvp(primals, tangents, *, grid: tuple[int, bool], forced: bool, is_kn
 def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, forced: bool) -> tuple[Array, Array]:
     """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion.
 
-    The error is that of the speed, relative, of angles, rad, and of displacements, relative to the largest one. It is the
-    change by one Newton step with the residuals at twice as many points, and the highest harmonic.
+    The error is that of the speed, relative, of angles, rad, and of displacements, relative to the largest one. It is
+    estimated from the change in one Newton step with the residuals at twice as many points, and from the highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
     found, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates

@@ -1,4 +1,4 @@
-"""Torque balance near a synchronous regime: rank, derivative by the scene, quasi-static stability, margin."""
+"""Torque balance near a synchronous regime: rank, derivative with respect to the scene, quasi-static stability, margin."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def vibration_scale(balance: TorqueBalance, omega: Array) -> Array:
 
 
 def slopes_of(x: Array, balance: TorqueBalance, factor: Array | None = None) -> Slopes:
-    """Return the slopes of the balance at the unknowns `x` of a regime."""
+    """Return the decomposed Jacobian of the balance at the unknowns `x` of a regime."""
     free = np.flatnonzero(~balance.is_prescribed)
     omega = motion_of(balance, x)[0]
     rows = (balance.torque_scale / jnp.maximum(vibration_scale(balance, omega), jnp.finfo(x.dtype).tiny))[free]
@@ -70,7 +70,7 @@ def slopes_of(x: Array, balance: TorqueBalance, factor: Array | None = None) -> 
 def implicit_step(x: Array, slopes: Slopes, residuals: Array) -> Array:
     """Return the unknowns after a Newton step without a change in neutral directions.
 
-    `residuals` at `x`, as functions of the scene, give the result the derivatives of the implicit function theorem.
+    If `residuals` at `x` are functions of the scene, the result has the derivatives of the implicit function theorem.
     """
     known = slopes.values > _rank_tolerance(slopes.values)
     inverse = jnp.where(known, 1.0 / jnp.where(known, slopes.values, 1.0), 0.0)
@@ -79,18 +79,18 @@ def implicit_step(x: Array, slopes: Slopes, residuals: Array) -> Array:
 
 
 def quasi_static_growth(balance: TorqueBalance, omega: Array, phase: Array, neutral: Array | int) -> Array:
-    """Return the growth rate of small disturbances of a regime if the machine follows the rotating masses at once, 1/s.
+    """Return the growth rate of small disturbances of a regime if the machine follows the rotating masses without delay, 1/s.
 
         I_i w_i' = L_i(w_i) + (S_i/2) sum_k S_k w_k^4 Im(exp(i (alpha_k - alpha_i)) H_ik(w_k)),      alpha_i' = w_i - Omega
 
-    This is the usual criterion of synchronisation. It leaves out the ringing of the machine.
+    This is the usual criterion of synchronisation. It neglects the free vibrations of the machine.
     """
     prescribed, averaged = balance.is_prescribed, balance.averaged
     free = np.flatnonzero(~prescribed)
     if free.size == 0:
         return jnp.full_like(omega, -jnp.inf)
 
-    def answer(w: Array, direction: Array) -> Array:
+    def response(w: Array, direction: Array) -> Array:
         """Return w^4 D(w)^-1 B^T e of one mass that turns at `w`."""
         dynamic = balance.dynamic_stiffness(w)
         return w**4 * small_solve(dynamic, direction.astype(dynamic.dtype)[:, None])[:, 0]
@@ -98,8 +98,8 @@ def quasi_static_growth(balance: TorqueBalance, omega: Array, phase: Array, neut
     def acceleration(x: Array) -> Array:
         w = jnp.full_like(phase, omega).at[free].set(x[: free.size])
         turn = jnp.exp(1j * phase.at[free].set(x[free.size :]))
-        felt = -balance.direction.conj() @ (jax.vmap(answer)(w, balance.direction).T @ (balance.unbalance * turn))
-        torque = balance.driving_torques(w) + mean_torque(balance.unbalance, jnp.conj(turn) * felt)
+        forward = -balance.direction.conj() @ (jax.vmap(response)(w, balance.direction).T @ (balance.unbalance * turn))
+        torque = balance.driving_torques(w) + mean_torque(balance.unbalance, jnp.conj(turn) * forward)
         return (torque / averaged.inertia)[free]
 
     slopes = jax.jacfwd(acceleration)(jnp.concatenate([jnp.full(free.size, omega, phase.dtype), phase[free]]))
@@ -113,8 +113,8 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
 
         mean L(Omega) + factor (L_i(Omega) - mean L(Omega)) + V_i = 0
 
-    It is infinite without differences, and if there is no fold up to a factor of 1e6. Its derivative by the scene is that of
-    the fold.
+    The factor is infinite if there are no differences, and if there is no fold up to a factor of 1e6. Its derivatives with
+    respect to parameters of the scene are those of the fold.
     """
     if x.size == 0:
         return jnp.full((), jnp.inf, balance.unbalance.dtype)
@@ -149,7 +149,7 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
     fold, there, slopes = _fold_near(frozen, at, factor)
     polished = (jnp.abs(there - factor) < 1e-2 * factor) & (jnp.max(jnp.abs(fold - at)) < _LONGEST_STEP)
     at, factor = jnp.where(polished, fold, at), jnp.where(polished, there, factor)
-    # At the fold the left null vector times the residuals is 0 whatever the unknowns, to first order.
+    # At the fold the left null vector times the residuals is 0 to first order for any unknowns.
     left = slopes.rows * slopes.left[:, -1]
     by_factor = left @ jax.jvp(lambda f: balance_residuals(at, frozen, f), (factor,), (one,))[1]
     moved = factor - (left @ balance_residuals(at, balance, factor) - left @ balance_residuals(at, frozen, factor)) / by_factor

@@ -43,10 +43,12 @@ _ITERATIONS = 60
 def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
     """Return the speeds (n,) rad/s and phases (n, count) rad of all distinct regimes.
 
-    1. The sum of all torques over the speed is explicit for given phases. Every root of it, for regular and random sets of
-       phases, is a start of Newton's method for the speed and all phases
-    2. Phases of the solutions, exchanged between the masses, mirrored, or turned by half a turn one by one, are further starts
-    3. Regimes that differ by a common turn or by an exchange of equal masses are one regime. Regimes of one speed whose phases
+    1. The sum of all torques over the speed is explicit for given phases. Every root of this sum, for regular and random sets
+    of phases, is a start of Newton's method for the speed and all phases
+    2. Further starts are the phases of the solutions, exchanged between masses, mirrored, or with one phase shifted by half a
+    turn
+    3. Regimes that differ by a common shift of all phases or by an exchange of equal masses are one regime. Regimes of one
+    speed whose phases
        can change without a change of torques belong to a family, of which one member is kept
     """
     count, speed = balance.unbalance.size, np.asarray(balance.speed)
@@ -106,7 +108,7 @@ def _at_speeds(balance: TorqueBalance, speeds: Array) -> tuple[Array, Array]:
 def _speeds(balance: TorqueBalance) -> np.ndarray:
     """Return speeds up to the largest working speed, dense near resonances and near the working speeds of the drives.
 
-    No regime is faster: there the sum of the driving torques is negative, and the vibration brakes.
+    No regime is faster, because above these speeds the sum of the driving torques is negative, and the vibration brakes.
     """
     drives = np.array([float(drive.speed) for drive in balance.averaged.drives])
     top = drives.max()
@@ -175,7 +177,7 @@ def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array,
     def one(w: Array, phase: Array) -> tuple[Array, Array, Array, Array]:
         start = unknowns_of(balance, w, phase)
         x, _ = damped_newton(
-            lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_numbers=False
+            lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_scalars=False
         )
         w, angles = motion_of(balance, x)
         good = is_balanced(balance, x)
@@ -186,7 +188,8 @@ def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array,
 
 
 def is_balanced(balance: TorqueBalance, x: Array) -> Array:
-    """Return True if the unknowns solve the balance, judged by the vibrational torques that are possible at their speed."""
+    """Return True if the unknowns solve the balance; residuals are compared with the largest vibrational torques at their
+    speed."""
     free = np.flatnonzero(~balance.is_prescribed)
     w, _ = motion_of(balance, x)
     eps = jnp.finfo(x.dtype).eps

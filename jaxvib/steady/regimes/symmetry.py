@@ -14,7 +14,7 @@ _MOST_MASSES = 7
 class Exchange(NamedTuple):
     """Exchange of masses that leaves the balance unchanged: `order` (count,) and the shifts of phases (count,), rad.
 
-    If alpha is a regime, alpha' with alpha'[order] = alpha + shift is one.
+    If alpha is a regime, alpha' with alpha'[order] = alpha + shift is also a regime.
     """
 
     order: np.ndarray
@@ -72,7 +72,7 @@ def _shifts(influence: np.ndarray, turned: np.ndarray, small: np.ndarray) -> np.
 def distinct_regimes(
     speed: np.ndarray, phases: np.ndarray, exchanges: list[Exchange], tolerance: tuple[float, float]
 ) -> np.ndarray:
-    """Return indices of regimes (n,) of which no two differ only by a common turn, an exchange, or rounding.
+    """Return indices of regimes (n,) of which no two differ only by a common shift of phases, an exchange, or rounding.
 
     **Arguments**: `speed` (n,), `phases` (n, count); `tolerance` of speeds, relative, and of exp(i alpha).
     """

@@ -1,4 +1,4 @@
-"""Synchronous regimes of several exciters: all of them, or the one near a start, in the averaged theory."""
+"""Synchronous regimes of several exciters in the averaged theory: all regimes, or the regime near a start."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import degrees
 from jaxvib.steady.outcome import REFUSED, outcome
-from jaxvib.steady.points import Harmonic, PointAnswers
+from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.steady.regimes.local import implicit_step, margin_of, quasi_static_growth, slopes_of, vibration_scale
 from jaxvib.steady.regimes.search import all_regimes, is_balanced
 from jaxvib.units import Number, number, numbers
@@ -57,12 +57,14 @@ _MIN_DAMPING = 1e-9
 
 
 class RegimeStatus(eqx.Enumeration):
-    """Outcomes of one synchronous regime. Each member is the sentence shown to the user."""
+    """Outcomes of one synchronous regime. The value of each member is the message shown to the user."""
 
     found = "the rotating masses can turn with one speed in this way"
-    degenerate = "one of a family: phases can change without a change of torques, so that the least disturbance decides them"
+    degenerate = (
+        "one of a family: phases can change without a change of torques, so that even the smallest disturbance changes them"
+    )
     not_converged = "no regime was found from this start"
-    unbounded = "the masses turn at a resonance that nothing damps: the vibration has no bound"
+    unbounded = "the masses turn at an undamped resonance: the vibration grows without bounds"
     refused = REFUSED
 
 
@@ -70,9 +72,7 @@ class RegimeSearchStatus(eqx.Enumeration):
     """Outcomes of a search for all regimes."""
 
     done = "all regimes were searched for"
-    none = (
-        "no regime: at no speed do the driving torques and the vibration balance for all masses; they turn at their own speeds"
-    )
+    none = "no regime: at no speed do the vibrational and the driving torque of every mass balance; each turns at its own speed"
 
 
 class AbstractSynchronousRegime(Result):
@@ -121,7 +121,7 @@ class AbstractSynchronousRegime(Result):
     scene: Scene = eqx.field(metadata=SCENE)
 
 
-class SynchronousRegime(PointAnswers, AbstractSynchronousRegime):
+class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
     """Synchronous regime, see `AbstractSynchronousRegime`.
 
     Returned by `SynchronousRegimes.select` and `synchronous_regimes(scene, near=...)`.
@@ -204,7 +204,7 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array]) -> Synchron
 
 @validated
 def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = None) -> SynchronousRegimes | SynchronousRegime:
-    """Return every way in which all rotating masses of a scene can turn with one speed, averaged over a turn.
+    """Return all synchronous regimes of a scene, in which all rotating masses turn at one speed, by averaging over a turn.
 
         L_i(Omega) + V_i(Omega, alpha) = 0 for every mass i
         V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
@@ -231,7 +231,7 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = Non
     **Returns** `SynchronousRegimes`, or `SynchronousRegime` with `near`.
 
     **Raises** `InputError` for exciters with both loads and an unbalance, loads with a motor, ideal drives of different speeds,
-    and effects that this theory leaves out.
+    and effects that this theory does not include.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -282,7 +282,7 @@ def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     frozen = jax.lax.stop_gradient(balance)
     x = jax.lax.stop_gradient(unknowns_of(frozen, omega, phases))
     if x.size:
-        x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), x, frozen, on_numbers=False)
+        x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), x, frozen, on_scalars=False)
         slopes = slopes_of(x, frozen)
         neutral = slopes.neutral
         x = implicit_step(x, slopes, balance_residuals(x, balance))
@@ -290,11 +290,11 @@ def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
         neutral = jnp.asarray(0)
     w, angles = motion_of(balance, x)
     angles = jnp.concatenate([angles[:1], jnp.arctan2(jnp.sin(angles[1:]), jnp.cos(angles[1:]))])
-    influence, answer = influence_of(balance, w)
+    influence, response = influence_of(balance, w)
     turn = jnp.exp(1j * angles)
     vibration = torques_at(balance, influence, w, turn)
     driving = jnp.where(balance.is_prescribed, -vibration, balance.driving_torque(w))
-    z = w**2 * answer @ (balance.unbalance * turn)
+    z = w**2 * response @ (balance.unbalance * turn)
     force = peak_force(balance.model.carrier.foundation_force(z, 1j * w * z))
     scale = vibration_scale(balance, w)
     residual = jnp.max(jnp.abs(driving + vibration) / jnp.where(scale > 0.0, scale, 1.0))
@@ -362,14 +362,14 @@ def _has_one_speed(balance: TorqueBalance) -> Array:
 
 
 def _require_one_speed(scene: Scene) -> None:
-    """**Raises** `InputError` if ideal drives turn unbalances at different speeds. Traced numbers are not checked."""
+    """**Raises** `InputError` if ideal drives turn unbalances at different speeds. Traced speeds are not checked."""
     ideal = [k for k, exciter in enumerate(scene.exciters) if exciter.loads is None and exciter.drive.ideal]
 
     def check(*speeds: float) -> None:
         for k, speed in zip(ideal, speeds, strict=True):
             if speed != speeds[0]:
                 problem = f"is {float(speed):g} rad/s and that of exciters[{ideal[0]}] {float(speeds[0]):g} rad/s"
-                advice = "a regime has one speed, give ideal drives of unbalances the same"
+                advice = "a regime has one speed; give the same speed to all ideal drives of unbalances"
                 raise InputError(f"exciters[{k}].drive.speed", f"{problem}; {advice}")
 
     when_known(check, *(scene.exciters[k].drive.speed for k in ideal))

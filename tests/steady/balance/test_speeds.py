@@ -7,7 +7,7 @@ import scipy.linalg
 
 import jaxvib as jv
 from jaxvib.steady.balance.criterion import _join_intervals
-from jaxvib.steady.balance.speeds import _free_and_held_modes, _inverse_root, characteristic_speeds
+from jaxvib.steady.balance.speeds import _free_and_fixed_modes, _inverse_root, characteristic_speeds
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,7 @@ def test_modes_are_those_of_the_full_and_the_pinned_matrix(port):
     random = np.random.default_rng(0)
     a = random.normal(size=(4, 4)) + (1j * random.normal(size=(4, 4)) if np.iscomplexobj(np.asarray(port)) else 0.0)
     square, c = a @ a.conj().T, np.asarray(port)
-    values, vectors, held = _free_and_held_modes(jnp.asarray(square), jnp.asarray(c))
+    values, vectors, held = _free_and_fixed_modes(jnp.asarray(square), jnp.asarray(c))
     np.testing.assert_allclose(values, np.linalg.eigvalsh(square), rtol=1e-10)
     np.testing.assert_allclose(square @ np.asarray(vectors), np.asarray(vectors) * np.asarray(values), atol=1e-9)
     basis = scipy.linalg.null_space(c.conj()[None])

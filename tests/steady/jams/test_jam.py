@@ -193,7 +193,9 @@ def test_select_says_what_is_wrong():
     for wrong in (2.0, "3", True, None):
         with pytest.raises(jv.InputError, match="it must be a whole number"):
             modes.select(wrong)
-    with pytest.raises(jv.ComputationError, match=r"jam mode 5 does not exist at rotor speed 9.5493 rpm; there: 3") as error:
+    with pytest.raises(
+        jv.ComputationError, match=r"jam mode 5 does not exist at rotor speed 9.5493 rpm; existing modes: 3"
+    ) as error:
         modes.select(5)
     assert error.value.status == "absent"
     jam = modes.select(5, throw=False)

@@ -13,19 +13,19 @@ def circle_and_line(x, radius):
     return jnp.stack([jnp.sum(x**2) - radius**2, x[1] - 2.0 * x[0]]), jnp.arctan2(x[1], x[0])
 
 
-@pytest.mark.parametrize("on_numbers", [True, False])
-def test_a_zero_is_found_with_what_is_wanted_beside(on_numbers):
-    x, angle = damped_newton(circle_and_line, jnp.array([0.3, 0.1]), jnp.asarray(0.7), on_numbers=on_numbers)
+@pytest.mark.parametrize("on_scalars", [True, False])
+def test_a_zero_is_found_with_what_is_wanted_beside(on_scalars):
+    x, angle = damped_newton(circle_and_line, jnp.array([0.3, 0.1]), jnp.asarray(0.7), on_scalars=on_scalars)
     np.testing.assert_allclose(x, 0.7 * np.array([1.0, 2.0]) / np.sqrt(5.0), rtol=1e-14)
     np.testing.assert_allclose(angle, np.arctan(2.0), rtol=1e-14)
 
 
-@pytest.mark.parametrize("on_numbers", [True, False])
-def test_many_starts_come_to_what_each_comes_to_alone(on_numbers):
+@pytest.mark.parametrize("on_scalars", [True, False])
+def test_many_starts_come_to_what_each_comes_to_alone(on_scalars):
     starts = jax.random.uniform(jax.random.key(0), (40, 2), minval=-1.0)
 
     def one(start):
-        return damped_newton(circle_and_line, start, jnp.asarray(0.7), 12, on_numbers=on_numbers)[0]
+        return damped_newton(circle_and_line, start, jnp.asarray(0.7), 12, on_scalars=on_scalars)[0]
 
     together = jax.vmap(one)(starts)
     np.testing.assert_allclose(together, [one(start) for start in starts], rtol=0.0, atol=1e-12)

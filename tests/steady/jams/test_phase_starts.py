@@ -117,7 +117,7 @@ def test_the_search_is_written_on_single_numbers():
     machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
     p = assemble_torque_balance(jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0)))
     w, start = jnp.asarray(100.0), jnp.zeros(3)
-    for search in (lambda: phases_near(p, at_speed(p, w), start), lambda: solve_balance(p, w, start, on_numbers=True)):
+    for search in (lambda: phases_near(p, at_speed(p, w), start), lambda: solve_balance(p, w, start, on_scalars=True)):
         loops = [e for e in jax.make_jaxpr(search)().jaxpr.eqns if e.primitive.name == "while"]
         newton = max(loops, key=lambda e: len(e.outvars))
         assert len(newton.outvars) > 10 and all(v.aval.shape == () for v in newton.outvars)

@@ -89,6 +89,6 @@ def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():
 def test_a_branch_is_looked_at_once_at_each_point(monkeypatch):
     """The diagram is evaluated on n = Omega and in whole numbers, some repeated; at the rotor speed itself nothing remains."""
     points = np.concatenate([np.ones(9), np.arange(1.0, search._BRANCH_POINTS + 1)])
-    monkeypatch.setattr(search, "_fold_points", lambda scene: (points, jnp.array([2.0, 3.0])))
+    monkeypatch.setattr(search, "_search_grid", lambda scene: (points, jnp.array([2.0, 3.0])))
     monkeypatch.setattr(search, "branch_at", lambda scene, omega: (omega, jnp.ones_like(omega)))
     assert search.exact_mode_speeds(published(speed=30.0).scene()) == {5: 30.0}

@@ -310,13 +310,13 @@ def test_wrong_input_ends_in_one_sentence(general):
     machine, loads = body(), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     with pytest.raises(jv.InputError, match="speed is missing"):
         jv.synchronous_orbit(jv.Scene(machine, loads, jv.ConstantSpeed(60.0)))
-    with pytest.raises(jv.InputError, match="loads turn at a speed of their own"):
+    with pytest.raises(jv.InputError, match="loads do not turn at the speed of the rotor"):
         jv.synchronous_orbit(jv.Scene(machine, exciters=[jv.Exciter(loads, motor(), unbalance=1.0)]))
-    with pytest.raises(jv.InputError, match="loads need a drive of given speed"):
+    with pytest.raises(jv.InputError, match="loads need a drive of prescribed speed"):
         jv.synchronous_orbit(jv.Scene(machine, exciters=[jv.Exciter(loads, motor())]))
     with pytest.raises(jv.InputError, match="phases has 3 values"):
         jv.synchronous_orbit(general, phases=[0.0, 1.0, 2.0])
-    with pytest.raises(jv.InputError, match="regime is given beside speed"):
+    with pytest.raises(jv.InputError, match="regime is given together with speed"):
         jv.synchronous_orbit(general, jv.synchronous_orbit(general, phases=[0.0, 3.0]), speed=100.0)
 
 
