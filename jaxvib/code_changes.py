@@ -25,7 +25,7 @@ from typing import NamedTuple, TypeAlias
 
 PACKAGES = ("jaxvib", "optimize")
 
-_CHANGING = {"__abstractmethods__", "__annotate_func__", "__annotations__", "__annotations_cache__", "__doc__"}
+_CHANGING = {"__abstractmethods__", "__annotate_func__", "__annotations__", "__annotations_cache__", "__doc__", "__slotnames__"}
 """Attributes of classes that Python itself changes after the definition."""
 
 _ABSENT = object()

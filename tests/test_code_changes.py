@@ -1,6 +1,7 @@
 """Programs are stored for the sources that they were traced from: edits and replacements of code in a process."""
 
 import contextlib
+import copyreg
 import importlib
 import inspect
 import math
@@ -141,6 +142,7 @@ def test_use_of_the_package_is_no_replacement():
         inspect.getdoc(owner)
         with contextlib.suppress(ValueError):
             inspect.signature(owner)
+        copyreg._slotnames(owner)  # by copy and pickle
     assert code_changes.code_state(look=True).is_on_disk
 
 

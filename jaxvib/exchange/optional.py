@@ -21,10 +21,14 @@ def optional_module(name: str, extra: str) -> Any:
 def require_writable(path: Path) -> None:
     """Require, before anything is computed, that a path can be written to.
 
-    **Raises** `InputError` for a missing folder and for a read-only file.
+    **Raises** `InputError` for a missing folder, a read-only file and a name that no file can have.
     """
-    if not path.parent.is_dir():
-        raise InputError("path", f"is {quoted(str(path))}, and its folder does not exist; create it or name another one")
-    if path.is_dir() or (path.exists() and not path.stat().st_mode & 0o222):
-        kind = "a folder" if path.is_dir() else "read-only"
-        raise InputError("path", f"is {quoted(str(path))}, which is {kind}; name another file")
+    try:
+        if not path.parent.is_dir():
+            raise InputError("path", f"is {quoted(str(path))}, and its folder does not exist; create it or name another one")
+        if path.is_dir() or (path.exists() and not path.stat().st_mode & 0o222):
+            kind = "a folder" if path.is_dir() else "read-only"
+            raise InputError("path", f"is {quoted(str(path))}, which is {kind}; name another file")
+    except OSError as error:
+        problem = f"is {quoted(str(path))}, which cannot be written ({error.strerror}); name another file"
+        raise InputError("path", problem) from error

@@ -108,7 +108,7 @@ class Whirl(Result):
     def summary(self) -> str:
         """Return the whirls at each rotor speed, and the critical speeds, as text."""
         lines, (unit, scale) = [], speed_unit()
-        for n, *whirls in zip(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)), strict=True):
+        for n, *whirls in zip(*(np.asarray(x).tolist() for x in (self.rotor_speed, self.speed, self.forward)), strict=True):
             shown = ", ".join(f"{scale * w:.6g}{_sense_word(w, f)}" for w, f in zip(*whirls, strict=True))
             lines.append(f"rotor {scale * n:.6g} {unit}: whirl {shown} {unit}")
         lost = [self.message] if self.status_name != "done" else []

@@ -224,6 +224,7 @@ def test_sdypy_finds_the_poles_of_an_exported_response(home):
     [
         (dict(path="/none/m.unv"), "path is '/none/m.unv', and its folder does not exist"),
         (dict(path="/proc/m.unv"), "path is '/proc/m.unv', which cannot be written"),
+        (dict(path=400 * "m"), "path is 'mmmm"),
         (dict(quantity="jerk"), "quantity is 'jerk'; "),
         (dict(frequencies=[1.0, 2.0, 4.0]), "frequencies are not evenly spaced (steps of 1 to 2); give even ones"),
         (dict(frequencies=[1.0]), "frequencies are [1.0]; at least 2"),
