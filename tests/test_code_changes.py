@@ -20,7 +20,8 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib import code_changes
 from jaxvib.equations import linear
-from jaxvib.machine import drive, loads
+from jaxvib.machine import loads
+from jaxvib.machine.drives import drive
 from jaxvib.numerics import fourier
 from jaxvib.runtime import cache, programs, stored
 from jaxvib.steady import jams
