@@ -5,7 +5,7 @@ import sys
 
 from jaxvib.code_changes import watch
 
-watch(sys.modules[__name__])  # before all other imports, which it then watches too
+watch(sys.modules[__name__])  # first, because only later imports are watched
 
 from optimize.files import Design, load_design
 from optimize.pareto import Front, pareto

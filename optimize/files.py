@@ -42,7 +42,7 @@ class Design:
     subject_to: tuple[Demand, ...] = ()
 
     def run(self, **more: Any) -> Synthesis:
-        """Return `synthesize` of this design; `more` are arguments in place of those in `search`."""
+        """Search for the best machine by `synthesize`, with arguments `more` in place of those in `search`."""
         return synthesize(self.space, self.objective, subject_to=self.subject_to, **{**self.search, **more})
 
 
@@ -53,15 +53,16 @@ def load_design(path: str | Path) -> Design:
     **Arguments**: `path` of a TOML file with
 
     - `scene`: the scene file, relative to the design file
-    - `[free]`: bounds for each number that may change
-    - `[ties]`: numbers that follow others
-    - `[choices]`: values of catalogues
-    - every `[[hold]]`: a quantity and, unless it keeps its present value, its value
+    - `[free]`: bounds for each parameter that may change
+    - `[ties]`: parameters that follow others
+    - `[choices]`: parameters whose values are chosen from a list, such as a catalogue
+    - every `[[hold]]`: a quantity and the value that it keeps; default: its value in the scene
     - every `[[demand]]`: a quantity that is `at_most` or `at_least` a value
-    - `[objective]`: the quantity to make small, or large with `maximize = true`
+    - `[objective]`: the quantity to minimize, or to maximize with `maximize = true`
     - `[search]`: the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`, `searcher`
 
-    A quantity with `tolerances` is taken over machines whose numbers deviate by these, `statistic = "expected"` or `"worst"`.
+    A quantity with `tolerances` is a statistic over machines whose parameters deviate within these tolerances: the mean
+    (`statistic = "expected"`) or the largest value (`"worst"`).
 
     **Returns** `Design`. **Raises** `InputError` for a file that cannot be read and for every error in it, naming the field.
 
@@ -122,12 +123,12 @@ def _demands(table: object, section: str) -> list[Demand]:
     quantity, more = quantity_from_table(table, section, ("at_most", "at_least"))
     if not more:
         raise InputError(section, "has no limit; give at_most, at_least or both")
-    made = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
-    return [made[name](limit) for name, limit in more.items()]
+    make = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
+    return [make[name](limit) for name, limit in more.items()]
 
 
 def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> tuple[Quantity, Tables]:
-    """Return the quantity of a table in the `section` of a file, and the values of additional fields, whose names are `more`.
+    """Return the quantity that a table in the `section` of a file describes, and the values of the table's fields in `more`.
 
     **Raises** `InputError` for an unknown quantity, and for values that are not allowed.
     """
@@ -161,7 +162,7 @@ scene = "machine.toml"            # path of the scene file, relative to this fil
 "machine.stiffness" = ["10 N/mm", "200 N/mm"]
 "machine.link_stiffness" = ["50 N/mm", "500 N/mm"]    # remove this line for a single platform
 
-[[hold]]                          # a quantity with a fixed value during the search
+[[hold]]                          # a quantity that keeps its value during the search
 quantity = "jam_frequency"        # or amplitude, foundation_force, support_frequency_squared, total
 mode = 3                          # number of the jam mode: 2 r - 1 is the jam just below resonance r (1 for one platform)
 value = "570 rpm"                 # default: the value in the scene
@@ -176,7 +177,7 @@ quantity = "support_frequency_squared"   # sum of k/M over the supports: total s
 # at_least = "2 mm"
 # tier = "exact"                  # "exact": exact motion (default); "leading": light loads
 
-# [ties]                          # number = source, [source, factor], or [source, "keep"] for the present ratio
+# [ties]                          # parameter = source, [source, factor], or [source, "keep"] for the present ratio
 # "machine.stiffness[1]" = "machine.stiffness[0]"
 
 # [choices]                       # allowed values, such as springs of a catalogue, or numbers of loads

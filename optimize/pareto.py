@@ -1,4 +1,4 @@
-"""Trade-offs of two quantities, with the machine behind each point."""
+"""Trade-offs of two quantities, with the machine that belongs to each point."""
 
 from __future__ import annotations
 
@@ -36,15 +36,14 @@ _NO_LIMIT = 1e100
 
 
 class Front(Result):
-    """Machines of which none is better in one quantity without being worse in the other.
+    """Machines of a trade-off: if one is better than another in one quantity, it is worse in the other quantity.
 
     Returned by `pareto`.
 
     **Attributes** (P machines)
 
-    - `values` (P, 2) of the two quantities
-    - `names` and `units` of these
-    - `machines`: the scenes as the texts of scene files; `scene(k)` is one of them
+    - `values` (P, 2) of the two quantities, with their `names` and `units`
+    - `machines`: texts of the scene files of the machines; `scene(k)` returns one of them as a `Scene`
     """
 
     status = Computed.done
@@ -79,9 +78,9 @@ class Front(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the front, each point with the number by which `scene` gives its machine.
+        """Plot the front; each point is labelled with its number `k`, for which `scene(k)` returns the machine.
 
-        **Returns** a matplotlib figure, or the given `ax`.
+        **Returns** a matplotlib figure, or the demands `ax`.
         """
         from jaxvib.draw.charts import front_chart  # slow import
 
@@ -100,22 +99,23 @@ def pareto(
     starts: int = 32,
     seed: int = 0,
 ) -> Front:
-    """Return the trade-off of two quantities that are both to be small.
+    """Return the trade-off of two quantities, both of which are minimized.
 
-    - Each end of the front is the least value of one quantity and, among the machines that have it, the least of the other one
-    - Between the ends, limits on the second quantity are spread evenly: each point is the least of the first under its limit,
-      then the least of the second at that value of the first
-    - Every point is a search of its own (two, counting the second step); all of them share their programs
-    - Machines that another one beats are left out
+    - Each end of the front is the least value of one quantity and, among the machines that have this value, the least value of
+      the other quantity
+    - Between the ends, upper limits on the second quantity are spaced evenly. For each limit, the first quantity is minimized,
+      then the second quantity among machines with this value of the first
+    - Each point needs two searches; all searches share their compiled programs
+    - A machine is left out if another machine is not worse in any quantity
 
     **Arguments**
 
     - `space`: a `DesignSpace`
     - `first` and `second`: the two quantities
-    - `points`: at most this number of machines, at least 2; typical: 9 (the default). The time grows in proportion
-    - `subject_to`, `starts`, `seed` as `synthesize`; typical: 32 starts (the default) for each point
+    - `points`: largest number of machines, at least 2; typical: 9 (the default). The time is proportional to it
+    - `subject_to`, `starts`, `seed`: as for `synthesize`; typical: 32 starts (the default) for each point
 
-    **Returns** `Front`, machines with the least `first` first; a single one if it is the best of both.
+    **Returns** `Front`, in ascending order of `first`. It has one machine if this machine has the least values of both.
 
     **Raises** as `synthesize`; `KeyboardInterrupt` if a search is interrupted.
 
@@ -133,7 +133,7 @@ def pareto(
       50.014  20
     """
     count(points, "points", low=2)
-    given = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
+    demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
 
     def both(found: Synthesis) -> tuple[float, float]:
         return float(first(found.scene)), float(second(found.scene))
@@ -141,21 +141,21 @@ def pareto(
     def searched(objective: Quantity, other: Quantity, limit: float) -> list[Synthesis]:
         """Search for the least objective with a limit on the other quantity, then for the least value of that quantity among
         machines with the same objective."""
-        best = synthesize(space, objective, subject_to=[*given, other < limit], starts=starts, seed=seed, verify=False)
+        best = synthesize(space, objective, subject_to=[*demands, other < limit], starts=starts, seed=seed, verify=False)
         # A flat objective has many minima; the first search ends at any of them.
-        alike = [*given, objective < float(objective(best.scene))]
-        then = synthesize(space, other, subject_to=alike, begin=best, seed=seed, verify=False, throw=False)
+        with_best_objective = [*demands, objective < float(objective(best.scene))]
+        then = synthesize(space, other, subject_to=with_best_objective, begin=best, seed=seed, verify=False, throw=False)
         if "interrupted" in (best.status_name, then.status_name):
             raise KeyboardInterrupt  # a front needs all of its searches
         return [best, then] if then.status_name != "contradictory" else [best]
 
-    # The limit has no effect, but excludes machines without the other quantity and lets all searches share two programs.
+    # This limit excludes only machines without the other quantity. With it, all searches share two programs.
     lowest = searched(first, second, _NO_LIMIT)
     highest = searched(second, first, _NO_LIMIT)
     (_, worst), (_, least) = both(lowest[-1]), both(highest[-1])
     found = [*lowest, *highest]
     for limit in np.linspace(worst, least, points)[1:-1] if worst > least else ():
-        with contextlib.suppress(ComputationError):  # a search may miss a narrow range of feasible machines
+        with contextlib.suppress(ComputationError):  # a search may not find a narrow range of feasible machines
             found += searched(first, second, float(limit))
     values = np.asarray([both(each) for each in found])
     kept = not_dominated(values)
@@ -170,13 +170,13 @@ def pareto(
 def not_dominated(values: np.ndarray) -> list[int]:
     """Return the indices of rows of `values` (n, q) that no other row dominates, ordered by their first column.
 
-    Of equal rows one is returned. A row counts as no worse than another one if it exceeds it by less than 1e-6 of the range of
-    each column or 1e-7 of the largest value, whichever is more: searches keep their demands to this accuracy.
+    If rows are equal, one of them is returned. Row a is not worse than row b if, in each column, a exceeds b by less than 1e-6
+    of the range of the column or 1e-7 of its largest value, whichever is larger: demands are met to this accuracy.
     """
     span = np.maximum(np.ptp(values, axis=0), 0.1 * np.max(np.abs(values), axis=0))
     scaled = values / np.where(span > 0.0, span, 1.0)
     kept: list[int] = []
-    for k in np.argsort(np.sum(scaled, axis=1), kind="stable"):  # no row is beaten by one with a larger sum
+    for k in np.argsort(np.sum(scaled, axis=1), kind="stable"):  # a row with a larger sum cannot dominate
         if not any(np.all(scaled[j] <= scaled[k] + _SAME_POINT_DIFFERENCE) for j in kept):
             kept.append(int(k))
     return sorted(kept, key=lambda k: (values[k, 0], -values[k, 1]))

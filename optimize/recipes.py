@@ -26,7 +26,7 @@ def _platforms(scene: Scene, least: int) -> Platforms:
 
 
 def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[str, tuple[Number, Number]]:
-    """Return bounds for every spring of the machine, within a factor of its stiffness."""
+    """Return the bounds k/`range_` and k*`range_` of the stiffness k of each spring of these kinds."""
     found: dict[str, tuple[Number, Number]] = {}
     for kind in kinds:
         for k, value in enumerate(np.asarray(getattr(machine, kind))):
@@ -40,8 +40,8 @@ def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[
 def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
     """Return the design task for an antiphase machine of two masses: least foundation force per relative amplitude.
 
-    The frequency of the jam and the stiffness budget of the supports (the sum of k_i/M_i over the platforms) keep their values;
-    all springs are free within a factor `range_`.
+    The frequency of the jam and the stiffness budget of the supports (the sum of k_i/M_i over the platforms) keep their values.
+    Each spring may be changed by a factor of up to `range_`.
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
 
@@ -101,7 +101,7 @@ def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: in
 def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[int, int] | None = None) -> Design:
     """Return the design task: the lightest loads that shake a platform by at least the amplitude `least` (m or text).
 
-    The mass of the loads is free, from a tenth to ten times its value; the radius of the track keeps its value.
+    The mass of the loads is free, from one tenth to ten times its value; the radius of the track keeps its value.
 
     **Returns** `Design`, not yet searched; `design.run()` searches.
     """
@@ -117,16 +117,15 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
     """Return the design task: springs for which a jam mode exists over the widest range of rotor speeds.
 
-    The range lies about the present rotor speed. The objective is its distance to the nearer fold, above or below;
-    the amplitude must be at least the share `keep` of the present amplitude.
+    The range includes the present rotor speed. The objective is the distance of the rotor speed from the nearer fold, above or
+    below. The amplitude must be at least `keep` times the present amplitude.
 
-    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a share that is not between 0
-    and 1.
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` if `keep` is not between 0 and 1.
     """
     count(mode, "mode")
     if not 0.0 < keep <= 1.0:
         raise InputError("keep", f"is {quoted(keep)}; it must be greater than 0 and at most 1")
     machine = _platforms(scene, 1)
     space = DesignSpace(scene, _springs(machine, 3.0, ("stiffness", "link_stiffness")))
-    whose = amplitude(mode=mode, of=of)
-    return Design(space, -fold_margin(mode=mode), subject_to=(whose > keep * float(whose(scene)),))
+    amplitude_of_mode = amplitude(mode=mode, of=of)
+    return Design(space, -fold_margin(mode=mode), subject_to=(amplitude_of_mode > keep * float(amplitude_of_mode(scene)),))

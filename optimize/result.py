@@ -28,14 +28,14 @@ _MAX_SHOWN_PERCENT = 1000.0
 
 
 _MAX_LINEAR_PERCENT = 10.0
-"""Largest change of the objective, per cent, that is predicted from its slope."""
+"""Largest change of the objective, per cent, for which a prediction from its slope is shown."""
 
 _MIN_LIMIT_CHANGE = 1e-6
 """Smallest change of a limit, per cent, that is shown."""
 
 
 class SynthesisStatus(eqx.Enumeration):
-    """Outcomes of a search; the members are the sentences a user reads."""
+    """Outcomes of a search. The value of each member is the message shown to the user."""
 
     done = "the search converged: no change of a free parameter improves the objective"
     not_converged = "the search has not converged: allow more polishing or more iterations"
@@ -45,7 +45,7 @@ class SynthesisStatus(eqx.Enumeration):
 
 @dataclass(frozen=True)
 class Outcome:
-    """Numbers of a machine in one jam mode, NaN if the mode does not exist.
+    """Quantities of a machine in one jam mode, NaN if the mode does not exist.
 
     Returned by `Synthesis.before`, `after` and `verified`.
 
@@ -53,8 +53,8 @@ class Outcome:
 
     - `parameters`: the free parameters by name, SI
     - `exists`: True if the mode exists
-    - `omega`, rad/s
-    - `amplitude`, m, of platform 1 (y1) first, and `foundation_force`, N, zero to peak
+    - `omega`: load speed, rad/s
+    - `amplitude` of each coordinate, platform 1 (y1) first, m, and `foundation_force`, N, zero to peak
     - `force_per_amplitude`, N/m
     """
 
@@ -66,14 +66,14 @@ class Outcome:
     force_per_amplitude: float
 
     def as_dict(self) -> dict[str, Plain]:
-        """Return the same for JSON: free parameters beside the quantities, None instead of NaN."""
+        """Return the free parameters and the quantities as a dictionary for JSON, with None instead of NaN."""
         shown = ("omega", "amplitude", "foundation_force", "force_per_amplitude")
         return {name: plain(value) for name, value in {**self.parameters, **{k: getattr(self, k) for k in shown}}.items()}
 
 
 class Row(NamedTuple):
-    """Row of the table: `what`: its name, its SI `unit`; values `before` and `after`, of the exact motion (`exact`) and by time
-    integration (`time`), NaN for an absent one."""
+    """Row of the table: name `what` and SI `unit`; values `before` and `after` the search, by the exact motion (`exact`) and by
+    time integration (`time`). A value that was not computed is NaN."""
 
     what: str
     unit: str
@@ -89,34 +89,34 @@ class Limit(NamedTuple):
     **Attributes**
 
     - `what` in words; its `value` and `limit` in SI `unit`
-    - `broken`: its violation, in parts of the limit (0: met; infinite: the machine has no such value)
+    - `violation`: its relative violation (0: met; infinite: the machine has no such value)
     - `active`: True if it limits the design
-    - `multiplier`: the slope of the objective over the limit, times the limit, toward the side on which it limits less (held
-      quantities: upward)
-    - `gain`: the change of the objective in per cent that this slope gives for a limit moved by 1 %: negative is an
-      improvement. A gain of more than some per cent is beyond the range of a slope
+    - `multiplier`: derivative of the objective with respect to the limit, times the limit, for a change that relaxes the limit
+      (held quantities: an increase)
+    - `gain`: change of the objective, per cent, if the limit is relaxed by 1 %, predicted from this derivative; negative for an
+      improvement. A prediction of more than a few per cent is not reliable
     """
 
     what: str
     unit: str
     value: float
     limit: float
-    broken: float
+    violation: float
     active: bool
     multiplier: float
     gain: float
 
     def shortfall(self) -> str:
         """Return the distance of the machine from a violated limit as text."""
-        if not math.isfinite(self.broken):
+        if not math.isfinite(self.violation):
             return "the nearest machine does not have this quantity"
         unit, factor = shown_unit(self.unit, max(abs(self.value), abs(self.limit)))
-        return f"at best {f'{self.value * factor:.5g} {unit}'.rstrip()}, {100.0 * self.broken:.3g} % off"
+        return f"at best {f'{self.value * factor:.5g} {unit}'.rstrip()}, {100.0 * self.violation:.3g} % off"
 
 
 class Influence(NamedTuple):
-    """Influence of a free parameter: `what`: its name; the change of the objective in per cent if only this number is 1 %
-    smaller (`less`) and 1 % larger (`more`)."""
+    """Influence of the free parameter `what` on the objective: the change of the objective, per cent, if only this parameter is
+    1 % smaller (`less`) or 1 % larger (`more`)."""
 
     what: str
     less: float
@@ -124,10 +124,10 @@ class Influence(NamedTuple):
 
 
 class Machine(NamedTuple):
-    """Distinct machine of a search: `often`, the number of starts that ended at it; the `value` of the objective; the free
+    """Distinct machine of a search: `starts`, the number of starts that ended at it; the `value` of the objective; the free
     `numbers`, SI."""
 
-    often: int
+    starts: int
     value: float
     numbers: tuple[float, ...]
 
@@ -140,16 +140,17 @@ class Synthesis(Result):
     **Attributes**
 
     - `status`: a `SynthesisStatus`; `scene`: the best design
-    - `before` and `after`: its `Outcome` by the jam's equations, `verified` by time integration of the full equations from
-      `run` (both None if that was not done or failed: `unverified` states the reason)
-    - `table` of `Row`: every free parameter and quantity before and after, of the exact motion and in time
-    - `limits` of `Limit`: demands, held quantities, and active bounds, with the gain from moving each
-    - `influences` of `Influence`: the influence of each number
-    - `machines` of `Machine`: the different ones that were found, and how often
-    - `kkt`: the residual of the Karush-Kuhn-Tucker conditions of the best design, relative
-    - `starts`: searches made, from `drawn` random designs; `converged`: number of them that ended at a design that no free
-      number can improve; `same`: number that ended at the best design
-    - `designs` (starts, d) in [0, 1]: the end of each search, with their `values` and whether each is `done`
+    - `before` and `after`: `Outcome` of the initial scene and of the best design, to leading order
+    - `verified`: `Outcome` of the best design from `run`, a time integration of the full equations. Both are None if the run
+      was not requested or failed; `unverified` states the reason
+    - `table` of `Row`: every free parameter and quantity before and after, by the exact motion and by time integration
+    - `limits` of `Limit`: demands, held quantities and active bounds, with the gain from a change of each
+    - `influences` of `Influence`: the influence of each free parameter
+    - `machines` of `Machine`: the distinct final designs, with the number of starts that ended at each
+    - `kkt`: relative residual of the Karush-Kuhn-Tucker conditions at the best design
+    - `starts`: number of searches, from `drawn` random designs; `converged`: number of searches that ended at a design that no
+      change of a free parameter improves; `same`: number of searches that ended at the best design
+    - `designs` (starts, d) in [0, 1]: the final design of each search; `values`: its objective; `done`: True if it converged
     - `history` (iterations, starts) of the objective; `objective` and `unit`: its name and unit
     """
 
@@ -187,8 +188,7 @@ class Synthesis(Result):
         return "\n".join(line.rstrip() for line in lines)
 
     def rows(self) -> list[list[str]]:
-        """Return the table as text, in units that a designer reads: name, before, after, of the exact motion, verified in
-        time."""
+        """Return the table as text in practical units: name, before, after, by the exact motion, by time integration."""
         out = []
         for row in self.table:
             sizes = [abs(v) for v in row[2:] if math.isfinite(v)]
@@ -198,21 +198,21 @@ class Synthesis(Result):
         return out
 
     def findings(self) -> list[str]:
-        """Return lines of text on demands, held quantities and bounds, on influences, and on the machines that were found."""
+        """Return lines of text on demands, held quantities, bounds and influences, and on the distinct final designs."""
         lines = []
         best = self.machines[0].value if self.machines else math.nan
 
         def changed(*percent: float) -> str:
             if math.isnan(best) or not max(map(abs, percent)) > _MAX_SHOWN_PERCENT:
                 return " / ".join(f"{each:+.3g} %" for each in percent) + " of the objective"
-            moved = [max(abs(best), 1e-300) * each / 100.0 for each in percent]  # for an objective near 0
-            unit, factor = shown_unit(self.unit, max(map(abs, moved)))
-            return " / ".join(f"{each * factor:+.3g} {unit}".rstrip() for each in moved)
+            changes = [max(abs(best), 1e-300) * each / 100.0 for each in percent]  # for an objective near 0
+            unit, factor = shown_unit(self.unit, max(map(abs, changes)))
+            return " / ".join(f"{each * factor:+.3g} {unit}".rstrip() for each in changes)
 
         for limit in self.limits:
             unit, factor = shown_unit(limit.unit, max(abs(limit.value), abs(limit.limit)))
             values = f"{limit.value * factor:.5g} {unit}".rstrip()
-            if limit.broken > 0.0:
+            if limit.violation > 0.0:
                 lines.append(f"  not met: {limit.what}; {limit.shortfall()}")
             elif limit.active:
                 lines.append(f"  at its limit: {limit.what} ({values}); {_limit_influence(limit.gain)}")
@@ -222,8 +222,8 @@ class Synthesis(Result):
         for each in ranked[:5]:
             lines.append(f"  1 % less / more {each.what}: {changed(each.less, each.more)}")
         if len(self.machines) > 1:
-            seen = ", ".join(f"{m.often} x {m.value:.4g}" for m in self.machines[:6])
-            lines.append(f"  {len(self.machines)} different machines: {seen} {self.unit}".rstrip())
+            counts = ", ".join(f"{m.starts} x {m.value:.4g}" for m in self.machines[:6])
+            lines.append(f"  {len(self.machines)} different machines: {counts} {self.unit}".rstrip())
         return lines
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -260,9 +260,10 @@ def _align_columns(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 
 
 def _limit_influence(gain: float) -> str:
-    """Return text on the change of the objective by a change of a limit, from the `gain` for 1 %.
+    """Return text on the change of the objective with a limit, from the `gain` for a change of the limit by 1 %.
 
-    The change of the limit is so small that the slope is valid: the objective changes by at most a tenth.
+    The change of the limit in the text is reduced until the objective changes by at most one tenth, for which the linear
+    prediction is valid.
     """
     share = 1.0
     while abs(gain) * share > _MAX_LINEAR_PERCENT:
@@ -279,7 +280,7 @@ def objective_text(objective: str) -> str:
 
 
 def amplitude_names(scene: Scene) -> list[str]:
-    """Return the names of the amplitudes of the coordinates; that of platform 1 belongs to the coordinate y1."""
+    """Return the names of the amplitudes of all coordinates, such as "amplitude of platform 1 (y1)"."""
     names = scene.machine.structure().coordinates
     if not isinstance(scene.machine, Platforms):
         return [f"amplitude of {name}" for name in names]

@@ -26,15 +26,15 @@ Bounds = tuple[Number, Number] | tuple[Number, Number, str]
 """(low, high), or (low, high, "log" or "even")."""
 
 Source = str | tuple[str, float | Literal["keep"]]
-"""Source of a tied number: the name of another one, with a factor, or "keep" for their present ratio."""
+"""Source of a tied parameter: the name of another parameter, with a factor, or "keep" for their present ratio."""
 
 
 class HeldQuantity(eqx.Module):
-    """Quantity that keeps its value during the search; made by `hold`.
+    """Quantity that keeps its value during the search.
 
     Returned by `hold`.
 
-    **Attributes**: `quantity`; `value` in its unit, None for the value in the scene from which the search begins.
+    **Attributes**: `quantity`; `value` in its unit, None for the value in the initial scene.
     """
 
     quantity: Quantity = eqx.field(static=True)
@@ -48,10 +48,10 @@ def hold(quantity: Quantity, value: Number | None = None) -> HeldQuantity:
     **Arguments**
 
     - `quantity` such as `jam_frequency(mode=3)`
-    - `value` in its unit, or text; default: its value in the scene from which the search begins; typical: not 0
+    - `value` in its unit, or text; default: its value in the initial scene; typical: not 0
 
-    **Returns** `HeldQuantity`. **Raises** `InputError` for a wrong unit, or a value of 0 (held quantities are compared
-    relative to it).
+    **Returns** `HeldQuantity`. **Raises** `InputError` for a wrong unit, or a value of 0 (deviations from a held value are
+    relative).
 
     >>> from optimize import hold, jam_frequency
     >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name
@@ -67,7 +67,7 @@ def hold(quantity: Quantity, value: Number | None = None) -> HeldQuantity:
 
 
 class Tie(NamedTuple):
-    """Numbers that follow others: `target` = `factor` times `source`, entry by entry."""
+    """Parameters that follow others: `target` = `factor` times `source`, entry by entry."""
 
     target: NamedNumber
     source: NamedNumber
@@ -75,7 +75,7 @@ class Tie(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Number with a list of allowed values, ascending, SI; `start`: its place in the design vector."""
+    """Parameter with a list of allowed values, ascending, SI; `start`: its index in the design vector."""
 
     name: str
     values: tuple[float, ...]
@@ -88,31 +88,32 @@ class DesignSpace(eqx.Module):
     **Arguments**
 
     - `scene`: the design from which the search begins
-    - `free`: a mapping from names to (low, high), SI or text with units; typical: 2 to 20 numbers, from a half or a tenth to 2
-      or 10 times their values. More free parameters need more starts
-    - `hold`: quantities that keep their value, made by `optimize.hold`; sums and products too (`total`, `product`)
-    - `ties`: a mapping from a name to the number that it follows: another number's name (equal), (name, factor), or (name,
-      "keep") for the ratio that both have in the scene; zeros of an array stay, as in `free`
-    - `choices`: a mapping from a name to the available values, such as the springs of a catalogue; "loads.count" to numbers of
-      loads; typical: 2 to 20 values
+    - `free`: a mapping from names to (low, high), SI or text with units; typical: 2 to 20 parameters, from a half or a tenth to
+      2 or 10 times their values. More free parameters need more starts
+    - `hold`: quantities that keep their value, each in `optimize.hold(...)`, for example a sum (`total`) or a product
+      (`product`) of parameters
+    - `ties`: a mapping from the name of a parameter to its source: the name of another parameter (equal values), (name,
+      factor), or (name, "keep") to keep the present ratio of both; entries of an array that are 0 stay 0, as in `free`
+    - `choices`: a mapping from the name of a parameter to its allowed values, such as the springs of a catalogue, or from
+      "loads.count" to allowed numbers of loads; typical: 2 to 20 values
 
     Names and bounds of `free`:
 
-    - "machine.stiffness" frees every entry of an array that is not 0 (each within the bounds)
-    - "machine.stiffness[0]" frees one of them, also a spring that is not there yet (0)
-    - "loads.drag" frees the one number that all loads share, "drive.speed" the rotor's speed
-    - (low, high, "log") divides the range by ratio, (low, high, "even") evenly; default: by ratio for ranges over a factor of
-      10 or more, otherwise evenly
+    - "machine.stiffness" frees every entry of the array that is not 0; the bounds apply to each entry
+    - "machine.stiffness[0]" frees one entry, which may be 0 in the scene (a spring that does not exist yet)
+    - "loads.drag" frees the value that all loads share, "drive.speed" the rotor speed
+    - (low, high, "log") scales the range logarithmically, (low, high, "even") linearly; default: logarithmically for ranges
+      over a factor of 10 or more, otherwise linearly
 
-    Inside, a design is a vector z in [0, 1]^d.
+    A search describes a design by a vector z in [0, 1]^d.
 
-    **Attributes**, of the d free parameters: bounds `low` and `high` (d,), SI; `logs`: True for a range that is divided by
-    ratio; `held`: the held quantities; `counts`: the allowed numbers of loads.
+    **Attributes**, of the d free parameters: bounds `low` and `high` (d,), SI; `logs`: True for a logarithmically scaled range;
+    `held`: the held quantities; `counts`: the allowed numbers of loads.
 
     **Raises** `InputError` for
 
-    - a name that the scene does not have, and bounds the wrong way round
-    - a number that is free twice, or free and tied
+    - a name that the scene does not have, and a lower bound above the upper one
+    - a parameter that is free twice, or free and tied
     - values of a catalogue that no scene can have
     - more held quantities than free parameters
 
@@ -155,8 +156,8 @@ class DesignSpace(eqx.Module):
         for name, values in chosen.items():
             if name in free:
                 raise InputError(f"choices.{name}", "is free already; give it once, as free or as a choice")
-            wide = values[-1] / values[0] >= 10.0 if values[0] > 0.0 else False
-            ranges.append((name, find_number(scene, name, "choices"), values[0], values[-1], wide))
+            is_log = values[-1] / values[0] >= 10.0 if values[0] > 0.0 else False
+            ranges.append((name, find_number(scene, name, "choices"), values[0], values[-1], is_log))
         taken: set = set()
         numbers, lows, highs, logs, choices_ = [], [], [], [], []
         for name, whole, low, high, log in ranges:
@@ -202,7 +203,7 @@ class DesignSpace(eqx.Module):
             raise InputError(name, f"is {quoted(values)}; it must be an array with {self.size} numbers{axis}")
 
     def numbers(self, z: Numbers) -> Numbers:
-        """Return the free parameters (..., d), SI, of designs `z` (..., d) in [0, 1]; NumPy arrays if z is one."""
+        """Return the free parameters (..., d), SI, of designs `z` (..., d) in [0, 1]; a NumPy array if z is a NumPy array."""
         self._require_size(z, "z")
         xp, low, high = self._bounds(z)
         log = np.asarray(self.logs)
@@ -224,11 +225,12 @@ class DesignSpace(eqx.Module):
 
     @validated
     def where(self, scene: Scene) -> Array:
-        """Return the design z (d,) of a `scene`, moved into the bounds if it lies outside."""
+        """Return the design z (d,) of a `scene`; a parameter outside its bounds is moved to the nearer bound."""
         return self.shares(jnp.concatenate([each.read(scene) for each in self.free]))
 
     def shares(self, numbers: Numbers) -> Numbers:
-        """Return the designs z (..., d) of free `numbers` (..., d), SI, moved into the bounds if they lie outside."""
+        """Return the designs z (..., d) of free parameters `numbers` (..., d), SI; a value outside its bounds is moved to the
+        nearer bound."""
         self._require_size(numbers, "numbers")
         xp, low, high = self._bounds(numbers)
         value, log, width = xp.clip(numbers, low, high), np.asarray(self.logs), high - low
@@ -248,20 +250,19 @@ class DesignSpace(eqx.Module):
 
     @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
-        """Return the same space between other bounds `low` and `high` (d,), SI; equal bounds fix a number."""
+        """Return the same space with other bounds `low` and `high` (d,), SI; equal bounds fix a parameter."""
         for bounds, name in ((low, "low"), (high, "high")):
             self._require_size(bounds, name, single=True)
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
 
     def residuals(self, evaluation: Evaluation) -> Array:
-        """Return the deviation of each held quantity, relative to the value at which it is held (m,), for an `evaluation` of a
-        scene."""
+        """Return the relative deviation (m,) of each held quantity from its held value, from an `evaluation` of a scene."""
         off = [held.quantity.read(evaluation) / held.value - 1.0 for held in self.held if held.value is not None]
         return jnp.stack(off) if off else jnp.zeros((0,))
 
 
 def _require_tables(scene: object, free: object, hold: object, ties: object, choices: object) -> None:
-    """**Raises** `InputError` if `scene` is no scene, or another argument is no dictionary or list."""
+    """**Raises** `InputError` for arguments of a wrong type."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     require_known(scene, "scene", "DesignSpace", "make the space outside")
@@ -334,7 +335,7 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Ti
             ratio = np.full(target.size, float(factor))
         else:
             raise InputError(f"ties.{name}", f"has the factor {quoted(factor)}; give a number greater than 0, or 'keep'")
-        if target.keeps_zeros(scene):  # an absent part of the machine stays absent
+        if target.keeps_zeros(scene):  # a spring or damper that does not exist is not created
             ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):
             raise InputError(f"ties.{name}", f"has no ratio to {source_name}, which is 0 in the scene; give a factor")

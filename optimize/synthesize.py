@@ -29,24 +29,24 @@ from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
 from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, require_quantity, walk
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
-from optimize.search.find import Found, Options, Searcher, choose, require_searcher
+from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
 from optimize.search.polish import FEASIBILITY_TOLERANCE
-from optimize.search.problem import Problem, evaluate_quantities, made, problem_of
+from optimize.search.problem import Problem, evaluate_quantities, problem_of, scenes_of
 from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
 from optimize.space import DesignSpace
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
 _CONVERGED_DECREASE = 1e-6
-"""Largest decrease of the objective, relative to its value, that a converged design may still allow nearby."""
+"""Predicted relative decrease of the objective below which a design has converged."""
 
 _SAME_DESIGN_DISTANCE = 1e-3
-"""Largest distance of two designs that count as the same machine, relative to the ranges of the free parameters."""
+"""Distance of two designs, relative to the ranges of the free parameters, below which they count as the same machine."""
 
 _INITIAL_SPREAD = 1e-3
-"""Largest initial angle of the loads from the exact motion, rad."""
+"""Largest deviation of the initial angles of the loads from the exact motion, rad."""
 
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 
 
 @validated
@@ -64,7 +64,7 @@ def synthesize(
     begin: Synthesis | None = None,
     verify: bool = True,
     throw: bool = True,
-    progress: Tell | None = None,
+    progress: Progress | None = None,
 ) -> Synthesis:
     """Search a design space from many random starts at once for the least value of a quantity, subject to demands.
 
@@ -78,29 +78,30 @@ def synthesize(
     **Arguments**
 
     - `space`: a `DesignSpace`
-    - `objective`: a `Quantity` such as `force_per_amplitude(mode=3)`; write `-quantity` for one that shall be large
+    - `objective`: the `Quantity` to minimize, such as `force_per_amplitude(mode=3)`; `-quantity` maximizes
     - `subject_to`: demands such as `[amplitude(mode=3) > "2 mm", power(mode=3) < 500.0]`
     - `starts`: number of random starts; typical: 32 to 256 (the default). The time is proportional to it; more starts also
       make it more probable that the lowest minimum is found
     - `seed` of these starts
     - `iterations` of the descent; typical: 50 to 200 (default 100)
-    - `rate`: first step of the descent, in parts of a free parameter's range; typical: 0.01 to 0.1 (default 0.05)
+    - `rate`: first step of the descent, relative to the range of a free parameter; typical: 0.01 to 0.1 (default 0.05)
     - `polishing`: steps of sequential quadratic programming; typical: 12 (the default)
-    - `searcher`: the method before the polishing, "gradients" (Adam from the starts), or "cma": CMA-ES, which computes values
-      alone, `starts` x `iterations` of them, for objectives with many local minima (extra `cma`); its few best designs are
-      polished
-    - `begin`: a `Synthesis` of this space from which to continue, in place of random starts
+    - `searcher`: method before the polishing: "gradients", Adam from the starts; or "cma", CMA-ES for objectives with many
+      local minima (extra `cma`). CMA-ES uses no derivatives; it computes `starts` x `iterations` designs, and the few best of
+      them are polished
+    - `begin`: a `Synthesis` of this space; its final designs replace the random starts
     - `verify`: True to compute the exact motion of the best design. If it is stable, the full equations are integrated until
       the motion has settled, from a state in which the loads deviate by up to 1e-3 rad, and the quantities are measured;
       `unverified` states why there is no such run
     - `throw`: raise if demands contradict each other; otherwise the status and `limits` show it
-    - `progress`: a function, called with the present step and its finished share (0 to 1). An interrupt (Ctrl-C) ends the
-      search at once with its best design, which is not polished and not verified
+    - `progress`: a function that is called with the name of the present step and the finished share of the search (0 to 1).
+      An interrupt (Ctrl-C) ends the search at once with its best design, which is then not polished and not verified
 
     **Returns** `Synthesis`.
 
-    **Raises** `InputError` for values that are not allowed, `ComputationError` (status "no_feasible_start" if no design in the
-    bounds has the objective, "contradictory" if no design meets all demands: it names those that are not met, and by how much).
+    **Raises** `InputError` for values that are not allowed, and `ComputationError` with the status "no_feasible_start" if the
+    objective does not exist for any random design, or "contradictory" if no design meets all demands. Its message states which
+    demands are not met, and by how much.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -117,15 +118,19 @@ def synthesize(
     """
     options = _options(starts, seed, iterations, polishing, rate, searcher)
     demands = _validate_demands(space, objective, subject_to)
-    tell: Tell = lambda what, share: None if progress is None else call_user(progress, "progress", what, share)  # noqa: E731
+
+    def report(what: str, share: float) -> None:
+        if progress is not None:
+            call_user(progress, "progress", what, share)
+
     if begin is not None:
         options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
-    space, problem, found = _search(space, objective, demands, options, tell)
+    space, problem, found = _search(space, objective, demands, options, report)
     best = found.best
-    others = made(problem, neighbours(problem, found))
+    others = scenes_of(problem, neighbours(problem, found))
     scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], others)))
     kept = found.violation < 10.0 * FEASIBILITY_TOLERANCE
-    done = kept & (found.left < _CONVERGED_DECREASE)
+    done = kept & (found.remaining_decrease < _CONVERGED_DECREASE)
     values = np.where(kept, found.point.values[:, 0], np.inf)
     if found.interrupted:
         status = SynthesisStatus.interrupted
@@ -141,20 +146,20 @@ def synthesize(
     reports = evaluate_quantities((*(q for _, q in named), objective, *sides), batch, problem)
     limits = limits_of(problem, demands, found, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
-        broken = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.broken)
+        unmet = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.violation)
         raise failure(
-            SynthesisStatus.contradictory, f" (not met by the nearest machine: {broken}); widen the bounds or relax a demand"
+            SynthesisStatus.contradictory, f" (not met by the nearest machine: {unmet}); widen the bounds or relax a demand"
         )
-    tell("checking", 0.9)
+    report("checking", 0.9)
     verify = verify and bool(kept[best]) and not found.interrupted
     unfinished = "the search was interrupted" if found.interrupted else "the machine does not meet all demands"
     run, unverified = _run(scene, mode, verify) if kept[best] and not found.interrupted else (None, unfinished)
     other = _other_tiers(scene, [q for _, q in named], verify, run, mode)
     rows = _table(space, scene, named, reports[:2, : len(named)], other)
-    n = len(_standard(scene, mode, objective.of))
+    n = len(_standard_rows(scene, mode, objective.of))
     before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((space.scene, scene)))
     verified = None if run is None else _by_run(space, run, mode or 1, objective.of)
-    tell("done", 1.0)
+    report("done", 1.0)
     return Synthesis(
         status=status,
         scene=scene,
@@ -222,17 +227,17 @@ def _designs_to_continue(space: DesignSpace, begin: Synthesis) -> np.ndarray:
 
 
 def _search(
-    space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options, tell: Tell
-) -> tuple[DesignSpace, Problem, Found]:
+    space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options, report: Progress
+) -> tuple[DesignSpace, Problem, SearchResult]:
     """Return the best result over all allowed numbers of loads."""
-    best: tuple[DesignSpace, Problem, Found] | None = None
+    best: tuple[DesignSpace, Problem, SearchResult] | None = None
     existing = drawn = 0
     for loads in space.counts or (space.scene.loads.count,):
         here = space if loads == space.scene.loads.count else _with_loads(space, loads)
         problem = problem_of(here, objective, demands, options.starts)
         if problem.keys:
             require_drag(jammed_loads(space.scene))
-        found = choose(problem, options, tell)
+        found = choose(problem, options, report)
         if found is None:
             continue
         existing, drawn = existing + found.existing, drawn + found.drawn
@@ -252,22 +257,22 @@ def _search(
 
 
 def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options) -> str:
-    """Return text with the quantities of a search that no random design has."""
+    """Return text with the quantities of a search that do not exist for any random design."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     every = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
     z = np.random.default_rng(options.seed).uniform(size=(options.starts, space.size))
-    values = evaluate_quantities(every, made(problem_of(space, objective, (), options.starts), space.numbers(z)))
+    values = evaluate_quantities(every, scenes_of(problem_of(space, objective, (), options.starts), space.numbers(z)))
     absent = [q.words for q, there in zip(every, np.any(np.isfinite(values), axis=0).tolist(), strict=True) if not there]
     return " or ".join(absent) or "all of: " + ", ".join(q.words for q in every)
 
 
-def _rank(found: Found) -> tuple[bool, float]:
+def _rank(found: SearchResult) -> tuple[bool, float]:
     kept = bool(found.violation[found.best] < 10.0 * FEASIBILITY_TOLERANCE)
     return not kept, float(found.point.values[found.best, 0] if kept else found.violation[found.best])
 
 
 def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
-    """Return the design space with another number of loads. **Raises** `InputError` for loads with individual numbers."""
+    """Return the design space with another number of loads. **Raises** `InputError` for loads with different parameters."""
     now = space.scene.loads
     if not getattr(now, "alike", False):
         raise InputError("choices.loads.count", "needs equal loads; give one mass, radius and drag for all")
@@ -276,12 +281,15 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
 
 
 def _mode_of(objective: Quantity, demands: Sequence[Demand]) -> int | None:
-    """Return the jam mode of a search: that of its objective or, for a lightest machine, of the first demand that has one."""
+    """Return the jam mode of a search: that of its objective, otherwise that of the first demand with a jam mode."""
     return next((q.mode for q in (objective, *(d.quantity for d in demands)) if q.mode is not None), None)
 
 
 def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
-    """Integrate the full equations until they have settled in a jam mode; return the run, or the reason why there is none."""
+    """Integrate the full equations until the motion has settled in a jam mode.
+
+    **Returns** the run and an empty text, or None and the reason.
+    """
     if mode is None:
         return None, "neither the objective nor the demands have a jam mode to integrate"
     if not verify:
@@ -292,7 +300,7 @@ def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]
             return settle(scene, mode=mode), ""
         if not bool(orbit.stable):
             return None, f"mode {mode} is unstable: the largest multiplier of its exact motion is {float(orbit.multiplier):.4g}"
-        run = settle(scene, start=_beside(orbit))
+        run = settle(scene, start=_deviating_start(orbit))
     except ComputationError as error:
         return None, str(error)
     if not abs(float(run.omega / orbit.omega) - 1.0) < _SAME_DESIGN_DISTANCE:
@@ -309,17 +317,18 @@ def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
     return orbit if math.isfinite(float(orbit.multiplier)) else None
 
 
-def _beside(orbit: Orbit) -> State:
-    """Return a state of the exact motion with slightly separated loads, which leave the motion if it is unstable.
+def _deviating_start(orbit: Orbit) -> State:
+    """Return a state of the exact motion with slightly separated loads, so that an unstable motion is left.
 
-    From a start on the leading-order motion, a machine with little damping takes thousands of periods to reach the exact one.
+    From a start on the leading-order motion, a machine with little damping would need thousands of periods to reach the exact
+    one.
     """
     displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
     spread = _INITIAL_SPREAD * np.linspace(-1.0, 1.0, len(angle)) if len(angle) > 1 else np.zeros(1)
     return State(displacement, velocity, (angle + spread,), rate)
 
 
-def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quantity]]:
+def _standard_rows(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quantity]]:
     """Return the standard rows of the table of a machine in a jam mode."""
     if mode is None:
         return []
@@ -333,7 +342,7 @@ def _named_quantities(
     space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand], mode: int | None
 ) -> list[tuple[str, Quantity]]:
     """Return the quantities of the table: the standard ones of a jam, then the objective, held quantities and demands."""
-    standard = _standard(scene, mode, objective.of)
+    standard = _standard_rows(scene, mode, objective.of)
     sought = objective.parts[0] if objective.name.startswith("negative ") and objective.parts else objective
     own = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
     known = {q for _, q in standard}
@@ -376,7 +385,7 @@ def _other_tiers(
             return math.nan
         try:
             return float(other.read(evaluation))
-        except (InputError, ComputationError):  # a theory that excludes this scene
+        except (InputError, ComputationError):  # the method does not support this scene
             return math.nan
 
     evaluation = Evaluation(scene)

@@ -40,7 +40,7 @@ class Changed:
 
 @dataclass(frozen=True)
 class Sampled:
-    """Case of many scenes whose numbers have random relative errors, with fixed samples."""
+    """Case of many scenes whose parameters have random relative errors. The seed fixes the samples."""
 
     errors: tuple[tuple[str, float], ...]
     samples: int
@@ -49,9 +49,9 @@ class Sampled:
     several = True
 
     def factors(self, scene: Scene) -> list[tuple[NamedNumber, np.ndarray]]:
-        """Return factors of each number (samples, entries) from a normal distribution within three standard deviations.
+        """Return the factors (samples, entries) of each parameter, from a normal distribution cut at three standard deviations.
 
-        They are a Latin hypercube: the samples of each number cover its distribution evenly, in an independent order.
+        They are a Latin hypercube: the samples of each parameter cover its distribution evenly, in an independent order.
         """
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
@@ -59,9 +59,9 @@ class Sampled:
             found = find_number(scene, name, "tolerance")
             shares = (np.arange(self.samples) + 0.5) / self.samples
             deviations = np.clip([normal.inv_cdf(float(share)) for share in shares], -3.0, 3.0)
-            drawn = np.stack([random.permutation(deviations) for _ in range(found.size)], axis=1)
+            deviation = np.stack([random.permutation(deviations) for _ in range(found.size)], axis=1)
             # The tolerance is two standard deviations: 95 of 100 machines are within it.
-            out.append((found, np.maximum(1.0 + 0.5 * error * drawn, 0.05)))
+            out.append((found, np.maximum(1.0 + 0.5 * error * deviation, 0.05)))
         return out
 
     def scenes(self, scene: Scene) -> Scene:
@@ -69,17 +69,17 @@ class Sampled:
         factors = [(found, jnp.asarray(f)) for found, f in self.factors(scene)]
 
         def one(*each: Array) -> Scene:
-            made = scene
+            changed = scene
             for (found, _), factor in zip(factors, each, strict=True):
-                made = put_numbers(made, (found,), found.read(made) * factor)
-            return made
+                changed = put_numbers(changed, (found,), found.read(changed) * factor)
+            return changed
 
         return jax.vmap(one)(*(f for _, f in factors))
 
 
 @dataclass(frozen=True)
 class _OfPart(Quantity):
-    """Quantity that is computed from one other quantity."""
+    """Quantity that is computed from another one."""
 
     @property
     def words(self) -> str:
@@ -98,10 +98,10 @@ class Under(_OfPart):
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
         return self._value_of_cases(evaluation, lambda inner: self.parts[0].pieces(inner, sign))
 
-    def _value_of_cases(self, evaluation: Evaluation, question: Callable[[Evaluation], Array]) -> Array:
+    def _value_of_cases(self, evaluation: Evaluation, compute: Callable[[Evaluation], Array]) -> Array:
         scene, path = evaluation.under(self.case)
-        inner = Evaluation(scene, evaluation.known, path)
-        value = question(inner)
+        inner = Evaluation(scene, evaluation.near_speeds, path)
+        value = compute(inner)
         evaluation.found.update(inner.found)
         return value
 
@@ -120,7 +120,7 @@ class Robust(_OfPart):
             return jnp.mean(values)
         if self.statistic == "worst":
             return greatest(values)
-        # The mean beyond the quantile would be smoother, but the requested number is the quantile, between two samples.
+        # The mean of the values above the quantile would be smoother, but the user requests the quantile.
         return jnp.quantile(values, self.level)
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
@@ -128,20 +128,20 @@ class Robust(_OfPart):
             return super().pieces(evaluation, sign)
         return self._sampled(evaluation, self.parts[0].pieces).reshape(-1)
 
-    def _sampled(self, evaluation: Evaluation, question: Callable[[Evaluation], Array]) -> Array:
+    def _sampled(self, evaluation: Evaluation, compute: Callable[[Evaluation], Array]) -> Array:
         """Return the values of all samples, (samples, ...)."""
         scenes, path = evaluation.under(self.case)
-        known, keys = evaluation.known, []
+        near_speeds, keys = evaluation.near_speeds, []
         near: tuple[Array, ...] | None = None
-        if not isinstance(known, TargetRecorder) and known is not None:
-            keys = [key for key in known if key[0][: len(path)] == path]
-            near = tuple(known[key] for key in keys)
+        if not isinstance(near_speeds, TargetRecorder) and near_speeds is not None:
+            keys = [key for key in near_speeds if key[0][: len(path)] == path]
+            near = tuple(near_speeds[key] for key in keys)
         found: list[Key] = []
 
         def one(scene: Scene, near: tuple[Array, ...] | None) -> tuple[Array, tuple[Array, ...]]:
-            recorder = known if isinstance(known, TargetRecorder) else None
+            recorder = near_speeds if isinstance(near_speeds, TargetRecorder) else None
             inner = Evaluation(scene, recorder if near is None else dict(zip(keys, near, strict=True)), path)
-            value = question(inner)
+            value = compute(inner)
             found[:] = inner.found
             return value, tuple(inner.found.values())
 
@@ -156,18 +156,18 @@ class Robust(_OfPart):
 
 @validated
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
-    """Return a quantity at another operating point or under another load: some parameters of the scene have other values.
+    """Return a quantity of the same machine at another operating point or with other loads: some parameters are changed.
 
     **Arguments**
 
-    - `quantity` of the changed scene
+    - `quantity`, which is computed for the changed scene
     - `name` of the case, for tables
-    - `changes`: a mapping from the name of a number, such as "drive.speed" or "machine.mass[0]", to its value, SI or text with
-      a unit; the name of an array changes each of its entries that is not 0; typical: 1 or 2 numbers, 0.5 to 2 times their
-      values
+    - `changes`: a mapping from the name of a parameter, such as "drive.speed" or "machine.mass[0]", to its value, SI or text
+      with a unit; the name of an array changes each of its entries that is not 0; typical: 1 or 2 parameters, 0.5 to 2 times
+      their values
 
-    **Returns** `Quantity`. **Raises** `InputError` for a value of another unit, and, when it is computed, a name that the scene
-    does not have.
+    **Returns** `Quantity`. **Raises** `InputError` for a value in a wrong unit. A name that the scene does not have raises
+    `InputError` when the quantity is computed.
 
     >>> from optimize import foundation_force, under
     >>> under(foundation_force(mode=3), "loaded", {"machine.mass[0]": "180 kg"}).words
@@ -175,7 +175,7 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     """
     require_quantity(quantity, "quantity")
     if not isinstance(changes, Mapping) or not changes:
-        raise InputError("changes", f"is {quoted(changes)}; give a dictionary such as {{'drive.speed': '1200 rpm'}}")
+        raise InputError("changes", f"is {quoted(changes)}; it must be a dictionary such as {{'drive.speed': '1200 rpm'}}")
     values = tuple((key, read_value(key, value)) for key, value in changes.items())
     case = Changed(name, values)
     return Under(f"{quantity.words} ({name})", quantity.unit, of=quantity.of, case=case, parts=(quantity,))
@@ -184,10 +184,12 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
 def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, seed: int, how: str, level: float) -> Quantity:
     require_quantity(quantity, "quantity")
     if not isinstance(tolerances, Mapping) or not tolerances:
-        raise InputError("tolerances", f"is {quoted(tolerances)}; give a dictionary such as {{'machine.stiffness': 0.05}}")
+        raise InputError(
+            "tolerances", f"is {quoted(tolerances)}; it must be a dictionary such as {{'machine.stiffness': 0.05}}"
+        )
     for name, value in tolerances.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
-            raise InputError(f"tolerances.{name}", f"is {quoted(value)}; give a share such as 0.05 for 5 %")
+            raise InputError(f"tolerances.{name}", f"is {quoted(value)}; it must be between 0 and 1, such as 0.05 for 5 %")
     case = Sampled(
         tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), count(seed, "seed", low=0)
     )
@@ -199,18 +201,18 @@ def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, s
 
 @validated
 def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
-    """Return the mean of a quantity over machines whose numbers deviate from the design.
+    """Return the mean of a quantity over machines whose parameters deviate from the design.
 
     **Arguments**
 
     - `quantity` of each machine
-    - `tolerances`: a mapping from the name of a number or array of the scene to the relative tolerance that 95 of 100 machines
-      keep (0.05: 5 %); each entry has an error of its own, normal, no more than one and a half tolerances; typical: 0.01 to 0.1
-      for masses and springs, 0.3 to 0.5 for damping
-    - `samples`: number of machines that are drawn; typical: 16 to 256 (default 64). The time grows in proportion
-    - `seed` of the drawing (a Latin hypercube)
+    - `tolerances`: a mapping from the name of a parameter or array of the scene to the relative tolerance that 95 of 100
+      machines keep (0.05: 5 %). Each entry of an array has its own, normally distributed error of at most one and a half
+      tolerances; typical: 0.01 to 0.1 for masses and springs, 0.3 to 0.5 for damping
+    - `samples`: number of random machines; typical: 16 to 256 (default 64). The time is proportional to it
+    - `seed` of the random machines (a Latin hypercube)
 
-    **Returns** `Quantity`, NaN if one of the machines does not have it. **Raises** `InputError` for wrong tolerances.
+    **Returns** `Quantity`, NaN if it does not exist for one of the machines. **Raises** `InputError` for wrong tolerances.
 
     >>> from optimize import expected, foundation_force
     >>> expected(foundation_force(mode=3), {"machine.stiffness": 0.05}).words
@@ -221,13 +223,13 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
 
 @validated
 def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
-    """Return the largest value of a quantity over machines whose numbers deviate from the design, see `expected`.
+    """Return the largest value of a quantity over machines whose parameters deviate from the design, see `expected`.
 
-    For a quantity that shall be large, take `-worst(-quantity, ...)`.
+    The smallest value of a quantity that should be large is `-worst(-quantity, ...)`.
 
-    **Arguments**: `quantity`, `tolerances`, `samples` and `seed` as `expected`; typical: 64 samples (the default).
+    **Arguments**: `quantity`, `tolerances`, `samples` and `seed`: as for `expected`; typical: 64 samples (the default).
 
-    **Returns** `Quantity`, NaN if one of the machines does not have it. **Raises** `InputError` for wrong tolerances.
+    **Returns** `Quantity`, NaN if it does not exist for one of the machines. **Raises** `InputError` for wrong tolerances.
 
     >>> from optimize import foundation_force, worst
     >>> worst(foundation_force(mode=3), {"machine.damping": 0.3}).unit
@@ -240,15 +242,16 @@ def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int =
 def quantile(
     quantity: Quantity, level: float, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0
 ) -> Quantity:
-    """Return the value that a share of the machines stays below, see `expected`.
+    """Return a quantile: the value below which a quantity lies for a given fraction of the machines, see `expected`.
 
     **Arguments**
 
-    - `quantity`, `tolerances`, `samples` and `seed` as `expected`
-    - `level`: the share, between 0 and 1; typical: 0.9 to 0.99. It needs some multiples of 1 / (1 - level) samples
+    - `quantity`, `tolerances`, `samples` and `seed`: as for `expected`
+    - `level`: the fraction, between 0 and 1; typical: 0.9 to 0.99. The number of samples should be several times
+      1 / (1 - level)
 
-    **Returns** `Quantity`, NaN if one of the machines does not have it. **Raises** `InputError` for wrong tolerances or a wrong
-    level.
+    **Returns** `Quantity`, NaN if it does not exist for one of the machines. **Raises** `InputError` for wrong tolerances or a
+    wrong level.
 
     >>> from optimize import foundation_force, quantile
     >>> quantile(foundation_force(mode=3), 0.95, {"machine.stiffness": 0.05}).words

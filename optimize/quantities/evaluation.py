@@ -1,4 +1,4 @@
-"""Results of a scene that quantities need, each computed once; jams are followed from a similar machine."""
+"""Results of a scene from which quantities are computed. Each is computed once; jams are followed from a similar machine."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.units.known import is_known
 
 _NO_FOLD = 10.0
-"""Factor on the rotor speed that replaces the upper fold of a mode if no fold ends it at higher rotor speeds."""
+"""Upper fold of a mode that no fold ends at higher rotor speeds, in units of the rotor speed."""
 
-_SAMPLES = 4000
+_RUN_UP_SAMPLES = 4000
 """Number of stored states of a run-up."""
 
 
 class Case(Protocol):
-    """Scenes derived from the scene of a design: a load case, an operating point, samples of tolerances."""
+    """Scenes that are derived from the scene of a design: a load case, an operating point, or samples of tolerances."""
 
     def scenes(self, scene: Scene) -> Scene:
         """Return the scene in this case; if the case has several scenes, its arrays have a leading axis."""
@@ -44,14 +44,14 @@ class Case(Protocol):
 
 
 Target = tuple[str, int]
-"""Followed jam or fold: ("jam", mode), or a fold at an end of the mode, ("below", mode) or ("above", mode)."""
+"""Followed jam, ("jam", mode), or followed fold at an end of the mode, ("below", mode) or ("above", mode)."""
 
 Key = tuple[tuple[Case, ...], Target]
-"""Scene, as the path of cases from the scene of the design, and the followed jam or fold."""
+"""Scene, as the cases that lead from the scene of the design to it, and its followed jam or fold."""
 
 
 class TargetRecorder:
-    """Substitute for an evaluation that records the requested targets."""
+    """Substitute for the known load speeds of an `Evaluation`; it records which jams and folds quantities request."""
 
     def __init__(self) -> None:
         self.keys: list[Key] = []
@@ -65,20 +65,23 @@ class TargetRecorder:
 class Evaluation:
     """Results of one scene, each computed when it is first requested.
 
-    **Attributes**: `scene`; `is_known`: true if its numbers have values; `known`: load speeds (rad/s) near which jams and folds
-    are followed, by `Key` (without them the whole branch is computed); `found`: the resulting load speeds.
+    **Attributes**
+
+    - `scene`; `is_known`: True if its parameters have values, False if they are traced
+    - `near_speeds`: load speeds (rad/s) near which jams and folds are searched for, by `Key`; None to compute the whole branch
+    - `found`: the resulting load speeds by `Key`
     """
 
     def __init__(
         self,
         scene: Scene,
-        known: Mapping[Key, Array] | TargetRecorder | None = None,
+        near_speeds: Mapping[Key, Array] | TargetRecorder | None = None,
         path: tuple[Case, ...] = (),
         modes: JamModes | None = None,
     ):
         self.scene = scene
         self.is_known = is_known(scene)
-        self.known = known
+        self.near_speeds = near_speeds
         self.path = path
         self.found: dict[Key, Array] = {}
         if modes is not None:
@@ -103,36 +106,42 @@ class Evaluation:
         return jam_modes(self.scene)
 
     def jam(self, mode: int) -> Jam:
-        """Return the jam mode with a number, NaN if it does not exist."""
+        """Return the jam of the mode with this number, with NaN values if it does not exist."""
         most = 2 * self.scene.machine.structure().mass.shape[0] + 1
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
         key: Key = (self.path, ("jam", mode))
         if key not in self._jams:
-            jam = self.modes.select(mode, throw=False) if self.known is None else follow_jam(self.jammed, mode, self.known[key])
+            jam = (
+                self.modes.select(mode, throw=False)
+                if self.near_speeds is None
+                else follow_jam(self.jammed, mode, self.near_speeds[key])
+            )
             self._jams[key] = jam
             self.found[key] = jam.omega
         return self._jams[key]
 
     def folds(self, mode: int) -> tuple[Array, Array]:
-        """Return the rotor speeds, rad/s, of the folds below and above a jam mode on the branch; if a fold is absent, 0 or ten
-        times the rotor speed of the scene."""
+        """Return the rotor speeds, rad/s, of the folds at the lower and the upper end of a jam mode on n(Omega).
+
+        If a fold is absent, the value is 0 on the side of slow rotors, and ten times the rotor speed of the scene on the other.
+        """
         speeds = []
         for side in ("below", "above"):
             key: Key = (self.path, (side, mode))
-            near = guesses(self.modes, (side, mode)) if self.known is None else self.known[key]
-            there = jnp.isfinite(near)
-            omega, speed = follow_fold(self.jammed, jnp.where(there, near, 1.0))
-            self.found[key] = jnp.where(there, omega, near)
+            near = guesses(self.modes, (side, mode)) if self.near_speeds is None else self.near_speeds[key]
+            exists = jnp.isfinite(near)
+            omega, speed = follow_fold(self.jammed, jnp.where(exists, near, 1.0))
+            self.found[key] = jnp.where(exists, omega, near)
             slower = (side == "below") == (mode % 2 == 1)
-            speeds.append(jnp.where(there, speed, 0.0 if slower else _NO_FOLD * self.scene.drive.speed))
+            speeds.append(jnp.where(exists, speed, 0.0 if slower else _NO_FOLD * self.scene.drive.speed))
         return speeds[0], speeds[1]
 
     def orbit(self, mode: int) -> Orbit:
-        """Return the exact motion that continues a jam mode, NaN if there is none."""
+        """Return the exact periodic motion near a jam mode, with NaN values if it does not exist."""
         if mode not in self._orbits:
             jam = self.jam(mode)
-            if self.known is None and self.is_known:
+            if self.near_speeds is None and self.is_known:
                 orbit = jam_orbit(self.scene, mode=mode, throw=False)
             else:
                 orbit = jam_orbit(self.scene, near=jax.lax.stop_gradient(jam.omega), throw=False)
@@ -154,17 +163,17 @@ class Evaluation:
         self._runs["jam", mode] = run
 
     def start_up(self, until: float, spin_up: float) -> Run:
-        """Integrate the full equations from rest to the time `until`, s; the rotor's speed rises over the time `spin_up`, s."""
-        ask = partial(simulate, self.scene, until, start="spin_up", spin_up=spin_up, samples=_SAMPLES)
-        return self._run(("start_up", until, spin_up), ask)
+        """Integrate the full equations from rest to the time `until`, s; the rotor speed rises during the time `spin_up`, s."""
+        integrate = partial(simulate, self.scene, until, start="spin_up", spin_up=spin_up, samples=_RUN_UP_SAMPLES)
+        return self._run(("start_up", until, spin_up), integrate)
 
-    def _run(self, key: Hashable, ask: Callable[..., Run]) -> Run:
-        """Return a run, whose derivatives are in forward mode."""
+    def _run(self, key: Hashable, integrate: Callable[..., Run]) -> Run:
+        """Return a run. Its derivatives exist in forward mode only."""
         import diffrax
 
         if key not in self._runs:
             adjoint = None if self.is_known else diffrax.ForwardMode()
-            self._runs[key] = ask(estimate=False, adjoint=adjoint, throw=False)
+            self._runs[key] = integrate(estimate=False, adjoint=adjoint, throw=False)
         return self._runs[key]
 
     def under(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:

@@ -34,15 +34,16 @@ __all__ = [
 ]
 
 _SLIP = 1e-4
-"""Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both
-have a relative rounding error of 1e-12."""
+"""Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both ways
+of computing it have a relative rounding error of 1e-12."""
 
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
-    """Return the platform or pair of platforms of an amplitude: `of`, or if it is None, platform 1 relative to platform 2, or
-    the only platform.
+    """Return the platform, or the pair of platforms, of an amplitude.
 
-    **Raises** `InputError` for a platform that is not there.
+    It is `of`; if `of` is None, platform 1 relative to platform 2, or the only platform.
+
+    **Raises** `InputError` for a platform that the machine does not have.
     """
     n = scene.machine.structure().mass.shape[0]
     if of is None:
@@ -56,7 +57,7 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
     raise InputError("of", f"is {quoted(of)}; give a platform or a pair of different platforms of 1 to {n}")
 
 
-def _asking(
+def _make_quantity(
     name: str,
     unit: str,
     function: Callable[..., Array],
@@ -67,13 +68,13 @@ def _asking(
     of: Pair = None,
     settings: tuple[Pair, ...] = (),
     tiers: tuple[Tier, ...] = TIERS,
-    parted: Callable[..., Array] | None = None,
+    pieces_function: Callable[..., Array] | None = None,
 ) -> Quantity:
     text = f"{text}, mode {mode}"
-    return BuiltinQuantity(name, unit, function, mode, of, tier, (mode, *settings), tiers, text, parted)
+    return BuiltinQuantity(name, unit, function, mode, of, tier, (mode, *settings), tiers, text, pieces_function)
 
 
-def _whose(of: Pair) -> str:
+def _platform_text(of: Pair) -> str:
     if of is None:
         return ""
     return f" of platform {of}" if isinstance(of, int) else f" of platform {of[0]} against {of[1]}"
@@ -90,25 +91,26 @@ def _pair(of: Pair | list[int]) -> Pair:
 
 @validated
 def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
-    """Return the amplitude in a jam mode, m zero to peak: of a platform, or of one relative to another (see `between`).
+    """Return the amplitude in a jam mode, m zero to peak, of a platform or of one platform relative to another.
 
     **Arguments**
 
     - `mode`: number of the jam mode, 1 to 2 nd + 1; typical: 1, 3, 5, which are stable for light loads
     - `of`: a platform, or a pair of them for a relative amplitude; typical: 1 to 3; default: platform 1 relative to 2, or the
       only one
-    - `tier`: "leading" (light loads, by algebra; the default), "exact" (the exact periodic motion), "time" (the full equations,
-      integrated for a while from the jam); typical times for a machine: 0.2 ms, 0.3 ms, 5 to 100 ms
+    - `tier`: "leading" (light loads, by algebra; the default), "exact" (the exact periodic motion), or "time" (the full
+      equations, integrated from the jam for 60 periods of the lowest natural frequency); typical computing times for a machine:
+      0.2 ms, 0.3 ms, 5 to 100 ms
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.5 to 10 mm. A number of a mode or platform that the
-    machine does not have raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.5 to 10 mm. A mode or platform that the machine does not
+    have raises `InputError` when the quantity is computed.
 
     >>> from optimize import amplitude
     >>> amplitude(mode=3, of=1).unit
     'm'
     """
     of = _pair(of)
-    return _asking("amplitude", "m", _amplitude, mode, tier, f"amplitude{_whose(of)}", of=of, settings=(of,))
+    return _make_quantity("amplitude", "m", _amplitude, mode, tier, f"amplitude{_platform_text(of)}", of=of, settings=(of,))
 
 
 def _amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
@@ -129,7 +131,7 @@ def _amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array
 def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") -> Quantity:
     """Return the phase difference of two platforms in a jam mode, rad: 0 in phase, pi in antiphase.
 
-    For the exact motion it is that of their first harmonics.
+    In the exact motion it is the phase difference of the first harmonics.
 
     **Arguments**
 
@@ -137,7 +139,7 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
     - `of`: the two platforms (default: 1 and 2)
     - `tier`: "leading" (the default) or "exact"
 
-    **Returns** `Quantity`, NaN if the mode does not exist. **Raises** `InputError` for an argument that is no pair.
+    **Returns** `Quantity`, NaN if the mode does not exist. **Raises** `InputError` if `of` is not a pair.
 
     >>> from optimize import phase
     >>> (phase(mode=3) > "170 deg").words
@@ -147,7 +149,7 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
     if not isinstance(pair, tuple) or len(pair) != 2:
         raise InputError("of", f"is {quoted(of)}; a phase needs a pair of platforms such as (1, 2)")
     text = f"phase between platforms {pair[0]} and {pair[1]}"
-    return _asking("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
+    return _make_quantity("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
 
 
 def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
@@ -158,8 +160,8 @@ def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -
     else:
         orbit = evaluation.orbit(mode)
         first = orbit.displacement_harmonics[:, orbit.orders.index(1)]
-    turned = first[i - 1] * jnp.conj(first[j - 1])
-    return jnp.arctan2(jnp.abs(turned.imag), turned.real)
+    relative = first[i - 1] * jnp.conj(first[j - 1])
+    return jnp.arctan2(jnp.abs(relative.imag), relative.real)
 
 
 @validated
@@ -169,22 +171,25 @@ def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "le
     **Arguments**
 
     - `mode`: number of the jam mode; typical: 1, 3, 5
-    - `harmonic` k: the force at k times the loads' speed alone (of the exact motion); typical: 1 to 5; default: the whole force
-    - `tier` as `amplitude`
+    - `harmonic`: number k of a harmonic of the exact motion, for the force at k times the load speed only; typical: 1 to 5;
+      default: the whole force
+    - `tier`: as for `amplitude`
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 1 to 2000 N. A number of a mode that the machine does not
-    have raises `InputError` when the quantity is computed, a harmonic of another tier than the exact one raises it here.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 1 to 2000 N. A mode that the machine does not have raises
+    `InputError` when the quantity is computed. **Raises** `InputError` for a harmonic with the tier "time".
 
     >>> from optimize import foundation_force
     >>> foundation_force(mode=3).unit
     'N'
     """
     if harmonic is None:
-        return _asking("foundation_force", "N", _force, mode, tier, "foundation force", settings=(None,), parted=_peaks)
+        return _make_quantity(
+            "foundation_force", "N", _force, mode, tier, "foundation force", settings=(None,), pieces_function=_peaks
+        )
     count(harmonic, "harmonic")
     text = f"harmonic {harmonic} of the foundation force"
     tier = "exact" if tier == "leading" else tier
-    return _asking("force_harmonic", "N", _force, mode, tier, text, settings=(harmonic,), tiers=("exact",))
+    return _make_quantity("force_harmonic", "N", _force, mode, tier, text, settings=(harmonic,), tiers=("exact",))
 
 
 def _force(evaluation: Evaluation, tier: Tier, mode: int, harmonic: int | None) -> Array:
@@ -207,19 +212,21 @@ def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -
     **Arguments**
 
     - `mode`: number of the jam mode; typical: 1, 3, 5
-    - `of`: a platform, or a pair of them, as `amplitude`
-    - `tier` as `amplitude`
+    - `of`: a platform or a pair of platforms, as for `amplitude`
+    - `tier`: as for `amplitude`
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.001 to 1 times the stiffness of the supports. A number of
-    a mode or platform that the machine does not have raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.001 to 1 times the stiffness of the supports. A mode or
+    platform that the machine does not have raises `InputError` when the quantity is computed.
 
     >>> from optimize import force_per_amplitude
     >>> force_per_amplitude(mode=3).unit
     'N/m'
     """
     of = _pair(of)
-    text = f"force per amplitude{_whose(of)}"
-    return _asking("force_per_amplitude", "N/m", _ratio, mode, tier, text, of=of, settings=(of,), parted=_peaks_per_amplitude)
+    text = f"force per amplitude{_platform_text(of)}"
+    return _make_quantity(
+        "force_per_amplitude", "N/m", _ratio, mode, tier, text, of=of, settings=(of,), pieces_function=_peaks_per_amplitude
+    )
 
 
 def _ratio(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
@@ -227,7 +234,7 @@ def _ratio(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
 
 
 def _peaks(evaluation: Evaluation, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
-    """Return peaks of the exact force in parts of the period; if its first harmonic is small, several are about as high."""
+    """Return the peaks of the exact force within the period. If its first harmonic is small, several are nearly equal."""
     if tier != "exact" or sign < 0.0:
         return sign * _force(evaluation, tier, mode, harmonic)[None]
     return evaluation.orbit(mode).force_peaks()
@@ -241,16 +248,16 @@ def _peaks_per_amplitude(evaluation: Evaluation, sign: float, tier: Tier, mode: 
 def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
     """Return the speed Omega at which the loads jam in a mode, rad/s.
 
-    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier` as `amplitude`.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier`: as for `amplitude`.
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 90 % to 100 % of a resonance, 10 to 300 rad/s. A number of
-    a mode that the machine does not have raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 90 % to 100 % of a resonance, 10 to 300 rad/s. A mode that
+    the machine does not have raises `InputError` when the quantity is computed.
 
     >>> from optimize import jam_frequency
     >>> jam_frequency(mode=3).unit
     'rad/s'
     """
-    return _asking("jam_frequency", "rad/s", _frequency, mode, tier, "jam frequency")
+    return _make_quantity("jam_frequency", "rad/s", _frequency, mode, tier, "jam frequency")
 
 
 def _frequency(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
@@ -261,11 +268,11 @@ def _frequency(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 
 @validated
 def fold_margin(*, mode: int) -> Quantity:
-    """Return the change of the rotor speed, up or down, at which a jam mode vanishes at a fold, rad/s, to leading order.
+    """Return the smallest change of the rotor speed, up or down, at which a jam mode ends at a fold, rad/s, to leading order.
 
         margin = min(n - n_low, n_high - n),    n_low, n_high rotor speeds of the folds that end the mode
 
-    If no fold ends the mode, 0 stands for n_low and ten times the rotor's speed for n_high.
+    Without a fold at that end of the mode, n_low is 0, and n_high is ten times the rotor speed.
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5.
 
@@ -275,8 +282,8 @@ def fold_margin(*, mode: int) -> Quantity:
     >>> (fold_margin(mode=3) > "60 rpm").words
     'distance to the fold, mode 3 at least 60 rpm'
     """
-    return _asking(
-        "fold_margin", "rad/s", _margin, mode, "leading", "distance to the fold", tiers=("leading",), parted=_margins
+    return _make_quantity(
+        "fold_margin", "rad/s", _margin, mode, "leading", "distance to the fold", tiers=("leading",), pieces_function=_margins
     )
 
 
@@ -304,7 +311,7 @@ def largest_multiplier(*, mode: int) -> Quantity:
     >>> (largest_multiplier(mode=3) < 0.99).words
     'largest multiplier, mode 3 at most 0.99'
     """
-    return _asking("largest_multiplier", "", _multiplier, mode, "exact", "largest multiplier", tiers=("exact",))
+    return _make_quantity("largest_multiplier", "", _multiplier, mode, "exact", "largest multiplier", tiers=("exact",))
 
 
 def _multiplier(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
@@ -325,7 +332,7 @@ def power(*, mode: int, tier: Tier = "leading") -> Quantity:
     >>> power(mode=3).unit
     'W'
     """
-    return _asking("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
+    return _make_quantity("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
 
 
 def _power(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
@@ -336,8 +343,8 @@ def _power(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     torque = loads.drag_sum() * (n - omega)
     if has_term(scene.all_effects, ContactFriction):
         torque = torque + friction_on_light_loads(loads, scene.all_effects, omega, n)
-    # With strong drag n - Omega has few correct digits. The torque then follows from the dissipation of the carrier, which has
-    # all digits.
+    # With strong drag n - Omega has few correct digits. The torque is then computed from the dissipation of the carrier, which
+    # has no such loss of digits.
     close = n - omega < _SLIP * n
     taken = evaluation.jammed.dissipated(omega * jnp.where(close, jam.displacement, 0.0))
     torque = jnp.where(close, taken / omega, torque)

@@ -27,7 +27,7 @@ __all__ = ["product", "spring_cost", "static_deflection", "support_frequency_squ
 _GRAVITY = 9.80665
 
 
-def _asking(name: str, unit: str, function: Callable[..., Array], text: str, *settings: object) -> Quantity:
+def _make_quantity(name: str, unit: str, function: Callable[..., Array], text: str, *settings: object) -> Quantity:
     return BuiltinQuantity(name, unit, function, tiers=("leading",), text=text, settings=settings)
 
 
@@ -38,8 +38,9 @@ def _platforms(scene: Scene, what: str) -> Platforms:
 
 
 def support_frequency_squared() -> Quantity:
-    """Return sum_i k_i/M_i over the platforms, loads included in M, (rad/s)^2: the stiffness budget n_1^2 + n_2^2 of the
-    papers.
+    """Return the stiffness budget of the supports, (rad/s)^2: sum_i k_i/M_i over the platforms, n_1^2 + n_2^2 in the papers.
+
+    M_i includes the mass of the loads.
 
     **Returns** `Quantity`; typical: 100 to 10,000. A machine without platforms raises `InputError` when the quantity is
     computed.
@@ -53,7 +54,7 @@ def support_frequency_squared() -> Quantity:
 
     Source: the antiphase paper, section 5.1.
     """
-    return _asking("support_frequency_squared", "rad^2/s^2", _budget, "stiffness budget of the supports, sum of k/M")
+    return _make_quantity("support_frequency_squared", "rad^2/s^2", _budget, "stiffness budget of the supports, sum of k/M")
 
 
 def _budget(evaluation: Evaluation, tier: Tier) -> Array:
@@ -62,7 +63,7 @@ def _budget(evaluation: Evaluation, tier: Tier) -> Array:
 
 
 def _entries(field: str) -> tuple[str, str, str, str]:
-    """Return the part, name and unit of an array whose entries have one unit, and a text for its entries."""
+    """Return the part, name and unit of an array of a scene whose entries all have one unit, and a text for its entries."""
     part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
     spec = spec_of(field) if part in ("machine", "loads") and "[" not in name else None
     if spec is None or len(spec.units) > 1:
@@ -71,7 +72,7 @@ def _entries(field: str) -> tuple[str, str, str, str]:
 
 
 def _leaf(scene: Scene, part: str, name: str) -> Array:
-    """Return the entries of an array of the scene; a number that all loads share is repeated for each load."""
+    """Return the entries of an array of the scene; a parameter that all loads share is repeated for each load."""
     leaf = getattr(getattr(scene, part), name, None)
     if not isinstance(leaf, jax.Array):
         raise InputError("field", f"is '{part}.{name}', which this scene does not have")
@@ -82,7 +83,7 @@ def _leaf(scene: Scene, part: str, name: str) -> Array:
 def total(field: str) -> Quantity:
     """Return the sum of an array of the scene, such as "machine.stiffness", in the unit of its entries.
 
-    A number that all loads share, such as "loads.mass", counts once for each load.
+    A parameter that all loads share, such as "loads.mass", is counted once for each load.
 
     **Arguments**: `field`: the name of the array; typical: "machine.mass", "machine.stiffness", "loads.mass".
 
@@ -93,7 +94,7 @@ def total(field: str) -> Quantity:
     'N/m'
     """
     part, name, unit, words = _entries(field)
-    return _asking(f"total {field}", unit, _total, f"sum of {words}", part, name)
+    return _make_quantity(f"total {field}", unit, _total, f"sum of {words}", part, name)
 
 
 def _total(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
@@ -102,9 +103,9 @@ def _total(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
 
 @validated
 def product(field: str) -> Quantity:
-    """Return the product of an array of the scene, such as "machine.stiffness", see `total`.
+    """Return the product of the entries of an array of the scene, such as "machine.stiffness", see `total`.
 
-    Its unit, that of its entries' product, is left out.
+    The result is in SI; its unit is not shown.
 
     **Arguments**: `field`: the name of the array; typical: "machine.mass", "machine.stiffness".
 
@@ -115,7 +116,7 @@ def product(field: str) -> Quantity:
     'product of mass of all platforms'
     """
     part, name, _, words = _entries(field)
-    return _asking(f"product of {field}", "", _product, f"product of {words}", part, name)
+    return _make_quantity(f"product of {field}", "", _product, f"product of {words}", part, name)
 
 
 def _product(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
@@ -132,7 +133,7 @@ def total_mass() -> Quantity:
     >>> total_mass().unit
     'kg'
     """
-    return _asking("total_mass", "kg", _mass, "mass of platforms and loads")
+    return _make_quantity("total_mass", "kg", _mass, "mass of platforms and loads")
 
 
 def _mass(evaluation: Evaluation, tier: Tier) -> Array:
@@ -147,8 +148,8 @@ def static_deflection(of: int | None = None) -> Quantity:
 
     **Arguments**: `of`: the platform; typical: 1 to 3; default: the largest deflection of all platforms.
 
-    **Returns** `Quantity`, NaN for a platform that no support carries, directly or by links; typical: 2 to 50 mm. A machine
-    without platforms, or without that one, raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN for a platform without a support of its own or, by links, of another platform; typical: 2 to
+    50 mm. A machine without platforms, or without this platform, raises `InputError` when the quantity is computed.
 
     >>> import jaxvib as jv
     >>> from optimize import static_deflection
@@ -160,13 +161,13 @@ def static_deflection(of: int | None = None) -> Quantity:
     if of is not None:
         count(of, "of")
     text = "static deflection" + (f" of platform {of}" if of is not None else "")
-    return _asking("static_deflection", "m", _sag, text, of)
+    return _make_quantity("static_deflection", "m", _sag, text, of)
 
 
 def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
     machine = _platforms(evaluation.scene, "the deflection")
     model, carried = linear_model(evaluation.scene), _has_support(machine)
-    # The stiffness matrix of platforms without supports is singular up to rounding: they are fixed here, with the result NaN.
+    # Platforms without supports make the stiffness matrix singular. They are fixed here, and their result is NaN.
     held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
     sag = jnp.linalg.solve(model.carrier.stiffness + held, _GRAVITY * jnp.diagonal(model.mass))
     if of is not None and of > sag.shape[0]:
@@ -176,7 +177,7 @@ def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
 
 
 def _has_support(machine: Platforms) -> Array:
-    """Return True (n,) for each platform that has a support or is connected by links to a platform with one."""
+    """Return True (n,) for platforms with a support, or connected by links to a platform with a support."""
     n = machine.mass.shape[0]
     joined = jnp.eye(n, dtype=bool)
     for (i, j), stiffness in zip(machine.links, machine.link_stiffness, strict=True):
@@ -190,8 +191,8 @@ def _has_support(machine: Platforms) -> Array:
 def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quantity:
     """Return the cost of the springs of supports and links, from a price list.
 
-    Prices between two entries are interpolated. Beyond an end of the list they are extrapolated from the last two entries
-    there, but not below the price at that end. A spring of stiffness 0 costs nothing.
+    The price between two entries is interpolated linearly. Beyond an end of the list it is extrapolated from the two entries
+    at that end, but it is at least the price at that end. A spring of stiffness 0 costs nothing.
 
     **Arguments**
 
@@ -215,7 +216,7 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
     for i, each in enumerate(price):
         if not 0.0 <= each < math.inf:
             raise InputError(f"prices[{i}]", f"has the price {each:g}; a price must be at least 0 and finite")
-    return _asking("spring_cost", unit, _cost, "cost of the springs", stiffness, price)
+    return _make_quantity("spring_cost", unit, _cost, "cost of the springs", stiffness, price)
 
 
 def _cost(evaluation: Evaluation, tier: Tier, stiffness: tuple[float, ...], price: tuple[float, ...]) -> Array:

@@ -25,15 +25,15 @@ def _times(until: Number, spin_up: Number) -> tuple[float, float]:
 
 @validated
 def peak_force(*, until: Number, spin_up: Number) -> Quantity:
-    """Return the largest foundation force while the rotor is brought up from rest, N: the full equations, integrated.
+    """Return the largest foundation force, N, of a run in which the rotor is accelerated from rest (full equations).
 
     **Arguments**
 
     - `until`: end of the integration, s or text; typical: 5 to 30
-    - `spin_up`: time over which the rotor's speed rises smoothly, s or text; typical: 1 to 10
+    - `spin_up`: time during which the rotor speed rises smoothly, s or text; typical: 1 to 10
 
-    **Returns** `Quantity`; its derivatives are in forward mode; typical: 500 N to 10 kN. **Raises** `InputError` for a spin-up
-    longer than the run.
+    **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 500 N to 10 kN. **Raises** `InputError` for a
+    spin-up longer than the run.
 
     >>> from optimize import peak_force
     >>> (peak_force(until="20 s", spin_up="5 s") < "2 kN").words
@@ -51,18 +51,18 @@ def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float) -> A
 
 @validated
 def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: int = 1) -> Quantity:
-    """Return the time after which a platform's amplitude stays near its final value, s, when the rotor is brought up from rest.
+    """Return the time, s, after which the amplitude of a platform stays near its final value, if the rotor starts from rest.
 
-    The full equations are integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), w the loads' last speed.
+    The full equations are integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), with w the load speed at the end.
 
     **Arguments**
 
-    - `until` and `spin_up` as `peak_force`
+    - `until` and `spin_up`: as for `peak_force`
     - `within`: the largest relative deviation from the final amplitude; typical: 0.02 to 0.1 (default 0.05)
     - `of`: the platform (default: 1)
 
-    **Returns** `Quantity`, whose derivatives are in forward mode; typical: 2 to 20 s after the end of the spin-up. It is
-    `until` if the motion is still changing then.
+    **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 2 to 20 s after the end of the spin-up. It is
+    `until` if the motion has not settled by then.
 
     **Raises** `InputError` for a `within` that is not between 0 and 1.
 

@@ -23,7 +23,7 @@ Pair = int | tuple[int, int] | None
 """Platform of an amplitude, or pair of platforms of a relative amplitude; None: see `between`."""
 
 Tier: TypeAlias = Literal["leading", "exact", "time"]
-"""Method of a quantity: leading order of light loads, the exact periodic motion, or time integration."""
+"""Method by which a quantity is computed: leading order of light loads, the exact periodic motion, or time integration."""
 
 TIERS: tuple[Tier, ...] = ("leading", "exact", "time")
 
@@ -32,7 +32,7 @@ Operand: TypeAlias = "Quantity | Number"
 
 @dataclass(frozen=True)
 class Quantity:
-    """Number of a scene with a name and a unit; quantities can be added, multiplied, compared.
+    """Function of a scene with a scalar value, a name and a unit. Quantities can be added, multiplied and compared.
 
     **Arguments**
 
@@ -42,12 +42,13 @@ class Quantity:
       if the quantity does not exist
     - `mode`: its jam mode, if any; typical: 1, 3, 5
     - `of`: the platform or pair of platforms of its amplitude, if any
+    - `parts`: the quantities from which it is computed, for example the terms of a sum
 
-    Operands of a sum or a comparison must have the same unit. A text such as "50 N" counts as a quantity: `force < "50 N"`,
-    `0.3 * a / "1 mm" + force / "10 N"`. `+ - * / **` of quantities and numbers are quantities; `<` and `>` make a `Demand`.
-    `parts` are the quantities from which one is computed.
+    The operators `+ - * / **` on quantities and numbers give quantities; `<` and `>` give a `Demand`. Operands of a sum or a
+    comparison must have the same unit. A string such as "50 N" can be an operand: `force < "50 N"`,
+    `0.3 * a / "1 mm" + force / "10 N"`.
 
-    **Raises** `InputError` for an argument that is no function of one or two arguments, and for units that do not match.
+    **Raises** `InputError` if `function` is not a function of one or two arguments, and for units that do not match.
 
     >>> import jaxvib as jv
     >>> from optimize import Quantity, foundation_force
@@ -73,7 +74,7 @@ class Quantity:
 
     @validated
     def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
-        """Return the value for a scene, a scalar in `unit`; known jam `modes` save their computation."""
+        """Return the value for a scene, a scalar in `unit`. The jam `modes` of the scene are computed unless they are given."""
         return self.read(Evaluation(scene, modes=modes))
 
     def read(self, evaluation: Evaluation) -> Array:
@@ -84,9 +85,9 @@ class Quantity:
         return jnp.reshape(self.function(evaluation.scene, evaluation.modes), ())
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
-        """Return smooth numbers (p,) in `unit` of which the largest is the quantity, or minus the quantity if `sign` is -1.
+        """Return smooth values (p,) in `unit` whose maximum is `sign` (1 or -1) times the quantity, from an `evaluation`.
 
-        A search may go along the kinks at which two of them, computed from an `evaluation`, are equal.
+        Where two of them are equal, the quantity has a kink, along which a search can move.
         """
         return jnp.reshape(sign * self.read(evaluation), (1,))
 
@@ -101,7 +102,7 @@ class Quantity:
         return any(part.forward_only for part in self.parts)
 
     def at_tier(self, tier: Tier) -> Quantity:
-        """Return the same quantity computed by another `tier`, if it can be.
+        """Return the same quantity computed by another `tier`; unchanged if that tier cannot compute it.
 
         **Raises** `InputError` for an unknown tier.
         """
@@ -110,9 +111,9 @@ class Quantity:
 
     @property
     def easy(self) -> Quantity:
-        """Quantity to leading order and without tolerances, for a first search.
+        """Same quantity to leading order and without tolerances, for a first search.
 
-        That search takes less time, and its best machines are near the final ones.
+        The first search is faster, and its best machines are near the final ones.
         """
         return replace(self, parts=tuple(part.easy for part in self.parts)) if self.parts else self
 
@@ -152,7 +153,7 @@ class Quantity:
             raise InputError(self.name, f"is raised to {quoted(power)}; the power must be a plain number")
         power = number_in(power, "", f"the power of {self.words}")
         unit = f"({self.unit})**{power:g}" if self.unit else ""
-        return _made("**", f"({self.words})^{power:g}", unit, self, _constant(power, ""))
+        return _combine("**", f"({self.words})^{power:g}", unit, self, _constant(power, ""))
 
     def __lt__(self, other: Operand) -> Demand:
         return Demand.of(self, other, "at most")
@@ -166,14 +167,14 @@ class Quantity:
 
 @dataclass(frozen=True)
 class BuiltinQuantity(Quantity):
-    """Quantity of this package, whose function takes an `Evaluation`, the tier and the `settings`."""
+    """Quantity of this package. Its function has the arguments `Evaluation`, tier and `settings`."""
 
     tier: Tier = "leading"
     settings: tuple[object, ...] = ()
     tiers: tuple[Tier, ...] = TIERS
     text: str = ""
-    parted: Callable[..., Array] | None = None
-    """Function of the evaluation, the sign, the tier and the settings that returns its `pieces`."""
+    pieces_function: Callable[..., Array] | None = None
+    """Function that returns the `pieces`, with the arguments evaluation, sign, tier and settings."""
 
     def __post_init__(self) -> None:
         require_one_of(self.tier, TIERS, "tier")
@@ -185,9 +186,9 @@ class BuiltinQuantity(Quantity):
         return jnp.reshape(self.function(evaluation, self.tier, *self.settings), ())
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
-        if self.parted is None:
+        if self.pieces_function is None:
             return super().pieces(evaluation, sign)
-        return self.parted(evaluation, sign, self.tier, *self.settings)
+        return self.pieces_function(evaluation, sign, self.tier, *self.settings)
 
     @property
     def words(self) -> str:
@@ -260,7 +261,7 @@ class Combined(Quantity):
 
 @dataclass(frozen=True)
 class Demand:
-    """Quantity that must be at most, or at least, another one or a value; made by `<` and `>`.
+    """Condition that a quantity is at most, or at least, a value or another quantity.
 
     Returned by `<` and `>` of quantities.
 
@@ -312,9 +313,9 @@ class Demand:
         return replace(self, limit=limit, shown="")
 
     def excess(self, evaluation: Evaluation, constant: Array) -> Array:
-        """Return the violation of the demand in its unit, negative if it is met.
+        """Return the violation of the demand in its unit, negative if it is met, from an `evaluation` of a scene.
 
-        **Arguments**: an `evaluation` of a scene; `constant`: the limit if that is a number.
+        **Arguments**: `constant`: the limit, used if the limit is a number and not a quantity.
         """
         value = self.quantity.read(evaluation)
         limit = constant if self.constant is not None else self.limit.read(evaluation)
@@ -330,7 +331,7 @@ def _constant(value: float, unit: str) -> Combined:
 
 
 def _with_unit(value: Operand, name: str) -> Quantity:
-    """Return a value as a quantity: a number has no unit, a string such as "2 mm" its own, in SI."""
+    """Return a value as a quantity. A number has no unit; a string such as "2 mm" is converted to SI with its own unit."""
     if isinstance(value, Quantity):
         return value
     if isinstance(value, (str, UnitQuantity)):
@@ -339,14 +340,14 @@ def _with_unit(value: Operand, name: str) -> Quantity:
     return _constant(number_in(value, "", f"the value combined with {name}"), "")
 
 
-def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
+def _combine(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
     mode = next((part.mode for part in parts if part.mode is not None), None)
     of = next((part.of for part in parts if part.of is not None), None)
     return Combined(name, unit, mode=mode, of=of, operation=operation, parts=parts)
 
 
 def _term(value: Operand, unit: str, name: str) -> Quantity:
-    """Return an operand of a sum as a quantity; a string is converted to the unit of the other operand, as for a limit."""
+    """Return an operand of a sum as a quantity; a string is converted to the unit of the other operand."""
     if isinstance(value, Quantity) or not isinstance(value, (str, UnitQuantity)):
         return _with_unit(value, name)
     return replace(_constant(number_in(value, unit, f"the value combined with {name}"), unit), name=str(value).strip())
@@ -362,26 +363,26 @@ def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
             f"combines {left.unit or 'no unit'} and {right.unit or 'no unit'}; divide each by a value first, for example "
             f'by "1 {left.unit or right.unit}"',
         )
-    return _made(sign, f"{left.words} {sign} {right.words}", left.unit, left, right)
+    return _combine(sign, f"{left.words} {sign} {right.words}", left.unit, left, right)
 
 
-def _inside(quantity: Quantity) -> str:
+def _bracketed(quantity: Quantity) -> str:
     """Return the name of a quantity, in brackets if a product would be ambiguous without them."""
-    plain = not (isinstance(quantity, Combined) and quantity.operation in "+-")
-    return quantity.words if plain else f"({quantity.words})"
+    is_unambiguous = not (isinstance(quantity, Combined) and quantity.operation in "+-")
+    return quantity.words if is_unambiguous else f"({quantity.words})"
 
 
 def _product(one: Operand, other: Operand) -> Quantity:
     left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
     unit = " ".join(u if " " not in u else f"({u})" for u in (left.unit, right.unit) if u)
-    return _made("*", f"{_inside(left)} * {_inside(right)}", unit, left, right)
+    return _combine("*", f"{_bracketed(left)} * {_bracketed(right)}", unit, left, right)
 
 
 def _ratio(one: Operand, other: Operand) -> Quantity:
     left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
     below = f"({right.unit})" if any(c in right.unit for c in " /*") else right.unit
     unit = "" if same_unit(left.unit, right.unit) else left.unit if not right.unit else f"{left.unit or '1'}/{below}"
-    return _made("/", f"{_inside(left)} / {_inside(right)}", unit, left, right)
+    return _combine("/", f"{_bracketed(left)} / {_bracketed(right)}", unit, left, right)
 
 
 def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
@@ -391,7 +392,7 @@ def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
         if not same_unit(each.unit, quantities[0].unit):
             raise InputError(operation, f"combines {quantities[0].unit or 'no unit'} and {each.unit or 'no unit'}")
     name = f"{operation} of ({'; '.join(q.words for q in quantities)})"
-    return _made(operation, name, quantities[0].unit, *quantities)
+    return _combine(operation, name, quantities[0].unit, *quantities)
 
 
 @validated
@@ -426,7 +427,7 @@ def least(*quantities: Quantity) -> Quantity:
 
 
 def require_quantity(value: object, field: str) -> None:
-    """**Raises** `InputError` if a value is no quantity."""
+    """**Raises** `InputError` if a value is not a `Quantity`."""
     if not isinstance(value, Quantity):
         raise InputError(field, f"is {quoted(value)}; it must be a Quantity, for example foundation_force(mode=3)")
 

@@ -1,4 +1,4 @@
-"""Values from users: functions, units, numbers in a unit."""
+"""Reading of users' functions, units, and numbers with units."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from jaxvib.units.known import require_known
 def arguments(function: Callable[..., object]) -> int:
     """Return the number of required arguments of a function; 1 if it is unknown."""
     try:
-        given = inspect.signature(function).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return 1
-    free = [p for p in given if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    return len(free)
+    required = [p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    return len(required)
 
 
 @lru_cache(maxsize=256)
 def same_unit(one: str, other: str) -> bool:
-    """Return True if two units are the same, for example "N" and "kg m/s^2"; hertz and rad/s are not."""
+    """Return True if two units are the same, for example "N" and "kg m/s^2", but not "Hz" and "rad/s"."""
     if one == other:
         return True
     ratio = unit_ratio(one, other)
@@ -30,7 +30,7 @@ def same_unit(one: str, other: str) -> bool:
 
 
 def number_in(value: Number, unit: str, name: str) -> float:
-    """Return a number, or a string with a unit, in a unit. **Raises** `InputError` as `jaxvib.units.number` does."""
+    """Convert a number, or a string with a unit, to `unit`. **Raises** `InputError` as `jaxvib.units.number` does."""
     found = number(value, unit, name)
     require_known(found, name, "a quantity", "make it outside")
     return float(found)

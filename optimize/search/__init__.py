@@ -1,1 +1,1 @@
-"""Search methods: many starts at once, a descent on optax, sequential quadratic programming, catalogues by branch and bound."""
+"""Search methods: descent from many starts (optax), sequential quadratic programming, branch and bound for catalogues."""

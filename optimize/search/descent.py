@@ -1,4 +1,5 @@
-"""Adam (optax) from many starts at once: along held quantities, with demands by an augmented Lagrangian."""
+"""Descent by Adam (optax) from many starts at once; it keeps held quantities and includes demands by an augmented
+Lagrangian."""
 
 from __future__ import annotations
 
@@ -17,25 +18,26 @@ from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from optimize.search.problem import Point, Problem, derive
 
-STRETCH = 25
+STEPS_PER_CALL = 25
 """Number of steps of the descent in one call of its program."""
 
 _DESCENT_VIOLATION = 0.1
-"""Allowed violation of held quantities during the descent, in which every step corrects the violation of the previous step."""
+"""Largest violation of held quantities that a step of the descent may leave; the next step corrects it."""
 
 _STEPS_PER_UPDATE = 20
 """Number of steps between updates of the multipliers of demands."""
 
 
-class _Lane(NamedTuple):
-    """State of one search: the point, the state of Adam, the step length, multipliers and weight of the demands, the initial
-    size of the objective, and the number of steps."""
+class _SearchState(NamedTuple):
+    """State of one search: the design with its values and derivatives (as in `Point`), the state of Adam, the step length, the
+    multipliers and the weight of the demands, the largest violation of a demand at the last update of the multipliers
+    (`worst`), the initial size of the objective, and the number of steps `taken`."""
 
     z: Array
     values: Array
     slopes: Array
-    known: tuple[Array, ...]
-    known_slopes: tuple[Array, ...]
+    speeds: tuple[Array, ...]
+    speed_slopes: tuple[Array, ...]
     adam: optax.OptState
     length: Array
     multipliers: Array
@@ -56,116 +58,118 @@ class Descended(NamedTuple):
 _ADAM = optax.scale_by_adam()
 
 
-def _least(rows: Array, right: Array) -> Array:
+def _least_norm_solution(rows: Array, right: Array) -> Array:
     """Return the solution x (d,) of least norm of rows (m, d) x = right (m,)."""
     gram = rows @ rows.T
     ridge = jnp.finfo(gram.dtype).eps * (1.0 + jnp.trace(gram))
     return rows.T @ small_solve(gram + ridge * jnp.eye(gram.shape[0]), right)
 
 
-def _along(vector: Array, held: Array, free: Array) -> Array:
+def _project(vector: Array, held: Array, free: Array) -> Array:
     """Project `vector` (d,) onto changes of free parameters that keep the held quantities."""
     vector = vector * free
     if held.shape[0] == 0:
         return vector
     rows = held * free[None, :]
-    return vector - _least(rows, rows @ vector)
+    return vector - _least_norm_solution(rows, rows @ vector)
 
 
 @cached
-def _initial_lanes(point: Any, multipliers: Array) -> _Lane:
-    lane = jax.vmap(_ADAM.init)(point.z)
+def _initial_states(point: Any, multipliers: Array) -> _SearchState:
+    state = jax.vmap(_ADAM.init)(point.z)
     n = point.z.shape[0]
     one = jnp.ones(n)
     size = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
     worst = jnp.full(n, jnp.inf)
-    z, values, slopes, known, known_slopes, *_ = point
-    return _Lane(z, values, slopes, known, known_slopes, lane, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int))
+    z, values, slopes, speeds, speed_slopes, *_ = point
+    return _SearchState(
+        z, values, slopes, speeds, speed_slopes, state, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int)
+    )
 
 
-def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
+def _step(problem: Problem, state: _SearchState, rate: Array) -> tuple[_SearchState, Array]:
     m = problem.equalities
-    off, excess = lane.values[1 : 1 + m], lane.values[1 + m :]
-    held = lane.slopes[1 : 1 + m]
-    pull = jnp.maximum(0.0, lane.multipliers + lane.weight * excess)
-    slope = lane.slopes[0] / lane.size + pull @ lane.slopes[1 + m :]
-    free = jnp.ones_like(lane.z)
+    off, excess = state.values[1 : 1 + m], state.values[1 + m :]
+    held = state.slopes[1 : 1 + m]
+    demand_weights = jnp.maximum(0.0, state.multipliers + state.weight * excess)
+    slope = state.slopes[0] / state.size + demand_weights @ state.slopes[1 + m :]
+    free = jnp.ones_like(state.z)
     for _ in range(2):
-        down = _along(slope, held, free)
-        free = jnp.where(((lane.z <= 0.0) & (down > 0.0)) | ((lane.z >= 1.0) & (down < 0.0)), 0.0, free)
-    move, adam = _ADAM.update(_along(slope, held, free), lane.adam)
-    step = -rate * _along(jnp.asarray(move), held, free)
+        down = _project(slope, held, free)
+        free = jnp.where(((state.z <= 0.0) & (down > 0.0)) | ((state.z >= 1.0) & (down < 0.0)), 0.0, free)
+    move, adam = _ADAM.update(_project(slope, held, free), state.adam)
+    step = -rate * _project(jnp.asarray(move), held, free)
     if m:
-        correction = -_least(held, off)
-        stopped = ((lane.z <= 0.0) & (correction < 0.0)) | ((lane.z >= 1.0) & (correction > 0.0))
-        step = step - _least(held * jnp.where(stopped, 0.0, 1.0)[None, :], off)
-    z = jnp.clip(lane.z + lane.length * step, 0.0, 1.0)
-    near = tuple(_ahead(w, r, z - lane.z) for w, r in zip(lane.known, lane.known_slopes, strict=True))
-    values, slopes, known, known_slopes = derive(problem, z, near)
+        correction = -_least_norm_solution(held, off)
+        stopped = ((state.z <= 0.0) & (correction < 0.0)) | ((state.z >= 1.0) & (correction > 0.0))
+        step = step - _least_norm_solution(held * jnp.where(stopped, 0.0, 1.0)[None, :], off)
+    z = jnp.clip(state.z + state.length * step, 0.0, 1.0)
+    near = tuple(_extrapolate(w, r, z - state.z) for w, r in zip(state.speeds, state.speed_slopes, strict=True))
+    values, slopes, speeds, speed_slopes = derive(problem, z, near)
     finite = jnp.all(jnp.isfinite(values)) & jnp.all(jnp.isfinite(slopes))
     good = finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _DESCENT_VIOLATION) & (rate > 0.0)
 
     def chosen(new: Array, old: Array) -> Array:
         return jnp.where(good, new, old)
 
-    new = (z, values, slopes, known, known_slopes)
-    z, values, slopes, known, known_slopes = jax.tree.map(
-        chosen, new, (lane.z, lane.values, lane.slopes, lane.known, lane.known_slopes)
+    new = (z, values, slopes, speeds, speed_slopes)
+    z, values, slopes, speeds, speed_slopes = jax.tree.map(
+        chosen, new, (state.z, state.values, state.slopes, state.speeds, state.speed_slopes)
     )
-    length = jnp.where(good, jnp.minimum(1.0, 1.2 * lane.length), 0.5 * lane.length)
+    length = jnp.where(good, jnp.minimum(1.0, 1.2 * state.length), 0.5 * state.length)
 
-    update = (lane.taken % _STEPS_PER_UPDATE == _STEPS_PER_UPDATE - 1) & (rate > 0.0)
+    update = (state.taken % _STEPS_PER_UPDATE == _STEPS_PER_UPDATE - 1) & (rate > 0.0)
     excess = values[1 + m :]
-    multipliers = jnp.where(update, jnp.maximum(0.0, lane.multipliers + lane.weight * excess), lane.multipliers)
+    multipliers = jnp.where(update, jnp.maximum(0.0, state.multipliers + state.weight * excess), state.multipliers)
     worst = jnp.max(jnp.maximum(excess, 0.0), initial=0.0)
-    slow = update & (worst > 0.5 * lane.worst) & (worst > 1e-6)
-    weight = jnp.where(slow, jnp.minimum(3.0 * lane.weight, 1e4), lane.weight)
-    lane = _Lane(
-        z, values, slopes, known, known_slopes, adam, length, multipliers, weight,
-        jnp.where(update, worst, lane.worst), lane.size, lane.taken + 1,
+    slow = update & (worst > 0.5 * state.worst) & (worst > 1e-6)
+    weight = jnp.where(slow, jnp.minimum(3.0 * state.weight, 1e4), state.weight)
+    state = _SearchState(
+        z, values, slopes, speeds, speed_slopes, adam, length, multipliers, weight,
+        jnp.where(update, worst, state.worst), state.size, state.taken + 1,
     )  # fmt: skip
-    return lane, values[0]
+    return state, values[0]
 
 
-def _ahead(known: Array, known_slopes: Array, step: Array) -> Array:
-    moved = known + known_slopes @ step
-    return jnp.where(jnp.isfinite(moved) & (jnp.abs(moved / known - 1.0) < 0.2), moved, known)
+def _extrapolate(speeds: Array, speed_slopes: Array, step: Array) -> Array:
+    extrapolated = speeds + speed_slopes @ step
+    return jnp.where(jnp.isfinite(extrapolated) & (jnp.abs(extrapolated / speeds - 1.0) < 0.2), extrapolated, speeds)
 
 
 @cached
-def _stretch(problem: Problem, lanes: _Lane, rates: Array) -> tuple[_Lane, Array]:
-    def step(lanes: _Lane, rate: Array) -> tuple[_Lane, Array]:
-        return jax.vmap(lambda lane: _step(problem, lane, rate))(lanes)
+def _run_steps(problem: Problem, states: _SearchState, rates: Array) -> tuple[_SearchState, Array]:
+    def step(states: _SearchState, rate: Array) -> tuple[_SearchState, Array]:
+        return jax.vmap(lambda state: _step(problem, state, rate))(states)
 
-    lanes, history = jax.lax.scan(step, lanes, rates)
-    return lanes, history.T
+    states, history = jax.lax.scan(step, states, rates)
+    return states, history.T
 
 
-def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Callable[[float, Point], None]) -> Descended:
+def descend(problem: Problem, point: Point, steps: int, rate: float, report: Callable[[float, Point], None]) -> Descended:
     """Descend by Adam from all starts at once; each step keeps the held quantities and corrects their deviations.
 
     Demands are included by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w) with multipliers l_i and the
-    weight w, which are updated every 20 steps. A step to a design without the objective is rejected, and the step length of
-    that start is halved. `tell` is called with the progress (0 to 1) and the point; an interrupt ends the descent.
+    weight w, which are updated every 20 steps. A step to a design for which the objective does not exist is rejected, and the
+    step length of this search is halved. `report` is called with the progress (0 to 1) and the point.
 
     **Returns** `Descended`.
     """
     schedule = optax.cosine_decay_schedule(rate, steps, alpha=0.01)
     rates = np.asarray(jax.jit(schedule)(np.arange(steps)))
-    rates = np.pad(rates, (0, -steps % STRETCH)).reshape(-1, STRETCH)
-    lanes = in_chunks(problem.lanes, _initial_lanes, point, np.zeros((len(point.z), len(problem.demands))))
+    rates = np.pad(rates, (0, -steps % STEPS_PER_CALL)).reshape(-1, STEPS_PER_CALL)
+    states = in_chunks(problem.batch_size, _initial_states, point, np.zeros((len(point.z), len(problem.demands))))
     history: list[np.ndarray] = []
     for k, part in enumerate(rates):
         each = on_device(part)
-        lanes, values = in_chunks(problem.lanes, lambda lane, each=each: _stretch(problem, lane, each), lanes)
+        states, values = in_chunks(problem.batch_size, lambda state, each=each: _run_steps(problem, state, each), states)
         history.append(values)
-        tell((k + 1) / len(rates), _point(lanes))
+        report((k + 1) / len(rates), _point(states))
     values = np.concatenate(history, axis=1)[:, :steps]
-    return Descended(_point(lanes), lanes.multipliers, values.T)
+    return Descended(_point(states), states.multipliers, values.T)
 
 
-def _point(lanes: _Lane) -> Point:
-    """Return the point of the searches, without pieces of the objective."""
-    z, values, slopes = (np.asarray(each) for each in lanes[:3])
+def _point(states: _SearchState) -> Point:
+    """Return the designs of all searches, without pieces of the objective."""
+    z, values, slopes = (np.asarray(each) for each in states[:3])
     nothing = np.zeros((len(z), 0))
-    return Point(z, values, slopes, lanes.known, lanes.known_slopes, nothing, np.zeros((*nothing.shape, z.shape[1])))
+    return Point(z, values, slopes, states.speeds, states.speed_slopes, nothing, np.zeros((*nothing.shape, z.shape[1])))

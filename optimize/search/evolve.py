@@ -1,4 +1,4 @@
-"""CMA-ES: search by values of the objective alone, for objectives with many local minima."""
+"""CMA-ES: a search without derivatives, for objectives with many local minima."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
-from optimize.search.problem import Known, Point, Problem, evaluate, find_speeds
+from optimize.search.problem import Point, Problem, Speeds, evaluate, find_speeds
 
 _VIOLATION_PENALTY = 10.0
-"""Penalty of a demand that is violated by its own size, in typical values of the objective."""
+"""Penalty of a demand that is violated by 100 %, in typical values of the objective."""
 
 _DESIGNS_PER_BATCH = 8
-"""Number of designs in a batch. It is small, since populations are small and few designs lose their jam at a time."""
+"""Number of designs in a batch. It is small because populations are small, and because the jams of only a few designs at a time
+cannot be followed."""
 
-_MAX_KNOWN_DESIGNS = 200
+_MAX_STORED_DESIGNS = 200
 """Number of the latest designs whose jams are stored."""
 
 _POLISHED_DESIGNS = 8
@@ -36,8 +37,12 @@ _MERIT_WITHOUT_OBJECTIVE = 1e12
 
 
 class Evolved(NamedTuple):
-    """Result of an evolution: the best distinct designs (None if no design had the objective), the best objective of each
-    generation (g, 1), the numbers of drawn designs and of those with the objective, and True if it was interrupted."""
+    """Result of an evolution.
+
+    **Attributes**: `point`: the best distinct designs, None if the objective exists for no design; `history` (g, 1): the best
+    objective of each generation; `drawn`: number of random designs; `existing`: number of these for which the objective exists;
+    `interrupted`: True if the user interrupted the search.
+    """
 
     point: Point | None
     history: np.ndarray
@@ -57,53 +62,56 @@ def _evaluate_designs(problem: Problem, z: Array, near: tuple[Array, ...]) -> tu
     return jax.vmap(lambda x, w: problem.values(x, w))(z, near)
 
 
-class Followed:
-    """Values of populations (s, 1 + me + mi), without derivatives. The jams of each design are followed from the nearest of the
-    last designs, or computed from the whole branch if that fails."""
+class PopulationValues:
+    """Values (s, 1 + me + mi) of populations, without derivatives.
+
+    The jams of each design are followed from the nearest of the latest designs. If this fails, they are searched for on the
+    whole branch.
+    """
 
     def __init__(self, problem: Problem):
-        self.problem = replace(problem, lanes=_DESIGNS_PER_BATCH)
-        self.remembered: tuple[np.ndarray, ...] | None = None
+        self.problem = replace(problem, batch_size=_DESIGNS_PER_BATCH)
+        self.latest: tuple[np.ndarray, ...] | None = None
         """Latest designs, and their followed speeds."""
 
     def of(self, z: np.ndarray) -> np.ndarray:
         """Return the values of the designs z (s, d), NaN if a quantity does not exist."""
-        if self.remembered is None:
-            values, known = self._at(z, find_speeds(self.problem, z))
+        if self.latest is None:
+            values, speeds = self._at(z, find_speeds(self.problem, z))
         else:
-            designs, *there = self.remembered
+            designs, *near = self.latest
             nearest = np.argmin(np.sum((z[:, None] - designs[None]) ** 2, axis=2), axis=1)
-            values, known = self._at(z, tuple(each[nearest] for each in there))
-            lost = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
-            if len(lost):
-                values[lost], again = self._at(z[lost], find_speeds(self.problem, z[lost]))
-                for every, some in zip(known, again, strict=True):
-                    every[lost] = some
+            values, speeds = self._at(z, tuple(each[nearest] for each in near))
+            missing = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+            if len(missing):
+                values[missing], again = self._at(z[missing], find_speeds(self.problem, z[missing]))
+                for every, some in zip(speeds, again, strict=True):
+                    every[missing] = some
         good = np.all(np.isfinite(values), axis=1)
         if np.any(good):
-            new = (z[good], *(each[good] for each in known))
-            old = (each[:0] for each in new) if self.remembered is None else self.remembered
-            self.remembered = tuple(np.concatenate(pair)[-_MAX_KNOWN_DESIGNS:] for pair in zip(old, new, strict=True))
+            new = (z[good], *(each[good] for each in speeds))
+            old = (each[:0] for each in new) if self.latest is None else self.latest
+            self.latest = tuple(np.concatenate(pair)[-_MAX_STORED_DESIGNS:] for pair in zip(old, new, strict=True))
         return values
 
-    def _at(self, z: np.ndarray, near: Known) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        values, found = in_chunks(self.problem.lanes, lambda x, w: _evaluate_designs(self.problem, x, w), z, near)
+    def _at(self, z: np.ndarray, near: Speeds) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        values, found = in_chunks(self.problem.batch_size, lambda x, w: _evaluate_designs(self.problem, x, w), z, near)
         return np.array(values), tuple(np.array(each) for each in found)
 
 
-def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float, float], None]) -> Evolved:
-    """Minimize by CMA-ES (Hansen and Ostermeier, Evolutionary Computation 9, 2001; package cma), restarted with twice the
-    population after convergence (Auger and Hansen, IEEE CEC 2005), with at most `evaluations` designs.
+def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[float, float], None]) -> Evolved:
+    """Minimize by CMA-ES (Hansen and Ostermeier, Evolutionary Computation 9, 2001; package cma) with at most `evaluations`
+    designs. After convergence it is restarted with twice the population (Auger and Hansen, IEEE CEC 2005).
 
-    The merit is the scaled objective plus penalties of violated demands. `tell` is called with the progress (0 to 1) and the
+    The merit is the scaled objective plus penalties of violated demands. `report` is called with the progress (0 to 1) and the
     best objective. An interrupt (KeyboardInterrupt) ends the search with its present result.
     """
     import cma  # an optional dependency
 
-    followed, m = Followed(problem), problem.equalities
+    populations, m = PopulationValues(problem), problem.equalities
     merits, designs, history = np.zeros(0), np.zeros((0, problem.space.size)), []
     size, drawn, existing, run, interrupted = np.nan, 0, 0, 0, False
-    # The package fails for a single number; therefore a second one without effect is added.
+    # The package fails for a single free parameter; therefore a second one without effect is added.
     searched = max(problem.space.size, 2)
     population = 4 + int(3 * np.log(searched))
     random = np.random.default_rng(seed)
@@ -115,19 +123,23 @@ def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float,
             while not strategy.stop() and drawn < evaluations:
                 samples = np.clip(np.asarray(strategy.ask()), 0.0, 1.0)
                 z = samples[:, : problem.space.size]
-                values = followed.of(z)
-                there = np.all(np.isfinite(values), axis=1)
-                drawn, existing = drawn + len(z), existing + int(np.sum(there))
-                if np.isnan(size) and np.any(there):
-                    size = max(float(np.median(np.abs(values[there, 0]))), 1e-300)
-                broken = np.sum(np.abs(values[:, 1 : 1 + m]), axis=1) + np.sum(np.maximum(values[:, 1 + m :], 0.0), axis=1)
+                values = populations.of(z)
+                exists = np.all(np.isfinite(values), axis=1)
+                drawn, existing = drawn + len(z), existing + int(np.sum(exists))
+                if np.isnan(size) and np.any(exists):
+                    size = max(float(np.median(np.abs(values[exists, 0]))), 1e-300)
+                total_violation = np.sum(np.abs(values[:, 1 : 1 + m]), axis=1) + np.sum(
+                    np.maximum(values[:, 1 + m :], 0.0), axis=1
+                )
                 merit = np.where(
-                    there, np.nan_to_num(values[:, 0] / size + _VIOLATION_PENALTY * broken), _MERIT_WITHOUT_OBJECTIVE
+                    exists, np.nan_to_num(values[:, 0] / size + _VIOLATION_PENALTY * total_violation), _MERIT_WITHOUT_OBJECTIVE
                 )
                 strategy.tell(list(samples), list(merit))
                 merits, designs = _best(np.concatenate([merits, merit]), np.concatenate([designs, z]))
                 history.append(float(values[np.argmin(merit), 0]))
-                tell(drawn / evaluations, merits[0] * size if len(merits) and merits[0] < _MERIT_WITHOUT_OBJECTIVE else np.nan)
+                report(
+                    drawn / evaluations, merits[0] * size if len(merits) and merits[0] < _MERIT_WITHOUT_OBJECTIVE else np.nan
+                )
             run += 1
     except KeyboardInterrupt:
         interrupted = True

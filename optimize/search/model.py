@@ -7,16 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from optimize.search.problem import Point, Problem, evaluate
-from optimize.search.quadratic import Solved, elastic
+from optimize.search.quadratic import Solved, solve_penalized
 
 _DIFFERENCE_STEP = 1e-5
 """Step of central differences, as a fraction of the range of a free parameter."""
 
 _MIN_SHARE_AT_KINK = 1e-4
-"""Smallest share of a piece of the objective that belongs to a kink."""
+"""Share above which a piece of the objective counts as one of those that meet at a kink."""
 
 _SMALL_OBJECTIVE_SHARE = 1e-4
-"""Smallest scale of the objective, as a fraction of its change over the bounds by its slope."""
+"""Smallest scale of the objective, relative to the change over the bounds that its slope predicts."""
 
 
 class Step(NamedTuple):
@@ -53,8 +53,13 @@ def _pieces(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray]:
 
 
 def kink_residuals(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return differences (s, k) between pieces of the objective with `shares` (s, parts) and the piece with the largest share,
-    in units of `size` (s,), and their derivatives (s, k, d); 0 for pieces without a share."""
+    """Return the residuals of the condition that pieces of the objective are equal at a kink.
+
+    **Arguments**: `shares` (s, parts): shares of the pieces; `size` (s,): unit of the objective.
+
+    **Returns** the differences (s, k) between the other pieces and the piece with the largest share, in units of `size`, and
+    their derivatives (s, k, d); both are 0 for pieces without a share.
+    """
     most = np.argsort(-shares, axis=1)[:, : point.z.shape[1] + 1]
     values, met = (np.take_along_axis(a, most, axis=1) for a in (point.pieces, shares > _MIN_SHARE_AT_KINK))
     piece_gradients = np.take_along_axis(point.piece_gradients, most[:, :, None], axis=1)
@@ -66,9 +71,9 @@ def kink_residuals(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[
 def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return derivatives at a kink of the objective.
 
-    **Returns** the derivatives (s, d) of the largest piece; the differences (s, k, d) of the derivatives of the next largest
-    pieces from these; and True (s, k) for pieces that are as large within `near`, relative to the objective or to its change
-    over the bounds.
+    **Returns** the derivatives (s, d) of the largest piece; for the next largest pieces, the derivatives (s, k, d) minus those
+    of the largest piece; and True (s, k) for pieces that equal the largest one within `near`, relative to the objective or to
+    its change over the bounds.
     """
     order = np.argsort(-point.pieces, axis=1)[:, : point.z.shape[1] + 1]
     values = np.take_along_axis(point.pieces, order, axis=1)
@@ -78,14 +83,16 @@ def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def second_derivatives(problem: Problem, point: Point) -> np.ndarray:
-    """Return second derivatives (s, d, me + mi + parts + 1, d) of held quantities, demands, pieces of the objective, and half
-    the square of the objective, by central differences of first derivatives."""
+    """Return second derivatives (s, d, me + mi + parts + 1, d) by central differences of first derivatives.
+
+    They are those of held quantities, demands, pieces of the objective, and half the square of the objective, in this order.
+    """
     s, d = point.z.shape
     moves = _DIFFERENCE_STEP * np.concatenate([np.eye(d), -np.eye(d)])
     # All points in one call, so that chunks are full and every core has work.
     around = point.take(np.tile(np.arange(s), 2 * d))
     z = around.z + np.repeat(moves, s, axis=0)
-    there = evaluate(problem, z, around.ahead(z))
+    there = evaluate(problem, z, around.extrapolate_speeds(z))
     rows = np.concatenate(
         [there.slopes[:, 1:], _pieces(problem, there)[1], (there.values[:, :1] * there.slopes[:, 0])[:, None]], axis=1
     )
@@ -98,13 +105,13 @@ def curvatures(
 ) -> list[np.ndarray]:
     """Return second derivatives (s, d, d) of the Lagrangian, in units of the objective, made positive semidefinite.
 
-    They are projected onto the directions that active constraints and pieces leave free; in the other directions the linear
-    model determines the step. If the objective f is positive, a second set has (f^2/2)''/f in place of f''. If f is the modulus
-    of an almost linear quantity, such as a force that is to vanish, the step of the second set reaches the zero at once, while
-    the step of f'' reaches it only from nearby.
+    They are projected onto the directions in which active constraints and pieces do not determine the step; in the other
+    directions the linear model determines it. If the objective f is positive, a second set is returned, with (f^2/2)''/f in
+    place of f''. It is better if f is the modulus of an almost linear quantity, for example a force that should vanish: its
+    step then leads to the zero at once, whereas the step with f'' does so only from nearby.
 
-    **Arguments**: `second`: see `second_derivatives`; multipliers `weights` (s, me + mi) in units of the objective's `size`
-    (s,); `shares` (s, parts) of its pieces.
+    **Arguments**: `second`: see `second_derivatives`; `weights` (s, me + mi): multipliers, in units of the objective's `size`
+    (s,); `shares` (s, parts) of the pieces of the objective.
     """
     s, d = point.z.shape
     m = problem.equalities
@@ -127,8 +134,8 @@ def curvatures(
         return [_positive(projector, hessian)]
     with np.errstate(all="ignore"):  # not defined for an objective of 0
         other = constraints + second[:, :, -1] / (size * value)[:, None, None]
-    apt = usable & (value > 0.0)[:, None, None] & np.all(np.isfinite(other), axis=(1, 2), keepdims=True)
-    return [_positive(projector, hessian), _positive(projector, np.where(apt, other, hessian))]
+    is_usable_square = usable & (value > 0.0)[:, None, None] & np.all(np.isfinite(other), axis=(1, 2), keepdims=True)
+    return [_positive(projector, hessian), _positive(projector, np.where(is_usable_square, other, hessian))]
 
 
 def _positive(projector: np.ndarray, hessian: np.ndarray) -> np.ndarray:
@@ -142,39 +149,40 @@ def _positive(projector: np.ndarray, hessian: np.ndarray) -> np.ndarray:
 def solve_model(
     problem: Problem, point: Point, hessian: np.ndarray, size: np.ndarray, penalty: np.ndarray, trust_radius: np.ndarray
 ) -> Step:
-    """Solve for the step to the minimum of the model within the bounds and the trust region of radius `trust_radius` (s,).
+    """Return the step to the minimum of the model within the bounds and the trust region of radius `trust_radius` (s,).
 
-    If the objective is the maximum of several pieces, the problem is that of the epigraph: the least t that no piece exceeds.
+    If the objective is the maximum of several pieces, an additional unknown t is minimized such that no piece exceeds t
+    (epigraph form).
     """
     m, mi, d = problem.equalities, len(problem.demands), point.z.shape[1]
     box = np.maximum(-point.z, -trust_radius[:, None]), np.minimum(1.0 - point.z, trust_radius[:, None])
     held = point.slopes[:, 1 : 1 + m], point.values[:, 1 : 1 + m]
     demands = point.slopes[:, 1 + m :], point.values[:, 1 + m :]
     if problem.parts == 1:
-        found = elastic(hessian, point.slopes[:, 0] / size[:, None], held, demands, box, penalty)
+        found = solve_penalized(hessian, point.slopes[:, 0] / size[:, None], held, demands, box, penalty)
         return Step(found.p, found.held, found.demands * _active(found, demands), np.ones((len(hessian), 1)))
     values = (point.pieces - point.values[:, :1]) / size[:, None]
     slopes = point.piece_gradients / size[:, None, None]
-    # Only pieces that can become the largest in the trust region count, and not many more than can meet at one kink.
-    could = values + np.einsum("spd,sd->sp", np.abs(slopes), np.maximum(-box[0], box[1]))
-    few = np.argsort(-could, axis=1)[:, : 3 * d + 8]
-    values = np.take_along_axis(values, few, axis=1)
-    slopes = np.take_along_axis(slopes, few[:, :, None], axis=1)
+    # Only the pieces that can become largest in the trust region are used, and not many more than can meet at one kink.
+    reachable = values + np.einsum("spd,sd->sp", np.abs(slopes), np.maximum(-box[0], box[1]))
+    candidates = np.argsort(-reachable, axis=1)[:, : 3 * d + 8]
+    values = np.take_along_axis(values, candidates, axis=1)
+    slopes = np.take_along_axis(slopes, candidates[:, :, None], axis=1)
 
-    def beside(rows: np.ndarray, of_t: float) -> np.ndarray:
+    def with_t(rows: np.ndarray, of_t: float) -> np.ndarray:
         return np.concatenate([rows, np.full((*rows.shape[:2], 1), of_t)], axis=2)
 
-    wide = 1.0 + 2.0 * np.max(np.abs(could), axis=1, keepdims=True)
-    found = elastic(
+    limit_of_t = 1.0 + 2.0 * np.max(np.abs(reachable), axis=1, keepdims=True)
+    found = solve_penalized(
         np.pad(hessian, ((0, 0), (0, 1), (0, 1))),
         np.concatenate([np.zeros((len(hessian), d)), np.ones((len(hessian), 1))], axis=1),
-        (beside(held[0], 0.0), held[1]),
-        (np.concatenate([beside(demands[0], 0.0), beside(slopes, -1.0)], axis=1), np.concatenate([demands[1], values], axis=1)),
-        (np.concatenate([box[0], -wide], axis=1), np.concatenate([box[1], wide], axis=1)),
+        (with_t(held[0], 0.0), held[1]),
+        (np.concatenate([with_t(demands[0], 0.0), with_t(slopes, -1.0)], axis=1), np.concatenate([demands[1], values], axis=1)),
+        (np.concatenate([box[0], -limit_of_t], axis=1), np.concatenate([box[1], limit_of_t], axis=1)),
         penalty,
     )
     shares = np.zeros_like(point.pieces)
-    np.put_along_axis(shares, few, found.demands[:, mi:], axis=1)
+    np.put_along_axis(shares, candidates, found.demands[:, mi:], axis=1)
     shares = shares / np.maximum(np.sum(shares, axis=1, keepdims=True), 1e-300)
     return Step(found.p[:, :d], found.held, found.demands[:, :mi] * _active(found, demands), shares)
 
@@ -185,19 +193,19 @@ def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray
     An interior-point method leaves small multipliers of inactive demands, which are not small relative to an objective near 0.
     """
     slopes, excess = demands
-    room = -excess - np.einsum("smd,sd->sm", slopes, found.p[:, : slopes.shape[2]])
-    return found.demands[:, : excess.shape[1]] > room
+    slack = -excess - np.einsum("smd,sd->sm", slopes, found.p[:, : slopes.shape[2]])
+    return found.demands[:, : excess.shape[1]] > slack
 
 
 def predicted_decrease(problem: Problem, point: Point, hessian: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
-    """Return the decrease of the objective that the model predicts, relative to the objective or, if that is about 0, to its
-    change over the bounds."""
+    """Return the decrease of the objective that the model predicts, relative to the objective; if the objective is about 0,
+    relative to its change over the bounds."""
     values, slopes = _pieces(problem, point)
-    along = np.max(values - point.values[:, :1] + np.einsum("spd,sd->sp", slopes, model.p), axis=1)
+    linear_change = np.max(values - point.values[:, :1] + np.einsum("spd,sd->sp", slopes, model.p), axis=1)
     dual = np.concatenate([model.held, model.demands], axis=1) * size[:, None]
     constraint_change = np.einsum("sm,smd,sd->s", dual, point.slopes[:, 1:], model.p)
     curved = np.einsum("si,sij,sj->s", model.p, hessian, model.p) * size
-    # At the zero of a modulus slopes give no scale, but their change does.
+    # At the zero of a modulus the slopes vanish; their change then defines the scale.
     change = np.max(np.abs(slopes), axis=(1, 2)) + _DIFFERENCE_STEP * np.trace(hessian, axis1=1, axis2=2) * size
     least = np.maximum(np.abs(point.values[:, 0]), _SMALL_OBJECTIVE_SHARE * change)
-    return np.abs(along + constraint_change + 0.5 * curved) / np.maximum(least, 1e-300)
+    return np.abs(linear_change + constraint_change + 0.5 * curved) / np.maximum(least, 1e-300)

@@ -25,8 +25,8 @@ FEASIBILITY_TOLERANCE = 1e-8
 """Largest violation of held quantities and demands of a final design, relative to their values."""
 
 _UNREACHABLE_DECREASE = 1e-10
-"""Predicted relative decrease that counts as zero if no step achieves it. It is the rounding error of derivatives of exact
-motions."""
+"""Predicted relative decrease of the objective that counts as zero if no step achieves it. Rounding errors of the derivatives
+of exact motions have this size."""
 
 _HIDDEN_DECREASE, _ROUNDING = 1e-13, 1e-15
 """Relative decrease of the objective that rounding can hide, and relative rounding error of the objective."""
@@ -61,13 +61,13 @@ class Optimality(NamedTuple):
 class Polished(NamedTuple):
     """Results of searches.
 
-    **Attributes**: the final `point`; `history` (steps, starts) of the objective; `left`: predicted relative decrease that
-    remains; the largest `violation`; the `optimality`.
+    **Attributes**: the final `point`; `history` (steps, starts) of the objective; `remaining_decrease` of the objective that
+    the model still predicts, relative; the largest `violation`; the `optimality`.
     """
 
     point: Point
     history: np.ndarray
-    left: np.ndarray
+    remaining_decrease: np.ndarray
     violation: np.ndarray
     optimality: Optimality
 
@@ -83,9 +83,9 @@ def violation(problem: Problem, point: Point) -> np.ndarray:
 def restore(
     problem: Problem, point: Point, steps: int, demanded: np.ndarray | None = None, shares: np.ndarray | None = None
 ) -> Point:
-    """Move designs by the smallest change, to first order, onto their constraints inside the bounds.
+    """Change designs as little as possible, to first order, so that they meet their constraints within the bounds.
 
-    The constraints are the held quantities, the demands that are exceeded or marked in `demanded` (s, mi), and equal values of
+    The constraints are the held quantities, the demands that are violated or marked in `demanded` (s, mi), and the equality of
     those pieces of the objective whose weight in `shares` (s, pieces) is not 0.
     """
     m, mi = problem.equalities, len(problem.demands)
@@ -104,13 +104,15 @@ def restore(
             gap, piece_gradients = kink_residuals(point, shares, np.maximum(np.abs(point.values[:, 0]), 1e-300))
             slopes, values = np.concatenate([slopes, piece_gradients], axis=1), np.concatenate([values, gap], axis=1)
         z = _least_change(point.z, slopes, values, most=0.3)
-        point = evaluate(problem, z, point.ahead(z))
+        point = evaluate(problem, z, point.extrapolate_speeds(z))
     return point
 
 
 def _least_change(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, most: float = np.inf) -> np.ndarray:
-    """Move designs z (s, d) by the smallest change to the linearized zeros of `values` (s, m) with `slopes` (s, m, d), inside
-    the bounds and each number by at most `most`."""
+    """Return the nearest designs to z (s, d), within the bounds, at which the linearized `values` (s, m) vanish.
+
+    **Arguments**: `slopes` (s, m, d): derivatives of the values; `most`: largest change of each entry of z.
+    """
     wanted = -least_norm(slopes, values)
     stopped = ((z <= 0.0) & (wanted < 0.0)) | ((z >= 1.0) & (wanted > 0.0))
     step = -least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values)
@@ -124,7 +126,7 @@ class Starts(NamedTuple):
 
     - `point`: all initial designs, or None
     - `drawn`: number of random designs; `existing`: number of those for which the objective exists
-    - `nearest`: designs that could not be moved onto the held quantities, at most the requested number, or None
+    - `nearest`: designs that do not have the held values, at most the requested number, or None
     """
 
     point: Point | None
@@ -134,17 +136,23 @@ class Starts(NamedTuple):
 
 
 def draw_starts(
-    problem: Problem, starts: int, seed: int, look: Callable[[Problem, np.ndarray], tuple[np.ndarray, ...]], rounds: int = 20
+    problem: Problem,
+    starts: int,
+    seed: int,
+    speeds_of: Callable[[Problem, np.ndarray], tuple[np.ndarray, ...]],
+    rounds: int = 20,
 ) -> Starts:
-    """Draw random designs in the bounds and move them onto the held quantities; repeat for designs for which the objective
-    does not exist."""
+    """Draw random designs within the bounds, and change them until the held quantities have their values.
+
+    Further designs are drawn in place of those for which the objective does not exist.
+    """
     random = np.random.default_rng(seed)
     kept: list[Point] = []
     others: list[Point] = []
     drawn = existing = 0
     while sum(len(p.z) for p in kept) < starts and drawn < rounds * starts:
         z = random.uniform(size=(starts, problem.space.size))
-        point = evaluate(problem, z, look(problem, z))
+        point = evaluate(problem, z, speeds_of(problem, z))
         drawn += starts
         point = point.take(np.flatnonzero(point.exists()))
         existing += len(point.z)
@@ -173,7 +181,7 @@ def _onto_held(problem: Problem, point: Point) -> Point:
         slopes = np.where(finite[:, None, None], point.slopes, 0.0)[:, 1 : 1 + m]
         values = np.where(finite[:, None], point.values, 0.0)[:, 1 : 1 + m]
         z = _least_change(point.z, slopes, values)
-        point = evaluate(problem, z, point.ahead(z))
+        point = evaluate(problem, z, point.extrapolate_speeds(z))
     return point
 
 
@@ -184,7 +192,7 @@ def _concatenated(points: list[Point]) -> Point | None:
     return jax.tree.map(lambda *each: np.concatenate(each), *points)
 
 
-def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Point], None]) -> Polished:
+def polish(problem: Problem, point: Point, steps: int, report: Callable[[float, Point], None]) -> Polished:
     """Minimize by sequential quadratic programming with a trust region (S l1 QP: Fletcher, Practical Methods of Optimization,
     14.4), from all starts at once.
 
@@ -192,7 +200,7 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
     violation does not vanish at the largest penalty, the constraints contradict each other.
     """
     if problem.parts > 1:  # the descent does not compute the pieces of the objective
-        point = evaluate(problem, point.z, point.known)
+        point = evaluate(problem, point.z, point.speeds)
     size = np.maximum(np.abs(point.values[:, 0]), 1e-9 * np.max(np.abs(point.slopes[:, 0]), axis=1))
     size = np.where(size > 0.0, size, 1.0)
     penalty, trust_radius = np.full(len(point.z), 10.0), np.full(len(point.z), 0.2)
@@ -203,7 +211,7 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
     second = np.zeros((len(point.z), point.z.shape[1], multipliers.shape[1] + problem.parts + 1, point.z.shape[1]))
     active = point.exists()
     changed = active.copy()
-    left = np.full(len(point.z), np.inf)
+    remaining_decrease = np.full(len(point.z), np.inf)
     history = [point.values[:, 0]]
     for k in range(steps + 1):
         index = np.flatnonzero(active)
@@ -217,19 +225,19 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             ]
             model = models[0]
             decreases = [predicted_decrease(problem, here, b, m, size[index]) for b, m in zip(hessians, models, strict=True)]
-            left[index] = np.minimum(decreases[0], decreases[-1])
+            remaining_decrease[index] = np.minimum(decreases[0], decreases[-1])
             dual = np.concatenate([model.held, model.demands], axis=1)
             # A constraint whose penalty is below its multiplier stays violated although it could be met.
-            short = np.max(np.abs(dual), axis=1, initial=0.0) > 0.9 * penalty[index]
-            penalty[index] = np.where(short, np.minimum(10.0 * penalty[index], _MAX_PENALTY), penalty[index])
+            penalty_is_small = np.max(np.abs(dual), axis=1, initial=0.0) > 0.9 * penalty[index]
+            penalty[index] = np.where(penalty_is_small, np.minimum(10.0 * penalty[index], _MAX_PENALTY), penalty[index])
             if k == steps:
                 break
-            tried = [_trial_point(problem, here, each, size[index], penalty[index]) for each in models]
-            merits = [_merit(problem, each, size[index], penalty[index]) for each in tried]
+            trials = [_trial_point(problem, here, each, size[index], penalty[index]) for each in models]
+            merits = [_merit(problem, each, size[index], penalty[index]) for each in trials]
             first = merits[0] <= merits[-1]
-            new, new_merit = tried[0].where(first, tried[-1]), np.minimum(merits[0], merits[-1])
+            new, new_merit = trials[0].where(first, trials[-1]), np.minimum(merits[0], merits[-1])
             merit = _merit(problem, here, size[index], penalty[index])
-            better = _is_better(problem, here, new, merit, new_merit, left[index])
+            better = _is_better(problem, here, new, merit, new_merit, remaining_decrease[index])
             point = point.put(index, new.where(better, here))
             step = np.max(np.abs(np.where(first[:, None], models[0].p, models[-1].p)), axis=1)
             radius = trust_radius[index]
@@ -238,23 +246,31 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             multipliers[index] = np.clip(dual, -1e6, 1e6)
             shares[index] = model.shares
             least = violation(problem, here) < 1e-10
-            at_rest = least & ~short & ((left[index] < _HIDDEN_DECREASE) | (~better & (left[index] < _UNREACHABLE_DECREASE)))
+            at_rest = (
+                least
+                & ~penalty_is_small
+                & (
+                    (remaining_decrease[index] < _HIDDEN_DECREASE)
+                    | (~better & (remaining_decrease[index] < _UNREACHABLE_DECREASE))
+                )
+            )
             active[index] = ~(at_rest | (~better & (trust_radius[index] <= 1e-9)))
             changed = np.zeros_like(active)
             changed[index] = better & active[index]
         history.append(point.values[:, 0])
-        tell(min(k + 1, steps) / max(steps, 1), point)
-    return Polished(point, np.asarray(history), left, violation(problem, point), optimality(problem, point))
+        report(min(k + 1, steps) / max(steps, 1), point)
+    return Polished(point, np.asarray(history), remaining_decrease, violation(problem, point), optimality(problem, point))
 
 
 def _is_better(
-    problem: Problem, here: Point, new: Point, merit: np.ndarray, new_merit: np.ndarray, left: np.ndarray
+    problem: Problem, here: Point, new: Point, merit: np.ndarray, new_merit: np.ndarray, remaining_decrease: np.ndarray
 ) -> np.ndarray:
-    """Return True for designs whose step is accepted; `left` is the decrease of the objective that their models predict."""
+    """Return True for designs whose step is accepted; `remaining_decrease` is the decrease of the objective that their models
+    predict."""
     kept = violation(problem, new) < np.maximum(FEASIBILITY_TOLERANCE, violation(problem, here))
     better = new_merit < merit
-    # The last step converges quadratically: rounding hides the decrease of the objective, but slopes are still exact.
-    better |= kept & (left < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
+    # The last step converges quadratically: rounding hides the decrease of the objective, but derivatives are still exact.
+    better |= kept & (remaining_decrease < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
     better |= kept & (violation(problem, here) > FEASIBILITY_TOLERANCE) & new.exists()
     return better
 
@@ -265,9 +281,9 @@ def _initial_multipliers(problem: Problem, point: Point) -> np.ndarray:
 
 
 def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, penalty: np.ndarray) -> Point:
-    """Return the point after a step, or that point moved back onto the active constraints and kinks if it is better."""
+    """Return the point after a step, or, if it is better, the nearest point that meets the active constraints and kinks."""
     z = np.clip(point.z + model.p, 0.0, 1.0)
-    new = evaluate(problem, z, point.ahead(z))
+    new = evaluate(problem, z, point.extrapolate_speeds(z))
     active = model.demands > 1e-6
     restored = restore(problem, new, 2, active)
     as_feasible = restored.exists() & (violation(problem, restored) <= violation(problem, new))
@@ -280,9 +296,11 @@ def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, 
 
 def _merit(problem: Problem, point: Point, size: np.ndarray, penalty: np.ndarray) -> np.ndarray:
     m = problem.equalities
-    broken = np.sum(np.abs(point.values[:, 1 : 1 + m]), axis=1) + np.sum(np.maximum(point.values[:, 1 + m :], 0.0), axis=1)
-    broken = np.where(broken < 1e-12, 0.0, broken)
-    return np.where(point.exists(), point.values[:, 0] / size + penalty * broken, np.inf)
+    total_violation = np.sum(np.abs(point.values[:, 1 : 1 + m]), axis=1) + np.sum(
+        np.maximum(point.values[:, 1 + m :], 0.0), axis=1
+    )
+    total_violation = np.where(total_violation < 1e-12, 0.0, total_violation)
+    return np.where(point.exists(), point.values[:, 0] / size + penalty * total_violation, np.inf)
 
 
 def optimality(problem: Problem, point: Point) -> Optimality:

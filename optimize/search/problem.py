@@ -1,7 +1,7 @@
 """Numerical form of a search: values and derivatives of many designs at once, with jams followed between designs.
 
-Only the evaluation of a chunk of designs and a stretch of the descent (`descent`) are compiled; chunks run in parallel on all
-cores.
+Two functions are compiled: the evaluation of a chunk of designs, and a number of steps of the descent (`descent`). Chunks run
+in parallel on all cores.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ _CHUNK = 64
 """Number of designs in a batch on a core."""
 
 _ROUNDING_SHARE = 1e-9
-"""Relative size, compared with other designs, below which a value of a quantity is a rounding error of 0."""
+"""Value of a quantity, relative to its values for other designs, below which it counts as 0 with a rounding error."""
 
-Known = tuple[Any, ...]
-"""Load speeds near which jams are followed, an array with a leading axis over the designs for each key."""
+Speeds = tuple[Any, ...]
+"""Load speeds near which jams are searched for: for each key, an array with a leading axis over the designs."""
 
 
 class Problem(eqx.Module):
     """Design space with an objective and demands.
 
     **Attributes**: `space`; `objective`; `demands`: the forms of the demands; `constants` (mi,): their limits if these are
-    numbers; `keys` of the followed speeds; `scales` (mi,): the units of the demands, positive; `lanes`: the number of designs
-    in a batch; `parts`: the number of smooth pieces whose maximum is the objective.
+    numbers; `keys` of the followed speeds; `scales` (mi,): the units of the demands, positive; `batch_size`: the number of
+    designs in a batch; `parts`: the number of smooth pieces whose maximum is the objective.
     """
 
     space: DesignSpace
@@ -50,7 +50,7 @@ class Problem(eqx.Module):
     keys: tuple[Key, ...] = eqx.field(static=True)
     constants: Array | np.ndarray
     scales: Array | np.ndarray
-    lanes: int = eqx.field(static=True, default=_CHUNK)
+    batch_size: int = eqx.field(static=True, default=_CHUNK)
     parts: int = eqx.field(static=True, default=1)
 
     @property
@@ -59,8 +59,8 @@ class Problem(eqx.Module):
         return len(self.space.held)
 
     def values(self, z: Array, near: Sequence[Array], pieces: bool = False) -> tuple[Array, tuple[Array, ...]]:
-        """Return the objective, deviations of held quantities and excess of demands, (1 + me + mi,), followed by the `pieces`
-        of the objective if requested; and the followed speeds."""
+        """Return the values (1 + me + mi,) of the objective, deviations of held quantities and excesses of demands, with the
+        `pieces` of the objective appended if requested; and the followed speeds."""
         evaluation = Evaluation(self.space.at(z), dict(zip(self.keys, near, strict=True)))
         values = self.read(evaluation)
         if pieces:
@@ -68,15 +68,18 @@ class Problem(eqx.Module):
         return values, tuple(evaluation.found[key] for key in self.keys)
 
     def read(self, evaluation: Evaluation) -> Array:
-        """Return the numbers of `values` from an evaluation of a scene."""
+        """Return the objective, deviations of held quantities and excesses of demands from an evaluation of a scene."""
         objective = jnp.reshape(self.objective.read(evaluation), (1,))
         held = self.space.residuals(evaluation)
         excess = [demand.excess(evaluation, limit) for demand, limit in zip(self.demands, self.constants, strict=True)]
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
     def easy(self) -> Problem | None:
-        """Return the problem of the first search: to leading order, without tolerances, and without demands that have no
-        leading order. None if it is the same problem, or if the objective has no leading order."""
+        """Return the problem of the first search: quantities to leading order and without tolerances.
+
+        Demands on quantities without a leading order are omitted. None if it is the same problem, or if the objective has no
+        leading order.
+        """
         objective = self.objective.easy
         demands = [replace(d, quantity=d.quantity.easy, limit=d.limit.easy) for d in self.demands]
         held = tuple(HeldQuantity(h.quantity.easy, h.value) for h in self.space.held)
@@ -89,7 +92,7 @@ class Problem(eqx.Module):
         space = eqx.tree_at(lambda s: s.held, self.space, held)
         forms, index = tuple(demands[k] for k in kept), np.asarray(kept, int)
         keys, parts = _keys_and_parts(space, objective, forms)
-        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.lanes, parts)
+        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.batch_size, parts)
 
     @property
     def forward_only(self) -> bool:
@@ -113,15 +116,15 @@ class Point(NamedTuple):
     """Designs with their values and derivatives.
 
     **Attributes**: designs `z` (s, d); `values` (s, 1 + me + mi) and their derivatives `slopes` (s, 1 + me + mi, d); the
-    followed speeds `known` and their derivatives by z, `known_slopes` (s, ..., d); the objective's `pieces` (s, p) and their
+    followed speeds `speeds` and their derivatives by z, `speed_slopes` (s, ..., d); the objective's `pieces` (s, p) and their
     derivatives `piece_gradients` (s, p, d), empty for an objective of one piece.
     """
 
     z: np.ndarray
     values: np.ndarray
     slopes: np.ndarray
-    known: Known
-    known_slopes: Known
+    speeds: Speeds
+    speed_slopes: Speeds
     pieces: np.ndarray
     piece_gradients: np.ndarray
 
@@ -147,20 +150,21 @@ class Point(NamedTuple):
 
         return jax.tree.map(one, self, new)
 
-    def ahead(self, z: np.ndarray) -> Known:
-        """Extrapolate the followed speeds to other designs."""
+    def extrapolate_speeds(self, z: np.ndarray) -> Speeds:
+        """Extrapolate the followed speeds linearly to other designs."""
         step = z - self.z
         guess = []
-        for k, r in zip(self.known, self.known_slopes, strict=True):
-            moved = k + np.einsum("s...d,sd->s...", r, step)
-            guess.append(np.where(np.isfinite(moved) & (np.abs(moved / k - 1.0) < 0.2), moved, k))
+        for k, r in zip(self.speeds, self.speed_slopes, strict=True):
+            extrapolated = k + np.einsum("s...d,sd->s...", r, step)
+            guess.append(np.where(np.isfinite(extrapolated) & (np.abs(extrapolated / k - 1.0) < 0.2), extrapolated, k))
         return tuple(guess)
 
 
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
     """Return the problem of a search with its followed speeds and the scale of each demand.
 
-    The scale is the limit of the demand, or its value at the beginning; it is 1 if both are 0 within rounding.
+    The scale is the limit of the demand, or, if that is 0, its value for the initial design; it is 1 if both are 0 within
+    rounding.
     """
     forms = tuple(demand.form() for demand in demands)
     keys, parts = _keys_and_parts(space, objective, forms)
@@ -169,13 +173,14 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
     if np.any(scales == 0.0):
         found = _sizes(space, tuple(q for d in demands for q in (d.quantity, d.limit))).reshape(-1, 2).max(axis=1)
         scales = np.where(scales > 0.0, scales, np.where(np.isfinite(found) & (found > 0.0), found, 1.0))
-    return Problem(space, objective, forms, keys, constants, scales, _lanes(starts), parts)
+    return Problem(space, objective, forms, keys, constants, scales, _batch_size(starts), parts)
 
 
 def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
-    """Return the modulus of each quantity (q,) at the beginning; 0 if it is negligible beside its change over the bounds."""
+    """Return the modulus of each quantity (q,) for the initial design; 0 if it is negligible beside its change over the
+    bounds."""
     z = np.random.default_rng(0).uniform(size=(7, space.size))
-    scenes = _made(space, on_device(space.numbers(z)))
+    scenes = _scenes_of(space, on_device(space.numbers(z)))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, scenes)
     values = np.abs(evaluate_quantities(quantities, batch))
     largest = np.max(values, axis=0, initial=0.0, where=np.isfinite(values))
@@ -185,7 +190,10 @@ def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
 def derive(
     problem: Problem, z: Array, near: Sequence[Array], pieces: bool = False
 ) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
-    """Return values, derivatives, followed speeds and their derivatives of one design, with its `pieces` last if requested."""
+    """Return values, derivatives, followed speeds and their derivatives of one design.
+
+    If `pieces` is True, the pieces of the objective are the last values.
+    """
 
     def twice(x: Array) -> tuple[tuple[Array, tuple[Array, ...]], tuple[Array, tuple[Array, ...]]]:
         values, found = problem.values(x, near, pieces)
@@ -193,11 +201,11 @@ def derive(
 
     rows = 1 + problem.equalities + len(problem.demands) + (problem.parts if pieces else 0)
     if z.shape[0] <= 4 * rows or problem.forward_only:
-        (slopes, known_slopes), (values, found) = jax.jacfwd(twice, has_aux=True)(z)
+        (slopes, speed_slopes), (values, found) = jax.jacfwd(twice, has_aux=True)(z)
     else:
         slopes, (values, found) = jax.jacrev(lambda x: (twice(x)[0][0], twice(x)[1]), has_aux=True)(z)
-        known_slopes = tuple(jnp.zeros((*w.shape, z.shape[0])) for w in found)
-    return values, slopes, found, known_slopes
+        speed_slopes = tuple(jnp.zeros((*w.shape, z.shape[0])) for w in found)
+    return values, slopes, found, speed_slopes
 
 
 @cached
@@ -226,43 +234,43 @@ def _speeds_of_branches(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ..
 
         return tuple(guess(path, target) for path, target in keys)
 
-    # One scene after the other, which compiles in two thirds of the time and runs equally fast.
+    # One scene after the other: this compiles in two thirds of the time and runs equally fast.
     return jax.lax.map(one, scenes)
 
 
 @cached
-def _made(space: DesignSpace, numbers: Array) -> Scene:
+def _scenes_of(space: DesignSpace, numbers: Array) -> Scene:
     return jax.vmap(space.scene_of)(numbers)
 
 
-def _lanes(count: int) -> int:
+def _batch_size(count: int) -> int:
     return min(_CHUNK, 1 << max(count - 1, 0).bit_length())
 
 
-def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
-    """Return values and derivatives of many designs whose jams are near these speeds."""
+def evaluate(problem: Problem, z: np.ndarray, near: Speeds) -> Point:
+    """Return values and derivatives of designs z (s, d), whose jams are searched for near the load speeds `near`."""
     if len(z) == 0:
         raise ValueError("no designs")
-    values, slopes, found, known_slopes = in_chunks(problem.lanes, lambda x, w: _derive_all(problem, x, w), z, near)
+    values, slopes, found, speed_slopes = in_chunks(problem.batch_size, lambda x, w: _derive_all(problem, x, w), z, near)
     rows = 1 + problem.equalities + len(problem.demands)
-    return Point(z, values[:, :rows], slopes[:, :rows], found, known_slopes, values[:, rows:], slopes[:, rows:])
+    return Point(z, values[:, :rows], slopes[:, :rows], found, speed_slopes, values[:, rows:], slopes[:, rows:])
 
 
-def find_speeds(problem: Problem, z: np.ndarray) -> Known:
-    """Return the followed speeds of many designs, from whole branches; NaN without a jam."""
+def find_speeds(problem: Problem, z: np.ndarray) -> Speeds:
+    """Return the followed speeds of designs z (s, d) from whole branches; NaN if a jam does not exist."""
     if not problem.keys:
         return ()
     numbers = problem.space.numbers(np.asarray(z))
-    return in_chunks(problem.lanes, lambda scenes: _speeds_of_branches(problem.keys, scenes), made(problem, numbers))
+    return in_chunks(problem.batch_size, lambda scenes: _speeds_of_branches(problem.keys, scenes), scenes_of(problem, numbers))
 
 
-def made(problem: Problem, numbers: np.ndarray) -> Scene:
+def scenes_of(problem: Problem, numbers: np.ndarray) -> Scene:
     """Return the scenes with these free parameters (s, d), SI, as NumPy arrays with a leading axis."""
-    return in_chunks(problem.lanes, lambda x: _made(problem.space, x), numbers)
+    return in_chunks(problem.batch_size, lambda x: _scenes_of(problem.space, x), numbers)
 
 
 class _Shapes(NamedTuple):
-    """Structure of a scene without its numbers."""
+    """Structure of a scene, without the values of its arrays."""
 
     tree: Any
     leaves: tuple[tuple[tuple[int, ...], np.dtype], ...]
@@ -275,8 +283,8 @@ class _Shapes(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
-    """Return the load speeds that these quantities of a scene follow, and the number of smooth pieces whose maximum is the
-    first one."""
+    """Return the keys of the load speeds that these quantities of a scene follow, and the number of smooth pieces whose maximum
+    is the first quantity."""
     recorder = TargetRecorder()
 
     def ask(scene: Scene) -> tuple[Array, list[Array]]:
@@ -289,14 +297,14 @@ def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[K
 
 
 def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
-    """Return the load speeds that these quantities follow."""
+    """Return the keys of the load speeds that these quantities follow."""
     return _targets(tuple(quantities), _Shapes.of(scene))[0]
 
 
 @cached
 def _evaluate_all(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: Scene, near: tuple[Array, ...]) -> Array:
-    def one(scene: Scene, known: tuple[Array, ...]) -> Array:
-        evaluation = Evaluation(scene, dict(zip(keys, known, strict=True)))
+    def one(scene: Scene, speeds: tuple[Array, ...]) -> Array:
+        evaluation = Evaluation(scene, dict(zip(keys, speeds, strict=True)))
         return jnp.stack([q.read(evaluation) for q in quantities])
 
     return jax.vmap(one)(scenes, near)
@@ -311,10 +319,10 @@ def evaluate_quantities(quantities: Sequence[Quantity], scenes: Scene, problem: 
     if not quantities:
         return np.zeros((leaves[0].shape[0], 0))
     keys = report_keys(quantities, jax.tree.map(lambda leaf: leaf[0], scenes))
-    known = keys if problem is None or set(keys) - set(problem.keys) else problem.keys
+    followed = keys if problem is None or set(keys) - set(problem.keys) else problem.keys
 
     def part(batch: Scene) -> Array:
-        near = dict(zip(known, _speeds_of_branches(known, batch), strict=True)) if known else {}
+        near = dict(zip(followed, _speeds_of_branches(followed, batch), strict=True)) if followed else {}
         return _evaluate_all(quantities, keys, batch, tuple(near[key] for key in keys))
 
-    return in_chunks(_lanes(leaves[0].shape[0]) if problem is None else problem.lanes, part, scenes)
+    return in_chunks(_batch_size(leaves[0].shape[0]) if problem is None else problem.batch_size, part, scenes)

@@ -31,7 +31,7 @@ def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return (matrix @ vector[..., None])[..., 0]
 
 
-def elastic(
+def solve_penalized(
     hessian: np.ndarray,
     slope: np.ndarray,
     held: tuple[np.ndarray, np.ndarray],
@@ -50,8 +50,8 @@ def elastic(
     a (s, me); `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `penalty` (s,).
 
     >>> import numpy as np
-    >>> no = np.zeros((1, 0, 1)), np.zeros((1, 0))
-    >>> one = elastic(np.eye(1)[None], np.array([[-3.0]]), no, (np.ones((1, 1, 1)), np.array([[-1.0]])),
+    >>> none = np.zeros((1, 0, 1)), np.zeros((1, 0))
+    >>> one = solve_penalized(np.eye(1)[None], np.array([[-3.0]]), none, (np.ones((1, 1, 1)), np.array([[-1.0]])),
     ...               (np.array([[-9.0]]), np.array([[9.0]])), np.array([100.0]))
     >>> one.p.round(6).tolist(), one.demands.round(6).tolist()    # the least of x^2/2 - 3 x where x <= 1
     ([[1.0]], [[2.0]])
@@ -59,14 +59,14 @@ def elastic(
     (a_rows, a), (c_rows, c), (low, high) = held, demands, box
     me, mi, d = a.shape[1], c.shape[1], slope.shape[1]
     program = _with_slacks(hessian, slope, held, demands, box, penalty)
-    # Start in the middle of the box with equal products of slacks and duals. `broken` are the values of the constraints there,
-    # `wide` is the first value of all violations.
+    # Start in the middle of the box with equal products of slacks and duals. `constraint_values` are the values of the
+    # constraints there, `first_violation` is the first value of all violations.
     p = (low + high) / 2.0
-    broken = np.concatenate([_times(a_rows, p) + a, _times(c_rows, p) + c], axis=1)
-    wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
-    x = np.concatenate([p, np.repeat(wide[:, None], me + mi, axis=1)], axis=1)
+    constraint_values = np.concatenate([_times(a_rows, p) + a, _times(c_rows, p) + c], axis=1)
+    first_violation = 1.0 + 2.0 * np.max(np.abs(constraint_values), axis=1, initial=0.0)
+    x = np.concatenate([p, np.repeat(first_violation[:, None], me + mi, axis=1)], axis=1)
     slack = np.maximum(program.right - _times(program.rows, x), 1e-12)
-    x, dual = _interior_point(program, x, slack, (penalty * wide / 3.0)[:, None] / slack)
+    x, dual = _interior_point(program, x, slack, (penalty * first_violation / 3.0)[:, None] / slack)
     parts = np.split(dual, np.cumsum([me, me, mi, me + mi, d]), axis=1)
     return Solved(np.clip(x[:, :d], low, high), parts[0] - parts[1], parts[2], parts[4] - parts[5])
 
@@ -89,7 +89,7 @@ def _with_slacks(
     box: tuple[np.ndarray, np.ndarray],
     penalty: np.ndarray,
 ) -> _Program:
-    """Return the programs of `elastic` with x = (p, violations): one violation, never negative, for each constraint."""
+    """Return the programs of `solve_penalized` with x = (p, violations): one violation, never negative, for each constraint."""
     (a_rows, a), (c_rows, c), (low, high) = held, demands, box
     (s, d), me, mi = slope.shape, a.shape[1], c.shape[1]
     n = d + me + mi
@@ -131,10 +131,10 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
         primal = _times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
         # Keep the best point, since rounding may spoil a good one.
-        off = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
-        better = off < least
-        improved, mark = np.where(off < 0.5 * mark, k, improved), np.where(off < 0.5 * mark, off, mark)
-        least = np.where(better, off, least)
+        residual = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
+        better = residual < least
+        improved, mark = np.where(residual < 0.5 * mark, k, improved), np.where(residual < 0.5 * mark, residual, mark)
+        least = np.where(better, residual, least)
         best = np.where(better[:, None], x, best[0]), np.where(better[:, None], dual, best[1])
         done = (least < 1e-11) | ((least < _NEAR_OPTIMUM) & (k - improved >= _STEPS_WITHOUT_PROGRESS))
         if np.all(done):
@@ -142,10 +142,10 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
         dx, ds, dl = _predicted_and_corrected(program, stationary, primal, gap, slack, dual)
         keep = np.where(done, 0.0, 0.995)
         # One step length for x and the duals, because the equation of the duals contains the quadratic term.
-        by = keep * np.minimum(_longest(slack, ds), _longest(dual, dl))
-        x = x + by[:, None] * dx
-        slack = np.maximum(slack + by[:, None] * ds, 1e-300)
-        dual = np.maximum(dual + by[:, None] * dl, 1e-300)
+        length = keep * np.minimum(_longest(slack, ds), _longest(dual, dl))
+        x = x + length[:, None] * dx
+        slack = np.maximum(slack + length[:, None] * ds, 1e-300)
+        dual = np.maximum(dual + length[:, None] * dl, 1e-300)
     return best
 
 
@@ -153,22 +153,22 @@ def _predicted_and_corrected(
     program: _Program, stationary: np.ndarray, primal: np.ndarray, gap: np.ndarray, slack: np.ndarray, dual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Mehrotra's step of x, slacks and duals; a predictor determines the possible decrease of slack-dual products."""
-    rows, turned = program.rows, np.swapaxes(program.rows, 1, 2)
+    rows, transposed = program.rows, np.swapaxes(program.rows, 1, 2)
     (m, n), weight = rows.shape[1:], dual / slack
-    matrix = program.quadratic + (turned * weight[:, None, :]) @ rows
+    matrix = program.quadratic + (transposed * weight[:, None, :]) @ rows
     ridge = 1e-13 * np.eye(n)
     matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] / n + 1e-300 * np.eye(n)
 
     def solved(target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the step that increases the products of slacks and duals by `target`."""
-        rest = -stationary - _times(turned, weight * primal + target / slack)
+        rest = -stationary - _times(transposed, weight * primal + target / slack)
         dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
         ds = -primal - _times(rows, dx)
         return dx, ds, target / slack - weight * ds
 
     _, ds, dl = solved(-slack * dual)
-    by_s, by_l = _longest(slack, ds), _longest(dual, dl)
-    after = np.einsum("sm,sm->s", slack + by_s[:, None] * ds, dual + by_l[:, None] * dl) / m
+    length_s, length_l = _longest(slack, ds), _longest(dual, dl)
+    after = np.einsum("sm,sm->s", slack + length_s[:, None] * ds, dual + length_l[:, None] * dl) / m
     centre = (after / np.maximum(gap, 1e-300)) ** 3 * gap
     return solved(centre[:, None] - slack * dual - ds * dl)
 

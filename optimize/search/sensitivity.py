@@ -1,4 +1,4 @@
-"""Sensitivities at the end of a search: active limits, influential numbers, different machines."""
+"""Sensitivities at the end of a search: active limits, influences of free parameters, distinct machines."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ import numpy as np
 from jaxvib.display import shown_unit
 from optimize.quantities.quantity import Demand
 from optimize.result import Influence, Limit, Machine
-from optimize.search.find import Found
+from optimize.search.find import SearchResult
 from optimize.search.polish import FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem
 
 _STEP = 0.01
-"""Relative change of a free parameter for its influence."""
+"""Relative change of a free parameter by which its influence is computed."""
 
 
-def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
-    """Return the limits of the best design: held quantities, demands and active bounds; `sides` (number of demands, 2): the
-    value of each demanded quantity, and its limit."""
+def limits_of(problem: Problem, demands: Sequence[Demand], found: SearchResult, sides: np.ndarray) -> tuple[Limit, ...]:
+    """Return the limits of the best design: held quantities, demands and active bounds.
+
+    **Arguments**: `sides` (number of demands, 2): the value of each demanded quantity, and its limit.
+    """
     best, m = found.best, problem.equalities
     values, duals = found.point.values[best], found.optimality
     objective = abs(values[0]) if np.isfinite(values[0]) else np.nan
@@ -34,16 +36,18 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
         at = float(held.value)
         unit, factor = shown_unit(held.quantity.unit, abs(at))
         what = f"{held.quantity.words} held at {at * factor:.5g} {unit}".rstrip()
-        broken = 0.0 if abs(off) <= 10.0 * FEASIBILITY_TOLERANCE else abs(off) if np.isfinite(off) else np.inf
+        violation = 0.0 if abs(off) <= 10.0 * FEASIBILITY_TOLERANCE else abs(off) if np.isfinite(off) else np.inf
         value = float(at * (1.0 + off))
-        rows.append(Limit(what, held.quantity.unit, value, at, float(broken), True, float(-dual), gain(-dual)))
+        rows.append(Limit(what, held.quantity.unit, value, at, float(violation), True, float(-dual), gain(-dual)))
     for k, demand in enumerate(demands):
         excess, dual, scale = values[1 + m + k], duals.demands[best, k], float(problem.scales[k])
-        broken = 0.0 if excess <= 10.0 * FEASIBILITY_TOLERANCE else excess if np.isfinite(excess) else np.inf
+        violation = 0.0 if excess <= 10.0 * FEASIBILITY_TOLERANCE else excess if np.isfinite(excess) else np.inf
         active = bool(excess > -1e-6)
         share = -dual * abs(sides[k, 1]) / scale if active else 0.0
         value, limit = float(sides[k, 0]), float(sides[k, 1])
-        rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(broken), active, float(share), gain(share)))
+        rows.append(
+            Limit(demand.words, demand.quantity.unit, value, limit, float(violation), active, float(share), gain(share))
+        )
     numbers = space.numbers(found.point.z[best])
     low, high = (np.asarray(b) for b in (problem.space.low, problem.space.high))
     sizes = np.abs([low, high])
@@ -62,7 +66,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
     return tuple(rows)
 
 
-def neighbours(problem: Problem, found: Found) -> np.ndarray:
+def neighbours(problem: Problem, found: SearchResult) -> np.ndarray:
     """Return the free parameters (1 + 2 d, d), SI, of the best design and of its neighbours.
 
     In each neighbour one free parameter is 1 % smaller or larger.
@@ -81,15 +85,15 @@ def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]
     return tuple(Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words()))
 
 
-def machines_of(problem: Problem, found: Found, same: float) -> tuple[Machine, ...]:
+def machines_of(problem: Problem, found: SearchResult, same: float) -> tuple[Machine, ...]:
     """Return the distinct machines among the results of the searches, best first."""
     values = np.where(found.violation < 10.0 * FEASIBILITY_TOLERANCE, found.point.values[:, 0], np.inf)
-    left = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
+    remaining = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
     space, machines = problem.space.within(*found.bounds), []
-    while left:
-        first = found.point.z[left[0]]
-        near = [k for k in left if np.max(np.abs(found.point.z[k] - first)) < same]
+    while remaining:
+        first = found.point.z[remaining[0]]
+        near = [k for k in remaining if np.max(np.abs(found.point.z[k] - first)) < same]
         numbers = tuple(map(float, space.numbers(first)))
-        machines.append(Machine(len(near), float(values[left[0]]), numbers))
-        left = [k for k in left if k not in set(near)]
+        machines.append(Machine(len(near), float(values[remaining[0]]), numbers))
+        remaining = [k for k in remaining if k not in set(near)]
     return tuple(machines)

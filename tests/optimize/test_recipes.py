@@ -167,7 +167,7 @@ def test_the_widest_range_is_that_of_the_whole_branch():
     below = speed[omega < jam][np.argmax(omega[omega < jam])] if np.any(omega < jam) else 0.0
     np.testing.assert_allclose(-best.values.min(), min(above - 120.0, 120.0 - below), rtol=1e-7)
     assert -best.values.min() > 1.05 * float(fold_margin(mode=3)(SCENE))
-    assert best.after.amplitude and best.limits[0].broken == 0.0
+    assert best.after.amplitude and best.limits[0].violation == 0.0
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from scenes import published, scene
 
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, amplitude, expected, foundation_force, hold, jam_frequency, total, total_mass
-from optimize.search.find import Found
+from optimize.search.find import SearchResult
 from optimize.search.polish import Optimality
 from optimize.search.problem import Point
 from optimize.synthesize import (
@@ -22,7 +22,7 @@ from optimize.synthesize import (
     _other_tiers,
     _rank,
     _run,
-    _standard,
+    _standard_rows,
     _table,
     _with_loads,
     synthesize,
@@ -40,7 +40,7 @@ def test_the_table_has_each_quantity_once():
         "foundation force",
         "force per amplitude",
     ]
-    assert [name for name, _ in _standard(SCENE, 3, None)] == standard and _standard(SCENE, None, None) == []
+    assert [name for name, _ in _standard_rows(SCENE, 3, None)] == standard and _standard_rows(SCENE, None, None) == []
     force, mass = foundation_force(mode=3), total_mass()
     named = _named_quantities(SPACE, SCENE, force, [mass < 300.0, force < 9.0, amplitude(mode=3, of=1) < 1.0], 3)
     assert [name for name, _ in named] == [*standard, "sum of stiffness of all supports", "mass of platforms and loads"]
@@ -74,7 +74,9 @@ def test_designs_that_keep_demands_rank_first():
     def found(value, violation):
         point = Point(np.zeros((1, 2)), np.array([[value]]), np.zeros((1, 1, 2)), (), (), np.zeros((1, 0)), np.zeros((1, 0, 2)))
         none = Optimality(np.zeros((1, 0)), np.zeros((1, 0)), np.zeros((1, 2)), np.zeros(1))
-        return Found(point, np.zeros((1, 1)), np.zeros(1), np.array([violation]), none, 1, 1, False, (np.zeros(2), np.ones(2)))
+        return SearchResult(
+            point, np.zeros((1, 1)), np.zeros(1), np.array([violation]), none, 1, 1, False, (np.zeros(2), np.ones(2))
+        )
 
     assert _rank(found(5.0, 0.0)) == (False, 5.0) and _rank(found(5.0, 0.3)) == (True, 0.3)
     assert _rank(found(5.0, 0.0)) < _rank(found(6.0, 9e-8)) < _rank(found(1.0, 0.2)) < _rank(found(0.5, 0.3))
@@ -206,7 +208,7 @@ def test_searches_of_all_numbers_of_loads_count(monkeypatch):
             np.zeros((1, 1)), np.array([[9.0 - loads]]), np.zeros((1, 1, 1)), (), (), np.zeros((1, 0)), np.zeros((1, 0, 1))
         )
         bounds = np.zeros(1), np.ones(1)
-        found = Found(point, np.zeros((1, 1)), np.zeros(1), np.zeros(1), none, 10 * loads, loads, False, bounds)
+        found = SearchResult(point, np.zeros((1, 1)), np.zeros(1), np.zeros(1), none, 10 * loads, loads, False, bounds)
         return None if loads == 4 else found
 
     module = sys.modules[synthesize.__module__]

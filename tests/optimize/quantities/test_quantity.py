@@ -125,7 +125,7 @@ def test_what_asks_knows_its_tiers():
     assert (A + exact).easy.parts == (A, both) and (A + both).at_tier("exact").parts == (A, exact)
     assert len(asked) == 1
     parted = BuiltinQuantity(
-        "p", "", function, settings=(7,), parted=lambda evaluation, sign, tier, seven: sign * jnp.array([1.0, seven])
+        "p", "", function, settings=(7,), pieces_function=lambda evaluation, sign, tier, seven: sign * jnp.array([1.0, seven])
     )
     np.testing.assert_array_equal(parted.pieces(Evaluation(SCENE), -1.0), [-1.0, -7.0])
 

@@ -6,7 +6,7 @@ import pytest
 from two_springs import FREE, SCENE, plain
 
 from optimize import DesignSpace, Quantity, hold
-from optimize.search.descent import STRETCH, _least, descend
+from optimize.search.descent import STEPS_PER_CALL, _least_norm_solution, descend
 from optimize.search.problem import evaluate, problem_of
 
 STEPS, RATE = 45, 0.05
@@ -81,7 +81,7 @@ def test_the_descent_is_adam_with_an_augmented_lagrangian():
         np.testing.assert_allclose(found.point.slopes[k, 0], slope(z), rtol=1e-4, atol=1e-5)
     assert found.history.shape == (STEPS, 2)
     assert [share for share, _ in told] == [0.5, 1.0]
-    np.testing.assert_array_equal(told[0][1], found.history[STRETCH - 1])
+    np.testing.assert_array_equal(told[0][1], found.history[STEPS_PER_CALL - 1])
 
 
 def test_a_step_to_where_there_is_nothing_is_not_taken():
@@ -106,7 +106,7 @@ def test_held_quantities_are_corrected_at_every_step(start):
     total = plain("sum", lambda x, y: x + y)
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(total, 7.0)]), plain("bowl", lambda x, y: bowl(x, y, jnp.log)), [], 2)
     place = []
-    found = run(problem, np.array([start]), STRETCH * 6, tell=lambda share, point: place.append(point))
+    found = run(problem, np.array([start]), STEPS_PER_CALL * 6, tell=lambda share, point: place.append(point))
     assert all(np.all(np.abs(point.values[:, 1]) < 1e-9) for point in place)
     at = np.linspace(1.0, 6.0, 100001)
     least = at[np.argmin(bowl(at, 7.0 - at))]
@@ -133,7 +133,7 @@ def test_two_things_that_are_held_are_kept_together():
     )
     space = DesignSpace(SCENE, {**FREE, "machine.link_stiffness": (5e4, 9.5e5, "even")}, [hold(total, 7.0), hold(link, 10.0)])
     problem = problem_of(space, plain("bowl", lambda x, y: bowl(x, y, jnp.log)), [], 2)
-    found = run(problem, np.array([[0.3, 0.4, 0.3]]), STRETCH * 6)
+    found = run(problem, np.array([[0.3, 0.4, 0.3]]), STEPS_PER_CALL * 6)
     at = np.linspace(1.0, 6.0, 100001)
     least = at[np.argmin(bowl(at, 7.0 - at))]
     numbers = np.asarray(space.numbers(found.point.z[0])) / 1e4
@@ -144,6 +144,6 @@ def test_two_things_that_are_held_are_kept_together():
 @pytest.mark.parametrize("size", [1.0, 1e-8, 1e-10])
 def test_what_hardly_changes_a_demand_is_not_sent_the_wrong_way(size):
     """x = 1 meets size x = size; where that is rounding, what is between 0 and 1 does."""
-    found = _least(jnp.array([[size, 0.0]]), jnp.array([size]))
+    found = _least_norm_solution(jnp.array([[size, 0.0]]), jnp.array([size]))
     assert 0.0 < float(found[0]) <= 1.0 and float(found[1]) == 0.0
-    np.testing.assert_allclose(_least(jnp.array([[3.0, 4.0]]), jnp.array([5.0])), [0.6, 0.8], rtol=1e-12)
+    np.testing.assert_allclose(_least_norm_solution(jnp.array([[3.0, 4.0]]), jnp.array([5.0])), [0.6, 0.8], rtol=1e-12)

@@ -10,7 +10,7 @@ import jaxvib as jv
 from jaxvib.steady.jams.jam import jam_modes
 from optimize import DesignSpace, Quantity, hold, jam_frequency, synthesize
 from optimize.search import evolve as evolve_module
-from optimize.search.evolve import Followed, _best, evolve
+from optimize.search.evolve import PopulationValues, _best, evolve
 from optimize.search.problem import problem_of
 
 
@@ -91,7 +91,7 @@ def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
     looked = []
     look = evolve_module.find_speeds
     monkeypatch.setattr(evolve_module, "find_speeds", lambda problem, z: looked.append(len(z)) or look(problem, z))
-    followed = Followed(problem)
+    followed = PopulationValues(problem)
     first = np.array([[0.2, 0.3], [0.8, 0.7], [0.5, 0.9]])
     second = first[::-1] + 0.01
     found = np.concatenate([followed.of(first), followed.of(second)])[:, 0]

@@ -8,7 +8,16 @@ from two_springs import FREE, SCENE, plain, point_of
 
 from optimize import DesignSpace, expected, hold, jam_frequency, largest, support_frequency_squared, synthesize
 from optimize.search import find as find_module
-from optimize.search.find import Found, Options, _away, _few, _of_their_mode, _spread, choose, find
+from optimize.search.find import (
+    Options,
+    SearchResult,
+    _best_distinct,
+    _distance_to_catalogue,
+    _has_tolerances,
+    _with_requested_modes,
+    choose,
+    find,
+)
 from optimize.search.polish import Optimality
 from optimize.search.problem import evaluate, find_speeds, problem_of
 
@@ -22,7 +31,7 @@ def ended(values, violation, z=None):
     z = np.linspace(0.0, 1.0, 2 * s).reshape(s, 2) if z is None else np.asarray(z)
     none = Optimality(np.zeros((s, 0)), np.zeros((s, 0)), np.zeros((s, 2)), np.zeros(s))
     point = point_of(z, np.asarray(values)[:, None], np.zeros((s, 1, 2)))
-    return Found(point, np.zeros((1, s)), np.zeros(s), np.asarray(violation), none, s, s, False, BOUNDS)
+    return SearchResult(point, np.zeros((1, s)), np.zeros(s), np.asarray(violation), none, s, s, False, BOUNDS)
 
 
 def test_the_best_is_the_least_that_keeps_all_demands():
@@ -33,24 +42,28 @@ def test_the_best_is_the_least_that_keeps_all_demands():
 def test_the_few_to_go_on_from_are_the_best_that_differ():
     z = [[0.5, 0.5], [0.505, 0.493], [0.2, 0.5], [0.5, 0.52], [0.9, 0.9], [0.1, 0.1]]
     found = ended([3.0, 2.0, 5.0, 4.0, np.nan, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], z)
-    np.testing.assert_array_equal(_few(found), [z[1], z[3], z[2], z[5]])  # what keeps no demand comes last
+    np.testing.assert_array_equal(_best_distinct(found), [z[1], z[3], z[2], z[5]])  # what keeps no demand comes last
     many = ended(np.arange(20.0), np.zeros(20))
-    np.testing.assert_array_equal(_few(many), many.point.z[:7])
-    assert _few(ended([np.nan], [np.inf])).shape == (0, 2)
+    np.testing.assert_array_equal(_best_distinct(many), many.point.z[:7])
+    assert _best_distinct(ended([np.nan], [np.inf])).shape == (0, 2)
 
 
 def test_how_far_a_number_is_from_its_catalogue():
-    assert _away((1.0, 2.0, 4.0), 2.5) == 0.25 and _away((1.0, 2.0, 4.0), 3.5) == 0.125 and _away((1.0, 2.0), 1.0) == 0.0
-    assert _away((0.0, 2.0), 0.0) == 0.0
+    assert (
+        _distance_to_catalogue((1.0, 2.0, 4.0), 2.5) == 0.25
+        and _distance_to_catalogue((1.0, 2.0, 4.0), 3.5) == 0.125
+        and _distance_to_catalogue((1.0, 2.0), 1.0) == 0.0
+    )
+    assert _distance_to_catalogue((0.0, 2.0), 0.0) == 0.0
 
 
 def test_a_jam_of_another_number_is_no_answer():
     problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [], 2)
     z = np.array([[0.5, 0.5], [0.4, 0.3]])
     point = evaluate(problem, z, find_speeds(problem, z))
-    np.testing.assert_array_equal(_of_their_mode(problem, point).values, point.values)
-    other = point._replace(known=(point.known[0] * np.array([1.0, 1.001]),))
-    kept = _of_their_mode(problem, other)
+    np.testing.assert_array_equal(_with_requested_modes(problem, point).values, point.values)
+    other = point._replace(speeds=(point.speeds[0] * np.array([1.0, 1.001]),))
+    kept = _with_requested_modes(problem, other)
     np.testing.assert_array_equal(kept.values[:, 0], [point.values[0, 0], np.nan])
     np.testing.assert_array_equal(kept.slopes, point.slopes)
 
@@ -64,7 +77,7 @@ def test_tolerances_count_wherever_they_stand():
         (NEAR, [mean < 3.0], True),
         (NEAR, [plain("other", lambda x, y: x) < mean], True),
     ):
-        assert _spread(problem_of(space, objective, demands)) == counts
+        assert _has_tolerances(problem_of(space, objective, demands)) == counts
 
 
 OPTIONS = Options(starts=4, seed=0, iterations=25, rate=0.05, polishing=8)
@@ -181,7 +194,7 @@ def test_choices_keep_demands_or_there_are_none(monkeypatch):
     numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
     np.testing.assert_allclose(numbers, min(tried, key=tried.get), rtol=1e-9)
     assert chosen([product > 8.9, product < 9.0], [1e4, 2e4, 7e4])[1] is None  # machines between, but no choice
-    monkeypatch.setattr(find_module, "_NODES", 0)
+    monkeypatch.setattr(find_module, "_MAX_NODES", 0)
     assert chosen()[1] is None
 
 
@@ -198,7 +211,7 @@ def test_between_narrower_bounds_the_best_is_at_them(bounds):
 def test_designs_that_lose_their_mode_fall_back_to_the_start(monkeypatch):
     """A machine that has the mode is worth more than a better one without: the second of two ends without values."""
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [plain("x", lambda x, y: x) < 4.0], 2)
-    kept = find_module._of_their_mode
+    kept = find_module._with_requested_modes
     asked = []
 
     def lost(problem, point):
@@ -207,11 +220,11 @@ def test_designs_that_lose_their_mode_fall_back_to_the_start(monkeypatch):
             return kept(problem, point)
         return point._replace(values=np.where([[True], [False]], point.values, np.nan))
 
-    monkeypatch.setattr(find_module, "_of_their_mode", lost)
+    monkeypatch.setattr(find_module, "_with_requested_modes", lost)
     begin = np.array([[0.1, 0.2], [0.5, 0.9]])  # x = 5 of 4 at most
     found = find(problem, Options(2, 0, 25, 0.05, 8, begin=begin), lambda *_: None)
     np.testing.assert_array_equal(found.point.z[1], begin[1])
     np.testing.assert_allclose(found.point.z[0], [0.375, 0.5], atol=1e-8)
     np.testing.assert_allclose(found.point.values[1], [1.0 + 3.2**2 + 2.0, 0.25], rtol=1e-12)
     np.testing.assert_allclose(found.violation, [0.0, 0.25], atol=1e-9)
-    assert found.left[0] < 1e-9 and found.left[1] == np.inf and found.optimality.kkt.shape == (2,)
+    assert found.remaining_decrease[0] < 1e-9 and found.remaining_decrease[1] == np.inf and found.optimality.kkt.shape == (2,)

@@ -162,7 +162,7 @@ def test_polishing_reports_its_residual_and_ends_early(held):
     assert shares == []
     ended = polish(held, start, 4, lambda share, point: shares.append(share))
     np.testing.assert_allclose(xy(ended.point), [[4.0, 3.0]] * 4, atol=1e-8)
-    assert np.all(ended.left < 1e-10) and np.all(ended.violation < 1e-10) and np.all(ended.optimality.kkt < 1e-8)
+    assert np.all(ended.remaining_decrease < 1e-10) and np.all(ended.violation < 1e-10) and np.all(ended.optimality.kkt < 1e-8)
     np.testing.assert_allclose(shares[:4], [0.25, 0.5, 0.75, 1.0])
 
 
@@ -172,7 +172,7 @@ def test_what_is_left_is_what_the_better_model_may_fall_by():
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], starts=2)
     found = polish(problem, at(problem, (5.5, 4.5), (6.0, 5.5)), 0, lambda *_: None)
     f = np.array([2.5, 2.25])
-    np.testing.assert_allclose(found.left, (f - 2.0) / f / (1.0 + 2.0 * (f - 2.0) / f), rtol=1e-5)
+    np.testing.assert_allclose(found.remaining_decrease, (f - 2.0) / f / (1.0 + 2.0 * (f - 2.0) / f), rtol=1e-5)
 
 
 def test_polishing_follows_a_bent_valley():
@@ -181,7 +181,7 @@ def test_polishing_follows_a_bent_valley():
     problem = problem_of(DesignSpace(SCENE, FREE), valley, [], starts=4)
     ended = polish(problem, at(problem, (8.0, 7.0), (2.0, 8.0), (6.0, 3.0), (5.0, 2.0)), 16, lambda *_: None)
     np.testing.assert_allclose(xy(ended.point), [[4.0, 2.5]] * 4, atol=1e-7)
-    assert np.all(np.diff(ended.history, axis=0) <= 0.0) and np.all(ended.left < 1e-13)
+    assert np.all(np.diff(ended.history, axis=0) <= 0.0) and np.all(ended.remaining_decrease < 1e-13)
 
 
 def test_a_dear_constraint_is_kept_at_last(held):
@@ -191,7 +191,7 @@ def test_a_dear_constraint_is_kept_at_last(held):
     ended = polish(problem, at(problem, (4.0, 5.0), (3.9999, 2.0)), 12, lambda *_: None)
     np.testing.assert_allclose(xy(ended.point), [[4.0, 3.0]] * 2, atol=1e-5)
     np.testing.assert_allclose(ended.optimality.demands, 4e4, rtol=1e-8)  # of the relative excess, x/4 - 1
-    assert np.all(ended.left < 1e-6)
+    assert np.all(ended.remaining_decrease < 1e-6)
 
 
 def test_scale_of_a_zero_objective_follows_from_its_slope():

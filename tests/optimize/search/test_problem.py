@@ -11,7 +11,16 @@ import jaxvib as jv
 from jaxvib.steady.jams.jam import jam_modes
 from optimize import DesignSpace, Quantity, amplitude, expected, foundation_force, hold, jam_frequency, largest, total
 from optimize.quantities.quantity import BuiltinQuantity
-from optimize.search.problem import Point, derive, evaluate, evaluate_quantities, find_speeds, made, problem_of, report_keys
+from optimize.search.problem import (
+    Point,
+    derive,
+    evaluate,
+    evaluate_quantities,
+    find_speeds,
+    problem_of,
+    report_keys,
+    scenes_of,
+)
 
 SUM, FIRST = plain("sum", lambda x, y: x + y), plain("first", lambda x, y: x)
 
@@ -24,7 +33,7 @@ def test_values_are_the_objective_what_is_held_and_the_demands():
     """Objective 5 - x y; x + y = 7; x at most 4, in parts of 4; y at most x, in parts of the larger at the beginning, 5."""
     space = DesignSpace(SCENE, FREE, [hold(SUM, 7.0)])
     problem = problem_of(space, plain("o", lambda x, y: 5.0 - x * y), [FIRST < 4.0, plain("y", lambda x, y: y) < FIRST], 2)
-    assert problem.equalities == 1 and problem.lanes == 2 and problem.keys == ()
+    assert problem.equalities == 1 and problem.batch_size == 2 and problem.keys == ()
     np.testing.assert_allclose(problem.scales, [4.0, 5.0])
     point = evaluate(problem, np.array([[0.25, 0.5], [0.75, 0.125]]), ())  # (3, 5) and (7, 2)
     np.testing.assert_allclose(
@@ -58,7 +67,7 @@ def test_scale_of_a_demand_is_its_limit_or_first_value():
 
 @pytest.mark.parametrize(("starts", "lanes"), [(1, 1), (2, 2), (3, 4), (33, 64), (1000, 64)])
 def test_designs_that_are_computed_together_are_a_power_of_two(starts, lanes):
-    assert problem_of(DesignSpace(SCENE, FREE), NEAREST, [], starts).lanes == lanes
+    assert problem_of(DesignSpace(SCENE, FREE), NEAREST, [], starts).batch_size == lanes
 
 
 def test_all_derivative_modes_agree_with_derivatives_by_hand():
@@ -75,11 +84,11 @@ def test_all_derivative_modes_agree_with_derivatives_by_hand():
         space = DesignSpace(machine, free, hold_)
         problem = problem_of(space, wish, [], 1)
         z = jnp.linspace(0.2, 0.7, 6)
-        values, slopes, found, known_slopes = derive(problem, z, ())
+        values, slopes, found, speed_slopes = derive(problem, z, ())
         k = springs(space.at(z))
         np.testing.assert_allclose(values[0], jnp.sum(weights * k**2), rtol=1e-12)
         np.testing.assert_allclose(slopes[0], 2.0 * weights * k**2 * np.log(90.0), rtol=1e-10)  # k = low 90^z
-        assert found == known_slopes == ()
+        assert found == speed_slopes == ()
 
 
 def test_followed_speeds_and_how_they_change():
@@ -91,29 +100,29 @@ def test_followed_speeds_and_how_they_change():
     omega = [float(jam_modes(problem.space.at(jnp.asarray(each))).select(3).omega) for each in z]
     np.testing.assert_allclose(near[0], omega, rtol=1e-10)
     point = evaluate(problem, z, near)
-    np.testing.assert_allclose(point.known[0], omega, rtol=1e-10)
+    np.testing.assert_allclose(point.speeds[0], omega, rtol=1e-10)
     np.testing.assert_allclose(point.values[:, 0], omega, rtol=1e-10)
-    np.testing.assert_allclose(point.known_slopes[0], point.slopes[:, 0], rtol=1e-10)
+    np.testing.assert_allclose(point.speed_slopes[0], point.slopes[:, 0], rtol=1e-10)
     moved = [evaluate(problem, z + step * np.array([0.0, 1.0]), near).values[:, 0] for step in (1e-5, -1e-5)]
-    np.testing.assert_allclose(point.known_slopes[0][:, 1], (moved[0] - moved[1]) / 2e-5, rtol=1e-5)
-    ahead = point.ahead(z + 1e-3)
+    np.testing.assert_allclose(point.speed_slopes[0][:, 1], (moved[0] - moved[1]) / 2e-5, rtol=1e-5)
+    ahead = point.extrapolate_speeds(z + 1e-3)
     np.testing.assert_allclose(ahead[0], omega + 1e-3 * point.slopes[:, 0].sum(axis=1), rtol=1e-12)
 
 
 def test_guesses_further_off_than_a_fifth_are_not_taken():
     z = np.zeros((4, 2))
     known = np.array([10.0, 10.0, 10.0, np.nan])
-    known_slopes = np.array([[1.0, 0.5], [30.0, 0.0], [-30.0, np.inf], [1.0, 1.0]])
+    speed_slopes = np.array([[1.0, 0.5], [30.0, 0.0], [-30.0, np.inf], [1.0, 1.0]])
     point = Point(
         z,
         z,
         z,
         (known, np.stack([known, 2.0 * known], axis=1)),
-        (known_slopes, np.stack([known_slopes, -known_slopes], axis=1)),
+        (speed_slopes, np.stack([speed_slopes, -speed_slopes], axis=1)),
         z,
         z,
     )
-    one, two = point.ahead(np.full((4, 2), 0.1))
+    one, two = point.extrapolate_speeds(np.full((4, 2), 0.1))
     np.testing.assert_allclose(one, [10.15, 10.0, 10.0, np.nan])
     np.testing.assert_allclose(two, [[10.15, 19.85], [10.0, 17.0], [10.0, 20.0], [np.nan, np.nan]])
 
@@ -149,7 +158,7 @@ def test_first_search_uses_leading_order_and_no_tolerances():
     demands = [TIMED < 3.0, EXACT < 5.0, FIRST < 4.0]
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(EXACT, 7.0)]), expected(force, off, samples=4), demands, 8)
     first = problem.easy()
-    assert first.objective == force and first.lanes == problem.lanes == 8
+    assert first.objective == force and first.batch_size == problem.batch_size == 8
     assert [(held.quantity, float(held.value)) for held in first.space.held] == [(LEADING, 7.0)]
     assert [d.quantity for d in first.demands] == [LEADING, FIRST]  # what is had in time alone is left out
     np.testing.assert_array_equal(first.constants, [5.0, 4.0])
@@ -179,7 +188,7 @@ def test_some_searches_come_first(objective, held, demands, first):
 
 
 def test_reports_are_those_of_each_scene():
-    batch = made(problem_of(DesignSpace(SCENE, FREE), NEAREST, [], 4), np.array([[3e4, 4e4], [5e4, 6e4], [7e4, 8e4]]))
+    batch = scenes_of(problem_of(DesignSpace(SCENE, FREE), NEAREST, [], 4), np.array([[3e4, 4e4], [5e4, 6e4], [7e4, 8e4]]))
     np.testing.assert_array_equal(batch.machine.stiffness, [[3e4, 4e4], [5e4, 6e4], [7e4, 8e4]])
     frequency = jam_frequency(mode=3)
     told = evaluate_quantities([SUM, frequency], batch)

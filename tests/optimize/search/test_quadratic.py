@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from optimize.search.quadratic import elastic
+from optimize.search.quadratic import solve_penalized
 
 NOTHING = np.zeros((1, 0, 1)), np.zeros((1, 0))
 
@@ -23,7 +23,7 @@ def some_programs():
 
 def test_quadratic_programs_meet_their_conditions():
     hessian, slope, (held, off), (demands, excess), (low, high), penalty = some_programs()
-    one = elastic(hessian, slope, (held, off), (demands, excess), (low, high), penalty)
+    one = solve_penalized(hessian, slope, (held, off), (demands, excess), (low, high), penalty)
     p = one.p
     gradient = np.einsum("sij,sj->si", hessian, p) + slope + one.bounds
     gradient += np.einsum("sm,smd->sd", one.held, held) + np.einsum("sm,smd->sd", one.demands, demands)
@@ -46,11 +46,11 @@ def test_quadratic_program_is_independent_of_its_batch(monkeypatch):
     solve = np.linalg.solve
     monkeypatch.setattr(np.linalg, "solve", lambda a, b: solved.append(1) or solve(a, b))
     hard = some_programs()
-    whole = elastic(*hard)
+    whole = solve_penalized(*hard)
     assert len(solved) <= 2 * 25
     easy = jax.tree.map(lambda a: np.concatenate([np.zeros_like(a[:1]), a[:3]]), hard)
     easy[0][0], easy[4][0][0], easy[4][1][0], easy[5][0] = np.eye(4), -1.0, 1.0, 10.0
-    beside = elastic(*easy)
+    beside = solve_penalized(*easy)
     np.testing.assert_allclose(beside.p[1:], whole.p[:3], atol=1e-9)
     np.testing.assert_allclose(beside.p[0], 0.0, atol=1e-9)
 
@@ -59,9 +59,9 @@ def test_boxes_and_amounts_may_be_far_from_nothing():
     """min p^2/2 between 100 and 101 with p = -1000 required: p is 100, the constraint is penalized, the bound has the rest."""
     box = np.full((1, 1), 100.0), np.full((1, 1), 101.0)
     one = np.ones((1, 1, 1))
-    held = elastic(one, np.zeros((1, 1)), (one, np.array([[1e3]])), NOTHING, box, np.array([10.0]))
+    held = solve_penalized(one, np.zeros((1, 1)), (one, np.array([[1e3]])), NOTHING, box, np.array([10.0]))
     np.testing.assert_allclose([held.p[0, 0], held.held[0, 0], held.bounds[0, 0]], [100.0, 10.0, -110.0], rtol=1e-8)
-    demanded = elastic(one, np.zeros((1, 1)), NOTHING, (one, np.array([[1e3]])), box, np.array([10.0]))
+    demanded = solve_penalized(one, np.zeros((1, 1)), NOTHING, (one, np.array([[1e3]])), box, np.array([10.0]))
     np.testing.assert_allclose([demanded.p[0, 0], demanded.demands[0, 0]], [100.0, 10.0], rtol=1e-8)
 
 
@@ -71,7 +71,7 @@ def test_separable_program_ends_at_minima_or_bounds(size):
     hessian, slope = np.array([2.0, 1.0, 4.0, 0.5]), np.array([-2.0, 3.0, -20.0, 0.1])
     box = -np.ones((1, 4)), 2.0 * np.ones((1, 4))
     nothing = np.zeros((1, 0, 4)), np.zeros((1, 0))
-    one = elastic(size * np.diag(hessian)[None], size * slope[None], nothing, nothing, box, np.array([10.0]))
+    one = solve_penalized(size * np.diag(hessian)[None], size * slope[None], nothing, nothing, box, np.array([10.0]))
     np.testing.assert_allclose(one.p[0], [1.0, -1.0, 2.0, -0.2], atol=1e-8)
     np.testing.assert_allclose(one.bounds[0] / size, [0.0, -2.0, 12.0, 0.0], atol=1e-7)
 
@@ -88,9 +88,9 @@ def test_constraints_beyond_their_penalty_are_violated(penalty, p, multiplier):
     one, box = np.ones((1, 1, 1)), (np.full((1, 1), -9.0), np.full((1, 1), 7.0))
     for sign in (1.0, -1.0):
         slope, penalties = np.array([[-3.0 * sign]]), np.array([penalty])
-        held = elastic(one, slope, (one, np.array([[-sign]])), NOTHING, box, penalties)
+        held = solve_penalized(one, slope, (one, np.array([[-sign]])), NOTHING, box, penalties)
         np.testing.assert_allclose([held.p[0, 0], held.held[0, 0]], [sign * p, sign * multiplier], atol=1e-7)
-        demanded = elastic(one, slope, NOTHING, (sign * one, np.array([[-1.0]])), box, penalties)
+        demanded = solve_penalized(one, slope, NOTHING, (sign * one, np.array([[-1.0]])), box, penalties)
         np.testing.assert_allclose([demanded.p[0, 0], demanded.demands[0, 0]], [sign * p, multiplier], atol=1e-7)
 
 
@@ -100,7 +100,7 @@ def test_each_multiplier_is_that_of_its_own_constraint():
     held = rows[:, :2], np.array([[-1.0, -2.0]])
     demands = rows[:, [2, 2]], np.array([[-3.0, -9.0]])
     box = np.full((1, 3), -20.0), np.full((1, 3), 20.0)
-    one = elastic(rows, -np.array([[3.0, 4.0, 5.0]]), held, demands, box, np.array([50.0]))
+    one = solve_penalized(rows, -np.array([[3.0, 4.0, 5.0]]), held, demands, box, np.array([50.0]))
     np.testing.assert_allclose(one.p, [[1.0, 2.0, 3.0]], atol=1e-8)
     np.testing.assert_allclose(one.held, [[2.0, 2.0]], atol=1e-7)
     np.testing.assert_allclose(one.demands, [[2.0, 0.0]], atol=1e-7)

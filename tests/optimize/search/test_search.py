@@ -59,8 +59,8 @@ def test_contradictory_demands_are_named_with_what_is_missing():
     space, demands = DesignSpace(SCENE, FREE), [SUM > "120 N/mm", FIRST < 2e4]
     best = found(space, NEAREST, subject_to=demands, throw=False)  # 2e4 + 9e4 at most
     assert best.status_name == "contradictory" and best.same == 0
-    broken = [limit for limit in best.limits if limit.broken > 0.0]
-    total_off = sum(limit.broken * abs(limit.limit) for limit in broken)
+    broken = [limit for limit in best.limits if limit.violation > 0.0]
+    total_off = sum(limit.violation * abs(limit.limit) for limit in broken)
     np.testing.assert_allclose(total_off, 1e4, rtol=1e-4)
     assert "not met" in "\n".join(best.findings())
     assert best.unverified == "the machine does not meet all demands" and best.run is None

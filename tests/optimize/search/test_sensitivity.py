@@ -6,7 +6,7 @@ from two_springs import FREE, SCENE, plain, point_of
 
 from optimize import DesignSpace, hold
 from optimize.result import Machine
-from optimize.search.find import Found
+from optimize.search.find import SearchResult
 from optimize.search.polish import Optimality
 from optimize.search.problem import problem_of
 from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
@@ -21,7 +21,7 @@ def ended(z, values, held=(), demands=(), bounds=(0.0, 0.0), violation=None, lim
     rows = [np.tile(np.asarray(each, float), (s, 1)) for each in (held, demands, bounds)]
     point = point_of(np.asarray(z), np.asarray(values), np.zeros((s, len(values[0]), 2)))
     violation = np.zeros(s) if violation is None else np.asarray(violation)
-    return Found(point, np.zeros((1, s)), np.zeros(s), violation, Optimality(*rows, np.zeros(s)), s, s, False, limits)
+    return SearchResult(point, np.zeros((1, s)), np.zeros(s), violation, Optimality(*rows, np.zeros(s)), s, s, False, limits)
 
 
 def test_limits_are_told_with_what_moving_them_gains():
@@ -33,16 +33,16 @@ def test_limits_are_told_with_what_moving_them_gains():
     held, first, room, broken = limits_of(problem, demands, found, sides)
     assert held.what == "sum held at 7" and held.active and held.limit == 7.0
     np.testing.assert_allclose(
-        [held.value, held.broken, held.multiplier, held.gain], [7.007, 1e-3, -2.0, -2.0 / 5.0], rtol=1e-12
+        [held.value, held.violation, held.multiplier, held.gain], [7.007, 1e-3, -2.0, -2.0 / 5.0], rtol=1e-12
     )
-    assert first.active and first.broken == 0.0 and first.what == "first at most 4"
+    assert first.active and first.violation == 0.0 and first.what == "first at most 4"
     np.testing.assert_allclose([first.multiplier, first.gain], [-3.0, -3.0 / 5.0], rtol=1e-12)
     assert (first.value, first.limit, room.value, room.limit) == (4.0, 4.0, 4.0, 8.0)
-    assert not room.active and room.multiplier == room.gain == room.broken == 0.0
-    assert broken.active and broken.broken == 2.5
+    assert not room.active and room.multiplier == room.gain == room.violation == 0.0
+    assert broken.active and broken.violation == 2.5
     kept = ended([[0.5, 0.5]], [[-5.0, 1e-8, 1e-8, -0.5, -2e-6]], [2.0], [3.0, 9.0, 0.5])
     kept = limits_of(problem, demands, kept, sides)
-    assert kept[0].broken == kept[1].broken == 0.0 and kept[1].active and not kept[3].active
+    assert kept[0].violation == kept[1].violation == 0.0 and kept[1].active and not kept[3].active
 
 
 def test_a_limit_that_is_a_quantity_moves_by_its_value():
@@ -66,7 +66,7 @@ def test_a_limit_that_is_a_quantity_moves_by_its_value():
 def test_bounds_that_hinder_are_told(scale, z, dual, what, multiplier):
     problem = problem_of(DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4, scale)}), WISH, [])
     (limit,) = limits_of(problem, [], ended([[z, 0.5]], [[4.0]], bounds=[dual, 0.0]), np.zeros((0, 2)))
-    assert limit.what == what and limit.active and limit.broken == 0.0
+    assert limit.what == what and limit.active and limit.violation == 0.0
     np.testing.assert_allclose(limit.limit, 9e4 if z == 1.0 else 1e4)
     np.testing.assert_allclose([limit.multiplier, limit.gain], [multiplier, multiplier / 4.0], rtol=1e-12)
     away = ended([[0.999, 0.5]], [[4.0]], bounds=[dual, 0.0])
@@ -99,9 +99,9 @@ def test_machines_are_counted_by_how_far_they_are_apart():
     z = [[0.5, 0.5], [0.25, 0.5], [0.5005, 0.4995], [0.25, 0.502], [0.9, 0.9], [0.1, 0.1]]
     found = ended(z, [[3.0], [2.0], [1.0], [4.0], [0.5], [np.nan]], violation=[0.0, 0.0, 0.0, 9e-8, 0.1, np.inf])
     best, second, third = machines_of(problem, found, 1e-3)
-    assert isinstance(best, Machine) and (best.often, best.value) == (2, 1.0)
+    assert isinstance(best, Machine) and (best.starts, best.value) == (2, 1.0)
     np.testing.assert_allclose(best.numbers, [1e4 + 8e4 * 0.5005, 1e4 + 8e4 * 0.4995])
-    assert (second.often, second.value, third.often, third.value) == (1, 2.0, 1, 4.0)
+    assert (second.starts, second.value, third.starts, third.value) == (1, 2.0, 1, 4.0)
 
 
 def test_what_the_machine_does_not_have_is_not_met():
@@ -109,5 +109,5 @@ def test_what_the_machine_does_not_have_is_not_met():
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), WISH, [FIRST < 4.0])
     found = ended([[0.5, 0.5]], [[np.nan, np.nan, np.nan]], [0.0], [0.0])
     held, first = limits_of(problem, [FIRST < 4.0], found, np.array([[np.nan, 4.0]]))
-    assert held.broken == first.broken == np.inf
+    assert held.violation == first.violation == np.inf
     assert first.shortfall() == held.shortfall() == "the nearest machine does not have this quantity"
