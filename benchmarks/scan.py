@@ -32,7 +32,7 @@ from parts.common import busy, machine_line  # noqa: E402
 from jaxvib.errors import InputError  # noqa: E402
 from jaxvib.motion.analysis.measure import measure  # noqa: E402
 from jaxvib.motion.analysis.scaled_error import natural_units  # noqa: E402
-from jaxvib.motion.integrate import WINDOW  # noqa: E402
+from jaxvib.motion.integrate import WINDOW_SAMPLES  # noqa: E402
 
 SPEED = 150.0
 OUTLIER = 3.0
@@ -142,7 +142,7 @@ def cost(s: jv.Scene, steps: int) -> Cost:
     measured = jax.jit(lambda s, times, states: measure(s, jv.vector_field(s), times, states, natural_units(s)))
     measuring = lambda: measured(s, window.time, window.state)  # noqa: E731
     step = (busy(run(3 * steps)) - busy(run(steps))) / (2 * steps)
-    return Cost(counted, step, busy(measuring) / WINDOW)
+    return Cost(counted, step, busy(measuring) / WINDOW_SAMPLES)
 
 
 def main() -> None:

@@ -24,14 +24,14 @@ from jaxvib.ode.types import Y as IntegratorState
 from jaxvib.runtime.compat import fast_diffrax_loop_end
 
 BATCH_SIZE = 64
-"""Number of runs in a batch on a core: enough to fill its vector registers, few enough to fit into its cache."""
+"""Number of runs in a batch on a core: enough to fill the vector registers, and few enough to fit into the cache."""
 
-PARTS = 64
+PARTS_OF_RUN = 64
 """Number of equal parts of a run before its window; the mean speeds of the loads are measured over each part."""
 
 
 _DOUBLINGS = 40
-"""Number of doublings of the implicit step at the start, from 1e-12 of the regular step to the regular step."""
+"""Number of doublings with which the first implicit step, 1e-12 of the regular step, grows to the regular step."""
 
 
 @fast_diffrax_loop_end()
@@ -59,10 +59,10 @@ def advance(
 def stretches(
     motion: PackedSystem, packed: IntegratorState, length: Array, step: Array, number: int, *, implicit: bool
 ) -> tuple[IntegratorState, Array, Array]:
-    """Return the first state of the integrator, and the start times and lengths, s, of `number` stretches of the same `length`.
+    """Return the first state of the integrator, and the start times and lengths, s, of `number` parts of the same `length`.
 
-    Implicit steps do not resolve the acceleration of loads by drag at the start; therefore the first stretch begins with very
-    short steps, each twice as long as the previous one.
+    Regular implicit steps do not resolve the fast acceleration of loads by drag at the start. Therefore very short steps are
+    taken first, each twice as long as the previous one, and the first part begins at their end.
     """
     begins, lengths = length * jnp.arange(number, dtype=length.dtype), jnp.full(number, length)
     if not implicit:
@@ -94,7 +94,7 @@ class BatchPlan(NamedTuple):
     - `until`: end time, s
     - `window`: length of the measuring window at the end, s
     - `samples`: number of evenly spaced states in the window
-    - `each`: number of steps in each of the `PARTS` parts before the window
+    - `each`: number of steps in each of the `PARTS_OF_RUN` parts before the window
     - `between`: number of steps from one sample to the next
     - `implicit`: True if decay is too fast for explicit steps
     """
@@ -111,8 +111,8 @@ class BatchRun(NamedTuple):
     """A run with its measurements.
 
     **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured` and `regime` of the window; `part_speed`
-    (PARTS, count): mean speeds of the loads, rad/s, over the equal parts before the window, each `part_length` s long;
-    `finite`: true if the motion stayed finite.
+    (PARTS_OF_RUN, count): mean speeds of the loads, rad/s, over the equal parts before the window, each `part_length` s long;
+    `finite`: True if the motion stayed finite.
     """
 
     scene: Scene
@@ -127,14 +127,14 @@ class BatchRun(NamedTuple):
 def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     """Integrate the full equations from a state with equal steps, and measure the window at the end like `simulate`.
 
-    Under `vmap` all runs take the same steps: no run waits for another, and no result depends on the other runs.
+    Under `vmap` all runs take the same steps. No run waits for another, and no result depends on the other runs.
     """
     dtype = state.displacement.dtype
     single, has_common_turns = wrap_angles(scene, dtype)
     model = assemble(scene)
     field = dynamics_of(model)
     motion = pack_batch(field, state, single, has_common_turns, implicit=plan.implicit)
-    begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS
+    begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS_OF_RUN
     spacing = plan.window / (plan.samples - 1)
 
     def part(packed: IntegratorState, at: tuple[Array, Array]) -> tuple[IntegratorState, IntegratorState]:
@@ -148,11 +148,11 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
 
     first = motion.pack(state)
     sizes = jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype)
-    packed, begins, lengths = stretches(motion, first, *sizes, PARTS, implicit=plan.implicit)
+    packed, begins, lengths = stretches(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
     packed, parts = jax.lax.scan(part, packed, (begins, lengths))
     _, later = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
     before = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)
-    azimuth, _ = turning_angles(scene, lambda: length * jnp.arange(PARTS + 1, dtype=dtype), motion.unpack(before))
+    azimuth, _ = turning_angles(scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(before))
     states = motion.unpack(jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), packed, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)

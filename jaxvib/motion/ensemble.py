@@ -62,7 +62,7 @@ class EnsembleStatus(eqx.Enumeration):
     """Outcomes of a run of an ensemble. The value of each member is the message shown to the user."""
 
     done = "the run reached its end"
-    detached = "the run reached its end, but a load lost contact with its track, on which the equations hold it"
+    detached = "the run reached its end, but a load lost contact with its track; the equations keep it on the track"
     not_finite = "the motion grew without bounds"
     refused = REFUSED
     not_resolved = "the steps are too long for the decay of the loads by drag or of the machine by damping: use more steps"
@@ -75,18 +75,19 @@ class Ensemble(Result):
 
     **Attributes** (B runs)
 
-    - `state`: a `State` whose arrays have a leading axis over the runs, at the end; in single precision with angles within a
-      turn
+    - `state`: final `State` of each run, with arrays that have a leading axis over the runs; in single precision angles are
+      within one turn
     - `load_speed` (B, count), rad/s: the mean speed of each load over the last quarter of the run
-    - `error` (B,), estimated: as that of a `Run`, but for the end state alone, each run's displacements relative to its own
-      largest. NaN if no estimate was requested or the motion did not stay finite; infinite if 4 steps or fewer leave no larger
-      ones to compare with; typical: below 1e-6 with the default steps
-    - `allowed` (B,): False if `make` put a number into a scene that its constructor would not take
+    - `error` (B,): estimated error of the final state, as for a `Run`, with displacements relative to the largest displacement
+      of the same run; typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
+      finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
+    - `allowed` (B,): False if `make` returned a scene with a value that its constructor does not allow
     - `finite` (B,): True if the motion stayed finite
     - `resolved` (B,): False if explicit steps are too long for the fastest decay
-    - `detached` (B, count): True if a load's track, which only pushes, would have had to pull the load at any stage of any step
-    - `steps` that each run took
-    - `seconds` that all runs took, compilation included if a program was new; NaN under a JAX transformation
+    - `detached` (B, count): True if, at any stage of any step, the track would have had to pull the load although it can only
+      push
+    - `steps` of each run
+    - `seconds` for all runs together, including compilation if a program was new; NaN under a JAX transformation
     """
 
     state: State = eqx.field(metadata=part("run"))
@@ -147,30 +148,32 @@ def ensemble(
 ) -> Ensemble:
     """Integrate many scenes, or one scene from many starts, from 0 to `until` with equal steps.
 
-    - Runs advance together, `batch` at a time, every number of the state a contiguous array over them. Chunks are spread over
-      all cores, or all graphics processors; under a JAX transformation they follow each other
-    - Equal steps keep runs together that would wait for each other otherwise. Near the boundary between two outcomes they also
-      keep the choice of steps from deciding
-    - Other values need no new program if `make` is the same function and the same numbers are shared by all runs, nor does
-      another number of runs above `batch`. A function written in the call is another one each time
-    - In single precision angles are kept within a turn while time is integrated, so that long runs keep their phase
+    - Batches of `batch` runs advance together; each entry of the state is one contiguous array over the batch. Batches are
+      distributed over all cores or graphics processors; under a JAX transformation they are computed one after the other
+    - Because all runs have equal steps, no run waits for another. Near the boundary between two outcomes, the outcome does not
+      depend on an automatic choice of steps
+    - Compiled programs are used again for other values and other numbers of runs above `batch`, if `make` is the same function
+      object and the same parameters are shared by all runs. A lambda in the call is a new function in each call
+    - In single precision angles are kept within one turn during the integration, so that long runs keep their phase
 
     **Arguments**
 
-    - `make`: returns a run's `Scene`, which starts at rest, or its scene and `State`, from one entry of `values`. It is
-      compiled as by `jax.jit`, so everything else that it refers to must stay as it was at the first call
-    - `values`: an array with a leading axis over the runs, or a tree of them; typical: 64 to 100,000 runs
+    - `make`: a function of one entry of `values` that returns the `Scene` of a run, which starts at rest, or a tuple of the
+      scene and its initial `State`. It is compiled as by `jax.jit`: later changes of variables to which it refers have no
+      effect
+    - `values`: an array with a leading axis over the runs, or a tree of such arrays; typical: 64 to 100,000 runs
     - `until`: end time of all runs, s or text; typical: 5 to 60
     - `stepsize_controller`: `EqualSteps(n)`, the number of steps of each run, rounded up to a multiple of 4. The default is 4
-      for each radian of the fastest motion, and more if loads decay by drag, or the carrier by damping, faster than these
-      resolve: from 100 times as fast on all runs take implicit steps, 32 for each radian. The time grows in proportion to n
-    - `estimate`: True to estimate errors by a second run with half as many steps, which needs more than 4; it adds half the
-      time
-    - `batch`: number of runs that advance together; typical: the default. A larger batch needs more memory in proportion
-    - `equations`: a function that returns a scene's equations of motion, a module that is called as that of `vector_field`;
-      another one to compare a printed model with the scene's own
+      for each radian of the fastest motion, or more to resolve a faster decay of loads (drag) or carrier (damping). If a decay
+      is at least 100 times as fast as the motion, all runs take implicit steps, 32 for each radian. The time is proportional
+      to n
+    - `estimate`: True to estimate errors by a second run with half as many steps, which takes half the time of the first. It
+      requires more than 4 steps
+    - `batch`: number of runs that advance together; typical: the default. The memory is proportional to it
+    - `equations`: a function of a scene that returns its equations of motion, as `vector_field` (the default) does; another
+      function is useful to compare, for example, the equations of a paper with those of the scene
 
-    **Returns** `Ensemble`. Derivatives go through it in forward mode.
+    **Returns** `Ensemble`. Derivatives exist in forward mode only.
 
     **Raises** `InputError` for values that are not allowed, or leading axes that differ.
 
@@ -194,7 +197,7 @@ def ensemble(
     last, load_speed, apart, finite, detached, taken = ends
     error = np.full(plan.allowed.shape, np.inf if estimate else np.nan, plan.end.dtype)
     if plan.is_compared:
-        # Share of the difference for a method of order 3, which is conservative for this method of order 8.
+        # The share is that of a method of order 3. This is conservative, because the method has order 8.
         error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
@@ -219,7 +222,7 @@ def _run_batch(
     equations: Equations,
     implicit: bool,
 ) -> _Ends:
-    """Integrate a batch of runs; numbers in `own` have a leading axis over the runs, those in `common` are shared by all."""
+    """Integrate a batch of runs; arrays in `own` have a leading axis over the runs, arrays in `common` are shared by all."""
 
     def one(own: list[Array]) -> _Ends:
         mine, ours = iter(own), iter(common)
@@ -230,10 +233,11 @@ def _run_batch(
 
 
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
-    """Integrate a run in a few parts with equal steps, and once more for each further count of steps, by one program.
+    """Integrate a run with equal steps in `ENSEMBLE_PARTS` parts, once for each entry of `counts` (steps in a part).
 
-    **Returns** for the first run: the final state, the mean speeds of the loads over the last part, the distance of the final
-    state of the second run, True if it stayed finite, the loads that lost contact with their track, and the number of steps.
+    **Returns** for the first count: the final state, the mean speeds of the loads over the last part, the distance of the final
+    state from that with the last count, True if the motion stayed finite, True for loads that lost contact with their track,
+    and the number of steps.
     """
     single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
     watched = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
@@ -254,7 +258,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 
     helds, taken = jax.lax.map(whole, counts)
-    # Wrapped angles are counted from the first of the requested states.
+    # Wrapped angles are relative to the number of turns of the first unpacked state.
     ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
     pair = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds))
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
@@ -269,9 +273,10 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
 
 
 class _StateWithDetachment(State):
-    """State with the integral over time of the pull that each load's track would need to hold it so far, (loads,) N s.
+    """State with the time integral (loads,), N s, of the force max(-N, 0) with which each track would have had to pull its
+    load.
 
-    The integral is exactly 0 if the normal force N was nowhere negative, whatever the weights of the method's stages.
+    The integral is exactly 0 if the normal force N was never negative, for any weights of the stages of the method.
     """
 
     missing: Array

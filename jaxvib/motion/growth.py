@@ -1,4 +1,4 @@
-"""Growth of small disturbances of a motion: regular, unstable, chaotic, or not decided by the run."""
+"""Growth of small disturbances of a motion: regular, unstable, chaotic, or undecided."""
 
 from __future__ import annotations
 
@@ -34,22 +34,23 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-_THOUSANDFOLD, _DOUBLED = math.log(1e3), math.log(2.1)
-"""Logarithms of growth over the later half of a run: smallest value that is certainly exponential; largest value of growth in
-proportion to time, with a margin."""
+_EXPONENTIAL_LOG_GROWTH, _LINEAR_LOG_GROWTH = math.log(1e3), math.log(2.1)
+"""Logarithms of growth over the later half of a run: above the first the growth is exponential; below the second it can be
+proportional to time (a factor of 2, with a margin)."""
 
 _MAX_LOG_GROWTH_OF_ERRORS = math.log(1.01)
 """Largest logarithm of growth over the later half of a run that integration errors can cause."""
 
 _MAX_GROWTH_RATIO_OF_QUARTERS = 0.85
-"""Largest ratio of growth in the last quarter of a run to that in the quarter before, for growth that is not exponential;
-growth in proportion to time has 0.71, exponential growth 1."""
+"""Largest ratio of the growth rate in the last quarter of a run to that in the quarter before, for growth that is not
+exponential. The ratio is 0.71 for growth proportional to time, and 1 for exponential growth."""
 
 _RETURN_DISTANCE = 1e-2
-"""Distance from a previous state at which a motion has returned to it, relative to the largest distance in between."""
+"""Distance from a previous state below which a motion has returned to it, relative to the largest distance in between."""
 
-_TURNS, _SAMPLES = 3.0, 4096
-"""Turns of the slowest of rotor and loads in which a motion must return to count as periodic, and samples of that stretch."""
+_TURNS_TO_RETURN, _SAMPLES_OF_RETURN = 3.0, 4096
+"""Number of turns of the slowest of rotor and loads within which a periodic motion must return to its state, and number of
+samples in this time."""
 
 
 class GrowthStatus(eqx.Enumeration):
@@ -70,10 +71,11 @@ class Growth(Result):
 
     - `status`: a `GrowthStatus`
     - `exponent`: the largest Lyapunov exponent, 1/s, and its standard error `uncertainty`, over the later half of the stretches
-    - `horizon`, s: time after which rounding is as large as the motion itself, ln(1/eps)/exponent. A derivative with respect to
-      a parameter of the scene has grown by 1/eps then, and says nothing about a change that is larger than rounding. Infinite
-      for a regular motion; for an undecided one the shortest that the rates allow, ln(1/eps)/(exponent + 3 uncertainty)
-    - `rates` (stretches,), 1/s: of each stretch; the stretches end at `time`, s
+    - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent. A
+      derivative with respect to a parameter has then grown by 1/eps, and predicts nothing about a change that is larger than
+      rounding. It is infinite for a regular motion; for an undecided one it is a lower bound,
+      ln(1/eps)/(exponent + 3 uncertainty)
+    - `rates` (stretches,): growth rate in each stretch, 1/s; `time` (stretches,): end of each stretch, s
     """
 
     status: GrowthStatus
@@ -107,36 +109,36 @@ def growth(
     separation: Number | None = None,
     stretches: int = 40,
 ) -> Growth:
-    """Estimate the largest Lyapunov exponent of a motion: the rate at which two motions separate that begin close together.
+    """Estimate the largest Lyapunov exponent of a motion: the rate at which two motions with nearly equal starts separate.
 
         exponent = mean of ln(d_k / d_0) / T over the later stretches of length T
 
-    A second motion starts at the distance d_0. After each stretch it is put back to this distance, in its current direction
+    A second motion starts at the distance d_0. After each stretch its distance is reset to d_0 in the current direction
     (Benettin's method).
 
-    Derivatives of a run grow at the same rate. If it is positive, a derivative of a run that is longer than the horizon has no
-    meaning, however exactly it is computed. Use derivatives of shorter runs, of averages over many starts, or of exact motions
-    (`jam_orbit`) then.
+    Derivatives of a run grow at the same rate. If the rate is positive, a derivative of a run that is longer than the horizon
+    is meaningless, however exactly it is computed. Use derivatives of shorter runs, of averages over many starts, or of exact
+    motions (`jam_orbit`) instead.
 
-    The later half of the run decides, with G the logarithm of the growth over it and s its standard error:
+    The result depends on the later half of the run. With G the logarithm of the growth in this half and s its standard error:
 
-    - "chaotic" or "unstable": G > 3 s and G > ln 1000, at rates that agree in both quarters. The motion is unstable if it
-      returns to its former state within three turns of its rotor and loads, an unstable jam for example, whose exponent is
-      ln|multiplier| over the period of `jam_orbit`; a motion of several periods that is unstable counts as chaotic
-    - "regular": G + 3 s < ln 1000 and G < 2 s, or, if G < ln 2.1, the rates fade as those of a growth in proportion to time do
-    - "undecided": everything else, for example a rate that is certain in a run in which it does not reach ln 1000
+    - "chaotic" or "unstable": G > 3 s and G > ln 1000, with rates that agree in both quarters. The motion is unstable if it
+      returns to its former state within three turns of its rotor and loads. An unstable jam is an example; its exponent is
+      ln|multiplier| divided by the period of `jam_orbit`. An unstable motion that repeats itself only after more turns is
+      called chaotic
+    - "regular": G + 3 s < ln 1000 and G < 2 s; or G < ln 2.1 with rates that decrease as for growth proportional to time
+    - "undecided": all other cases, for example if the rate is certain but the run is too short to reach ln 1000
 
-    A motion that leaves an unstable one during the run, as every motion does sooner or later by rounding, is judged by the
-    motion that it reaches.
+    Rounding makes every run leave an unstable motion after some time. The result then belongs to the motion that it reaches.
 
     **Arguments**
 
     - `scene` with a drive of constant speed, or with several exciters, whose drives may be motors
-    - `until`, s or text: approximate length of all stretches together; each is a whole number of turns of the rotor; typical:
-      20 to 200
-    - `start`, `mode`, `separation` as `simulate`
-    - `stretches`, at least 8; typical: 40 (the default). They must be so many that two motions which differ by rounding are
-      still close to each other after one stretch
+    - `until`, s or text: approximate length of all stretches together; each stretch is a whole number of turns of the rotor;
+      typical: 20 to 200
+    - `start`, `mode`, `separation`: as for `simulate`
+    - `stretches`: number of stretches, at least 8; typical: 40 (the default). One stretch must be so short that two motions
+      with the initial distance d_0 are still close to each other at its end
 
     **Returns** `Growth`. **Raises** `InputError` for a drive whose speed changes; `ComputationError` for a run that fails.
 
@@ -170,7 +172,7 @@ def growth(
 
     rng, rates, other, quarters = np.random.default_rng(0), [], None, []
     for k in range(stretches):
-        if other is None:  # in a direction that differs from that of the motion, in which nothing grows
+        if other is None:  # a random direction, because disturbances along the motion do not grow
             scale = error_scale(jax.tree.map(lambda x: x[None], state), unit)
             noise = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state)
             other = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, separation)
@@ -196,28 +198,28 @@ def growth(
 
 
 def _classify_growth(late: np.ndarray) -> str:
-    """Return the name of the `GrowthStatus` from logarithms `late` (n,) of the growth in each stretch of a run's later half.
+    """Return the name of the `GrowthStatus` from the logarithms `late` (n,) of the growth in the stretches of the later half.
 
-    Periodic motions are not distinguished here: "chaotic" includes "unstable".
+    This function does not test whether the motion is periodic: "chaotic" includes "unstable".
     """
     grown, error = float(np.sum(late)), _sum_error(late)
     first, last = np.split(late, [late.size // 2])
     rising = float(np.mean(last) - np.mean(first))
-    if grown > max(3.0 * error, _THOUSANDFOLD):
+    if grown > max(3.0 * error, _EXPONENTIAL_LOG_GROWTH):
         spread = math.hypot(*(_sum_error(quarter) / quarter.size for quarter in (first, last)))
         return "chaotic" if abs(rising) < max(3.0 * spread, 0.25 * float(np.mean(late))) else "undecided"
-    fades = grown < _DOUBLED and float(np.mean(last)) < _MAX_GROWTH_RATIO_OF_QUARTERS * float(np.mean(first))
-    seen = grown > max(2.0 * error, _MAX_LOG_GROWTH_OF_ERRORS)
-    return "regular" if grown + 3.0 * error < _THOUSANDFOLD and (fades or not seen) else "undecided"
+    decreases = grown < _LINEAR_LOG_GROWTH and float(np.mean(last)) < _MAX_GROWTH_RATIO_OF_QUARTERS * float(np.mean(first))
+    is_resolved = grown > max(2.0 * error, _MAX_LOG_GROWTH_OF_ERRORS)
+    return "regular" if grown + 3.0 * error < _EXPONENTIAL_LOG_GROWTH and (decreases or not is_resolved) else "undecided"
 
 
 def _sum_error(values: np.ndarray) -> float:
-    """Return the standard error of the sum of values (n,) of which only neighbours are correlated.
+    """Return the standard error of the sum of values (n,); only neighbouring values are correlated.
 
         s^2 = n c_0 + 2 (n - 1) c_1
 
-    with the autocovariances c_k; the result is at least the error of one value. If the phase of the motion differs between the
-    ends of stretches, logarithms of growth are large and cancel each other.
+    with the autocovariances c_k; the result is at least the error of one value. The correlation matters: if the phase of the
+    motion differs between the ends of stretches, neighbouring logarithms of growth are large and cancel each other.
     """
     off = values - np.mean(values)
     each = float(np.sum(off**2)) / (values.size - 1)
@@ -231,8 +233,8 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
         turning += [*np.abs(np.ravel(own.rate[0]))] if own.rate else [] if own.rotor is None else [abs(own.rotor[1])]
     slowest = min([speed, *(float(w) for w in turning if w > 1e-2 * speed)])
     run = simulate(
-        scene, _TURNS * 2.0 * math.pi / slowest, start=state, samples=_SAMPLES, stepsize_controller=steps, estimate=False,
-        throw=False,
+        scene, _TURNS_TO_RETURN * 2.0 * math.pi / slowest, start=state, samples=_SAMPLES_OF_RETURN, stepsize_controller=steps,
+        estimate=False, throw=False,
     )  # fmt: skip
     if run.trajectory is None or not bool(run.finished):
         return False
@@ -249,13 +251,13 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
 
 
 def _distance(a: State, b: State, scale: State) -> float:
-    """Return the Euclidean distance of two states, each number in units of the scale of its part."""
+    """Return the Euclidean distance of two states, with each entry in units of the scale of its part."""
     parts = jax.tree.leaves(jax.tree.map(lambda x, y, s: np.sum(((np.asarray(y) - np.asarray(x)) / s) ** 2), a, b, scale))
     return math.sqrt(float(sum(parts)))
 
 
 def _at_distance(a: State, b: State, scale: State, separation: float) -> State:
-    """Return the state at the distance `separation` from `a` towards `b`; if both are equal, `a` with moved displacements."""
+    """Return the state at the distance `separation` from `a` towards `b`; if both are equal, displacements are changed."""
     distance = _distance(a, b, scale)
     if distance == 0.0:
         return eqx.tree_at(lambda s: s.displacement, a, a.displacement + separation * scale.displacement)

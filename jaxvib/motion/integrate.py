@@ -29,14 +29,14 @@ from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-WINDOW = 4096
-"""Samples in the window over which amplitudes and speeds are measured."""
+WINDOW_SAMPLES = 4096
+"""Number of samples in the measuring window."""
 
-PER_TURN = 16
-"""Minimum number of samples in a turn of the rotor; the interpolant between them then has an error of 1e-7."""
+MIN_SAMPLES_PER_TURN = 16
+"""Smallest number of samples in a turn of the rotor; the interpolant between samples then has an error of 1e-7."""
 
 _UNBOUNDED_FACTOR = 1e8
-"""Factor on the initial displacement, or on the natural units, beyond which a motion is unbounded."""
+"""Displacement, in units of the initial displacement or of the natural unit, beyond which a motion counts as unbounded."""
 
 
 class StepControl(eqx.Module):
@@ -48,7 +48,7 @@ class StepControl(eqx.Module):
 
 
 def repeat_per_coordinate(unit: State, state: State) -> State:
-    """Return natural units with one for each coordinate of a load in the state."""
+    """Return the natural units of a state, with one unit for each coordinate of the loads."""
 
     def repeated(unit: ExciterState, own: ExciterState) -> ExciterState:
         number, spin = len(own.angle), unit.spin
@@ -102,10 +102,10 @@ def effects_rate(scene: Scene) -> Array:
 
 @cached
 def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
-    """Return the largest and the smallest of the rotor's speed and the natural frequencies, rad/s.
+    """Return the largest and the smallest of rotor speed and natural frequencies, rad/s.
 
-    The frequency 0 of a free carrier does not count. The largest one includes the loads' natural frequency, if they have one,
-    and the rates that effects add.
+    A natural frequency of 0 (a free carrier) is ignored. The largest value includes the natural frequency of the loads, if they
+    have one, and the rates of effects.
     """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = estimated_frequencies(scene), scene.top_speed
@@ -118,8 +118,8 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 
 
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
-    """Return True if angles are wrapped into a turn (single precision), and True if all loads' angles are wrapped by the same
-    turns (loads in contact)."""
+    """Return two flags: True if angles are kept within one turn (single precision); True if the same number of turns is
+    subtracted from the angles of all loads (loads in contact)."""
     return jnp.dtype(dtype).itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 
@@ -145,7 +145,7 @@ def integrate(
     scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
     """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured`."""
-    # A start that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
+    # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
@@ -177,13 +177,13 @@ def integrate(
     whole = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
     if is_measured is None:
         numbers = measure(model, field, times, states, unit)
-    else:  # the window of a run with larger steps is only compared
+    else:  # of a run with larger steps only the states are used
         numbers = jax.lax.cond(
             is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(model, states)
         )
     numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
-    # A run that did not reach its end has no window; the state at which it stopped shows if it diverged.
+    # A run that did not reach its end has no window; its last state shows if it diverged.
     ended = solution.result == diffrax.RESULTS.successful
     bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
@@ -206,10 +206,10 @@ def integrate(
 
 
 def _saves(scene: Scene, end: Array, slowest: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:
-    """Return the times of stored states: the measuring window, the end, and even times over the whole run."""
-    longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.top_speed))
+    """Return the times of stored states: the measuring window, the end, and evenly spaced times over the whole run."""
+    longest = 2.0 * jnp.pi * WINDOW_SAMPLES / (MIN_SAMPLES_PER_TURN * jax.lax.stop_gradient(scene.top_speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.turns / slowest, longest), end / 2.0)
-    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW)), diffrax.SubSaveAt(t1=True)]
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW_SAMPLES)), diffrax.SubSaveAt(t1=True)]
     if plan.samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, plan.samples)))
     return saves
@@ -229,25 +229,25 @@ def _steps(
         if control.steps is not None:
             first = end / jnp.asarray(control.steps)
         if control.tolerance is not None:
-            # The first step follows the tolerance by the order 8 of the error: runs with two tolerances then differ at once.
+            # The first step depends on the tolerance as steps of a method of order 8 do: two tolerances give different steps.
             first = 0.4 * jnp.asarray(control.tolerance) ** (1.0 / 9.0) / fastest
         return first, _controller(motion, state, unit, control)
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
 
 
 def _is_coincident(angles: list[Array]) -> Array:
-    """Return True if several loads of an exciter have one angle (..., count) all the time, up to growing rounding errors."""
+    """Return True if several loads of an exciter have the same angle at all times (..., count), except for rounding errors."""
 
     def one_angle(angle: Array) -> Array:
-        apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
-        return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
+        spread = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
+        return (angle.shape[1] > 1) & (spread < jnp.finfo(angle.dtype).eps ** 0.4)
 
     return functools.reduce(jnp.logical_or, map(one_angle, angles)) if angles else jnp.zeros((), bool)
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:
-    """Return True if the displacement of the carrier exceeds its start and its natural units by the factor
-    `_UNBOUNDED_FACTOR`."""
+    """Return True if the displacement or velocity of the carrier exceeds its initial value and its natural unit by the factor
+    `_UNBOUNDED_FACTOR`, or if the last state is not finite."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
     beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED_FACTOR * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
     return beyond[0] | beyond[1] | ~is_finite(last)
@@ -274,14 +274,14 @@ def is_finite(state: Any) -> Array:
 
 
 _MAX_TURNS = 1e15
-"""Largest number of turns that double precision counts one by one."""
+"""Largest number of turns that double precision resolves."""
 
 
 def whole_turns(scene: Scene, stretch: float) -> float:
-    """Return the longest time within `stretch`, s, of whole turns of all rotors with constant speed; at least one turn.
+    """Return the longest time within `stretch`, s, that is a whole number of turns of all rotors, but at least one turn.
 
-    If there are several rotors, only those with an imbalance count. The rotor of a motor does not count, since its angle is
-    part of the state. **Raises** `InputError` for rotors with an imbalance at different speeds.
+    The rotors of motors are ignored, because their angles are part of the state. If there are several rotors, only those with
+    an imbalance are considered. **Raises** `InputError` for rotors with an imbalance at different speeds.
     """
     one = len(scene.exciters) == 1
     counted = [

@@ -1,7 +1,7 @@
-"""Plans of runs: choices that depend on parameters of a scene, made on the host before a program is traced.
+"""Plans of runs: choices that depend on parameters of a scene and are made on the host, before a program is traced.
 
-Only this module tests which numbers are known. The method and static sizes (samples, steps, stretches) follow from known
-numbers; under a JAX transformation sizes have fixed values.
+Only this module tests which values are known (not traced). The method and static sizes (samples, steps, stretches) depend on
+known values; under a JAX transformation the sizes are fixed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
-from jaxvib.motion.integrate import PER_TURN, IntegrationPlan, StepControl, frequency_bounds
+from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, IntegrationPlan, StepControl, frequency_bounds
 from jaxvib.motion.start import Start, initial_state, require_start, validate_state, with_spin, with_spin_up_drive
 from jaxvib.motion.steps import Accuracy, EqualSteps, StepChoice, Tolerance, require, small_number
 from jaxvib.motion.stiffness import fastest_decay, steps_of, stiff_solver
@@ -42,12 +42,12 @@ MAX_STEPS = 2**31 - 1
 """Largest value of `max_steps`."""
 
 _UNKNOWN_STEPS, _UNKNOWN_SAMPLES = 2**20, 2000
-"""Maximum number of steps, and samples, of a run with unknown length or speeds."""
+"""Maximum number of steps, and number of samples, of a run whose length or speeds are unknown."""
 
 _FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
 
-_IMPLICIT_SHARE = 16.0
-"""Factor on the maximum number of steps for runs by the implicit method."""
+_IMPLICIT_STEPS_FACTOR = 16.0
+"""Factor by which the implicit method increases the default of `max_steps`."""
 
 _STRETCH_TURNS = 2.0e4
 """Number of turns after which single precision no longer resolves time; longer runs are divided into stretches."""
@@ -57,14 +57,18 @@ _STRETCH_TURNS = 2.0e4
 class RunPlan:
     """Plan of a run.
 
-    **Attributes**: `asked`: the scene of the call; `scene`: the scene of the run, with the drive that belongs to its start;
-    `end`, s; `state` at the start; `integration`: the static choices of one integration; `stretches`: the number of parts of
-    the run; `is_known`: true if scene, end and state have values; `is_estimated`: true if a second run with larger steps
-    estimates the error; `accuracy` that repeated runs must reach, or None; `fastest` rate of the motion, rad/s, NaN if it is
-    not needed.
+    **Attributes**
+
+    - `given_scene`: the scene of the call; `scene`: the scene of the run, with a spin-up drive for the start "spin_up"
+    - `end`, s; `state` at the start
+    - `integration`: the static choices of one integration; `stretches`: the number of consecutive integrations
+    - `is_known`: True if scene, end and state have values
+    - `is_estimated`: True if a second run with larger steps estimates the error; `accuracy`: the error that repeated runs must
+      reach, or None
+    - `fastest`: fastest rate of the motion, rad/s, NaN if it is not needed
     """
 
-    asked: Scene
+    given_scene: Scene
     scene: Scene
     end: Array
     state: State
@@ -96,14 +100,18 @@ def plan_run(
     throw: bool,
 ) -> RunPlan:
     """Validate the arguments of `simulate` and choose method, steps and sizes of its run. **Raises** `InputError`."""
-    asked = validate_scene(scene)
+    given_scene = validate_scene(scene)
     end = known_number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
-    samples = _enough_samples(asked, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(asked))
+    samples = (
+        _enough_samples(given_scene, end)
+        if samples is None
+        else count(samples, "samples", low=2, each=_sample_size(given_scene))
+    )
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _step_control(end, steps, estimate)
-    scene = with_spin_up_drive(asked, end, start, spin_up)
+    scene = with_spin_up_drive(given_scene, end, start, spin_up)
     state = start_state(scene, start, mode, separation, throw=throw)
 
     known = is_known(scene, end, state)
@@ -114,7 +122,7 @@ def plan_run(
     fastest = numpy_of_known(frequency_bounds(scene)[0]) if is_rate_needed else np.asarray(np.nan, end.dtype)
     stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
     if max_steps is None:
-        max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_SHARE) * fastest, end)
+        max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
         # The caller may differentiate the run, and derivatives of the unrolled step take several times as long to compile.
         forward = isinstance(adjoint, diffrax.ForwardMode)
@@ -129,7 +137,7 @@ def plan_run(
         and scene.drive.constant
     )
     return RunPlan(
-        asked=asked,
+        given_scene=given_scene,
         scene=scene,
         end=end,
         state=state,
@@ -162,7 +170,7 @@ def start_state(
 def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
     """Return a maximum number of steps: 500 for each turn of the `fastest` motion, rad/s, rounded up to a power of 2.
 
-    The number can be a static part of a program; powers of 2 keep the number of programs small. **Raises** `InputError` for a
+    The number can be a static argument of a program; with powers of 2, few programs are compiled. **Raises** `InputError` for a
     run that would need too many steps.
     """
 
@@ -178,20 +186,20 @@ def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
 
 
 def _enough_samples(scene: Scene, end: Array) -> int:
-    """Return a number of samples that resolve the vibration in a figure without a beat.
+    """Return a number of samples that is large enough to show the vibration in a figure without aliasing.
 
-    It is one of two numbers, which keeps the number of programs small.
+    It has one of two values, so that few programs are compiled.
     """
 
     def samples_of(end: float, speed: float) -> int:
-        return _FEW_SAMPLES if PER_TURN * end * speed / (2.0 * math.pi) <= _FEW_SAMPLES else _MANY_SAMPLES
+        return _FEW_SAMPLES if MIN_SAMPLES_PER_TURN * end * speed / (2.0 * math.pi) <= _FEW_SAMPLES else _MANY_SAMPLES
 
     samples = when_known(samples_of, end, scene.top_speed)
     return _UNKNOWN_SAMPLES if samples is None else samples
 
 
 def _sample_size(scene: Scene) -> float:
-    """Return the size of a stored state with its forces in bytes, times three copies during the computation."""
+    """Return the memory of a stored state with its forces, bytes; the computation needs three copies."""
     structure = scene.machine.structure()
     numbers = 2 * structure.mass.shape[0] + structure.foundation_stiffness.shape[0] + 1
     for exciter in scene.exciters:
@@ -223,7 +231,7 @@ def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) 
 ENSEMBLE_PARTS = 4
 """Number of equal parts of a run of an ensemble; mean speeds are taken over the last part."""
 
-_EXPLICIT_PER_RADIAN, _LEAST_STEPS = 4.0, 16
+_EXPLICIT_STEPS_PER_RADIAN, _MIN_STEPS = 4.0, 16
 
 
 class EnsemblePlan(NamedTuple):
@@ -232,14 +240,14 @@ class EnsemblePlan(NamedTuple):
     **Attributes**
 
     - `scenes` with a leading axis over the runs
-    - `allowed`: true for each run with numbers that the constructors accept; `is_allowed`: true if all are accepted
-    - `own`: numbers of scenes and states that differ between runs; `common`: numbers that all runs share; `is_shared`: true for
-      each shared number, in their order; `form`: the structure of scene and state for these numbers
+    - `allowed`: True for each run whose values the constructors allow; `is_allowed`: True if this holds for all runs
+    - `own`: arrays of scenes and states that differ between runs; `common`: arrays that all runs share; `is_shared`: True for
+      each shared array, in the order of both; `form`: the structure of scene and state without these arrays
     - `end`, s
     - `each`: number of steps in each of the `ENSEMBLE_PARTS` of a run; `coarse`: that of a second run with larger steps;
-      `is_compared`: true if there is a second run
-    - `decay` of each scene, 1/s; `implicit`: true for implicit steps
-    - `batch`: number of runs in a batch; `is_known`: true if all numbers have values
+      `is_compared`: True if there is a second run
+    - `decay`: fastest decay rate of each scene, 1/s; `implicit`: True for implicit steps
+    - `batch`: number of runs in a batch; `is_known`: True if all parameters have values
     """
 
     scenes: Scene
@@ -277,7 +285,7 @@ def plan_ensemble(
     known_end = known_number(until, "s", "until", low=0.0, open_low=True)
     end = jnp.asarray(known_end, dtype=float)
     batch = min(count(batch, "batch"), runs)
-    scenes, states, allowed = _made(make, values)
+    scenes, states, allowed = _build_scenes(make, values)
     if (is_positive := unknown_is_positive(known_end)) is not None:
         allowed = allowed & is_positive
     require_start(scenes, states)
@@ -292,14 +300,14 @@ def plan_ensemble(
         most = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
         most = most if bool(np.any(allowed)) else [1.0, 0.0]
         step, implicit = steps_of(
-            most[0], most[1], _EXPLICIT_PER_RADIAN, float(end) / number_of_steps if number_of_steps else None
+            most[0], most[1], _EXPLICIT_STEPS_PER_RADIAN, float(end) / number_of_steps if number_of_steps else None
         )
-        number_of_steps = number_of_steps or max(_LEAST_STEPS, math.ceil(float(end) / step - 1e-9))
+        number_of_steps = number_of_steps or max(_MIN_STEPS, math.ceil(float(end) / step - 1e-9))
     each = -(-number_of_steps // ENSEMBLE_PARTS)
     coarse = -(-each // 2)
 
     leaves, structure = jax.tree.flatten((scenes, states))
-    # A number that all runs share stays a scalar; at least one number is an array, which defines the number of runs.
+    # A value that all runs share stays a scalar. At least one value must be an array, because it defines the number of runs.
     is_shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in leaves]
     is_shared[0] = is_shared[0] and not all(is_shared)
     return EnsemblePlan(
@@ -322,16 +330,16 @@ def plan_ensemble(
 
 
 @eqx.filter_jit
-def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State, Array]:
-    """Return the scenes, their initial states, and true for scenes with allowed numbers, with a leading axis over the runs."""
+def _build_scenes(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State, Array]:
+    """Return the scenes, their initial states, and True for scenes with allowed values, with a leading axis over the runs."""
 
     def one(value: PyTree[Array]) -> tuple[Scene, State, Array]:
-        given = call_user(make, "make", value)
-        if isinstance(given, Scene):
-            given = given, initial_state(given)
-        scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
+        returned = call_user(make, "make", value)
+        if isinstance(returned, Scene):
+            returned = returned, initial_state(returned)
+        scene, state = returned if isinstance(returned, tuple) and len(returned) == 2 else (None, None)
         if not isinstance(scene, Scene) or not isinstance(state, State):
-            raise InputError("make", f"returns {quoted(given)}; it must return a Scene, or a Scene and a State")
+            raise InputError("make", f"returns {quoted(returned)}; it must return a Scene, or a Scene and a State")
         scene = validate_scene(scene)
         allowed = allowed_unknowns(scene)
         return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed
@@ -346,7 +354,7 @@ def _rates(scenes: Scene) -> tuple[Array, Array]:
 
 
 def with_settled_drives(scene: Scene, problem: str) -> Scene:
-    """Return the scene with motors that are off from the start if they are switched off later.
+    """Return the scene with motors switched off from the start if they are switched off during the run.
 
     **Raises** `InputError` with the `problem` for an ideal drive whose speed changes, and for the motor of a single exciter
     with loads.

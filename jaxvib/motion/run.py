@@ -82,7 +82,8 @@ _MIN_TURNS = 3
 class Run(AbstractMeasured, PathsOfPoints, Result):
     """Run of a scene: the quantities measured over its last turns (see `AbstractMeasured`), and the motion itself.
 
-    `ellipse` and `deck` describe the motion of points by the harmonic of `omega` that fits the window by least squares.
+    `ellipse` and `deck` describe the motion of points by a harmonic with the frequency `omega`, fitted to the window by least
+    squares.
 
     Returned by `simulate` and `settle`.
 
@@ -91,23 +92,24 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     - `status`: a `RunStatus`
     - `trajectory`: evenly spaced states over the whole run; None if only the window was requested
     - `window`: the densely sampled end of the run, over which quantities are measured
-    - `steps` taken, and how many of them were `rejected`
-    - `error`, estimated; NaN if no estimate was requested, infinite if it cannot be estimated; typical: 1e-8 to 1e-5
-    - `scene` that ran
-    - `coincident`: True if several loads started at one angle and stayed at one angle, as loads with the same numbers do even
-      if that is unstable. If such a motion repeats itself, the linearized equations show whether loads a little apart leave it;
-      its status is then `would_separate`, and it is not `settled`
-    - `engine` of the integration: "scalar" if the equations ran on scalars, which takes 2.5 to 50 times less time, or
-      "array", for states of more than 32 numbers and for 4 loads and more
-    - `evaluations` of the vector field (0 if the method does not count them) and `seconds`: the cost, including the runs with
-      larger steps for the error, and compilation if the program was new; `seconds` is NaN under a JAX transformation
+    - `steps`: number of accepted and rejected steps; `rejected`: number of rejected steps
+    - `error`: estimated error; NaN if no estimate was requested, infinite if it cannot be estimated; typical: 1e-8 to 1e-5
+    - `scene` of the run
+    - `coincident`: True if several loads started at one angle and stayed at one angle. Loads with the same parameters do so
+      even if this motion is unstable. If such a motion settles, its stability is tested by the linearized equations; if
+      slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`
+    - `engine` of the integration: "scalar" if the equations are computed on scalars, which takes 2.5 to 50 times less time, or
+      "array", for states of more than 32 entries and for 4 loads and more
+    - `evaluations` of the vector field (0 if the method does not count them), and `seconds` of the computation. Both include
+      the run with larger steps for the error; `seconds` includes compilation if the program was new, and is NaN under a JAX
+      transformation
 
-    The `error` is that of everything in the window at the end: displacements and velocities relative to the largest, angles in
-    rad, speeds of loads relative to the rotor's.
+    The `error` is the largest error of a state in the window: displacements and velocities relative to the largest, angles in
+    rad, speeds of loads relative to the rotor speed.
 
-    - It is the part of the difference to a run with larger steps that may remain with smaller ones, and twice of it if an
-      effect is not `smooth`; rounding counts too
-    - A motion that forgets its phase has a large error, but may have exact amplitudes
+    - It is estimated as a fraction of the difference to a run with larger steps, or as twice this difference if an effect is
+      not `smooth`; rounding errors are added
+    - A motion whose phase is not determined has a large error, but its amplitudes may be exact
     """
 
     status: RunStatus
@@ -124,7 +126,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def settled(self) -> Array:
-        """True if the motion repeats itself, judged by amplitudes and speed, and loads a little apart do not leave it."""
+        """True if amplitudes and speed no longer change, and slightly separated loads do not leave the motion."""
         return (self.drift < SETTLED_DRIFT) & (self.status != RunStatus.would_separate)
 
     @property
@@ -162,7 +164,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def _turning(self) -> str:
-        """Name of what `load_speed` belongs to."""
+        """Name of the masses to which `load_speed` belongs: loads, exciters, or both."""
         has_loads = [exciter.loads is not None for exciter in self.scene.exciters]
         return "loads" if all(has_loads) else "loads and exciters" if any(has_loads) else "exciters"
 
@@ -171,7 +173,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         if not np.any(np.isfinite(times)):
             return []
         left = ", ".join(f"{j + 1} at {t:.6g} s" for j, t in enumerate(times) if np.isfinite(t))
-        return [f"  detached: loads lost contact with their track (load {left}), on which the equations hold them"]
+        return [f"  detached: loads lost contact with their track (load {left}); the equations keep them on the track"]
 
     @property
     def regime(self) -> Regime:
@@ -180,10 +182,10 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def detached(self) -> Array:
-        """Time at which each load first lost contact with a track that can only push, (loads,) s, among the stored states.
+        """Time, s, at which each load (loads,) first lost contact with its track, according to the stored states.
 
-        NaN for a load that kept contact throughout, and for loads that are held from both sides. The equations keep the load on
-        its track, so the computed motion after this time is not that of a real load.
+        It is NaN for a load that never lost contact, and for loads that their track holds from both sides. The equations keep
+        the load on its track; after this time the computed motion is therefore not that of a real load.
         """
         loads = [exciter.loads for exciter in self.scene.exciters if exciter.loads is not None]
         is_pushed = np.repeat([each.one_sided for each in loads], [each.count for each in loads])
@@ -196,8 +198,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot time histories: platforms, speeds of loads and rotor, foundation force.
 
-        To the left the whole run as bands between its peaks (the window if nothing else was kept), to the right its last three
-        periods, which show the phases.
+        The left column shows the whole run as bands between its peaks (or the window, if only this was kept). The right column
+        shows the last three periods, with the phases.
 
         **Arguments**
 
@@ -216,15 +218,15 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @validated
     def spectrum(self, parts: int = 1) -> Spectrum:
-        """Return the frequencies of the motion over the window, or over `parts` segments of the whole run.
+        """Return the spectrum of the window, or the spectra of `parts` segments of the whole run.
 
         **Arguments**: `parts`: number of segments; neighbouring segments overlap by one half; typical: 10 to 60 for a run-up.
-        More segments resolve time better and frequency worse.
+        More segments give a better resolution in time and a poorer one in frequency.
 
-        **Returns** `Spectrum`; of several parts its figure is a waterfall, with resonances marked.
+        **Returns** `Spectrum`; for several segments its figure is a waterfall diagram, with resonances marked.
 
-        **Raises** `InputError` for more parts than there are samples for, and for several parts if the run kept its window
-        only.
+        **Raises** `InputError` for more segments than the samples allow, and for several segments if the run kept only its
+        window.
         """
         return spectrum_of(self.scene, self.window, self.trajectory, parts)
 
@@ -237,17 +239,17 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         **Arguments**: `at` and `body` as in `ellipse`; typical: (1.2, 0.3); `part`: "window", the end of the run, or "all".
 
         **Returns** `PointMotion`. **Raises** `InputError` for a place that the machine does not have, and for "all" if the run
-        kept its window only.
+        kept only its window.
         """
         kept = self.window if part == "window" else self.trajectory
         if kept is None:
-            raise InputError("part", "is 'all', but the run kept its window only; simulate with save='all'")
+            raise InputError("part", "is 'all', but the run kept only its window; simulate with save='all'")
         return motion_of_point(self.scene.machine, kept, on_body(read_place(at, "at"), self.scene.machine.require_body(body)))
 
     def harmonic(self) -> Harmonic:
-        """Return the harmonic of `omega` that fits the window by least squares, see `fit_harmonic`.
+        """Return the harmonic with the frequency `omega` that is fitted to the window, see `fit_harmonic`.
 
-        **Raises** `InputError` if the exciters make less than 3 turns in the window.
+        **Raises** `InputError` if the exciters make fewer than 3 turns in the window.
         """
         when_known(_require_turns, self.window.time, self.omega)
         amplitude, rest = fit_harmonic(self.window.time, self.window.state.displacement, self.omega)
@@ -255,7 +257,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @validated
     def plot_path(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the path of a rotor's axis across and up over the last three periods, mm; at every station if the rotor tilts.
+        """Plot the path of a rotor's axis over the last three periods, mm; the path at each station if the rotor tilts.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a machine that moves up and down only.
         """

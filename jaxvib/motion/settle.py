@@ -18,7 +18,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation
-from jaxvib.motion.integrate import WINDOW, frequency_bounds, whole_turns
+from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turns
 from jaxvib.motion.plan import RunPlan, plan_stretch, start_state, with_settled_drives
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
@@ -32,26 +32,28 @@ from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 
 _MEAN_STRETCHES = 32
-"""Number of stretches, of 100 slow periods each, on which the decision about a steady mean is based."""
+"""Number of stretches, of 100 slow periods each, that show whether a motion is steady in the mean. A slow period is a period of
+the lowest natural frequency."""
 
 _MAX_QUARTER_DIFFERENCE = 3.6
-"""Largest difference of the means over the four quarters of these stretches that counts as chance, in standard errors, 95 %."""
+"""Difference between the means of the four quarters of these stretches, in standard errors, that scatter alone exceeds in 5 %
+of cases."""
 
 _MAX_DISTANCE_IN_DRIFTS = 10.0
 """Largest distance of a settled motion from its steady state, in units of the drift."""
 
 _CREEP_STRETCHES = 4
-"""Number of stretches on which the decision about creeping loads is based."""
+"""Number of stretches that show whether loads creep."""
 
 _MAX_CREEP_DIFFERENCE = 0.05
-"""Largest relative difference of the angles by which loads creep in two of these stretches."""
+"""Largest relative difference between the angles by which loads creep in two of these stretches."""
 
 _MAX_UNBALANCE_CHANGE_RATIO = 0.01
 """Largest ratio of the change of the residual unbalance and the change of the angles, in rad, of loads that creep along
 balanced arrangements. In any other direction the ratio is at least 1 divided by the number of loads."""
 
 _DECREASE_SLOPE = -3.0
-"""Slope of the logarithm of the drift, in standard errors, beyond which the drift is decreasing."""
+"""Slope of the logarithm of the drift, in standard errors, below which the drift is decreasing."""
 
 
 @validated
@@ -71,37 +73,38 @@ def settle(
 
     Two kinds of motion never repeat themselves and count as settled too:
 
-    - `beating`: jammed loads and an imbalance, which turns faster, beat; some motions wander for ever. Such a motion is judged
-      by its last 32 stretches (of 100 slow periods; more if they are shorter). It is steady in the mean if the means of
-      amplitudes, force and speed over each quarter of them differ by no more than their scatter explains, or by half the given
-      `drift`, and the drift does not fall
-    - `creeping`: four loads or more, or three with an imbalance, balance the rotor in a whole family of arrangements
-      (`balanced_states`), and only small disturbances such as gravity move them along it, for hours. If they balance
-      the rotor, free vibrations of the carrier have decayed, and over four stretches the loads creep evenly while their
-      unbalance does not change, the status is `creeping`
+    - `beating`: the vibration of jammed loads beats with that of an imbalance, which turns faster; some motions never become
+      periodic. The last 32 stretches are considered (of 100 periods of the lowest natural frequency; more if stretches are
+      shorter). The motion is steady in the mean if the drift does not decrease, and if the means of amplitudes, force and speed
+      over the four quarters of these stretches differ by no more than their scatter explains, or by half the drift
+    - `creeping`: four loads or more, or three with an imbalance, can balance the rotor in infinitely many arrangements
+      (`balanced_states`). Small disturbances such as gravity move the loads slowly from one to the next, for hours. The status
+      is `creeping` if the loads balance the rotor, free vibrations of the carrier have decayed, and the loads creep evenly
+      over four stretches while the residual unbalance does not change
 
     **Arguments**
 
     - `scene` with a drive of constant speed
-    - `start`, `mode`: as `simulate`; default: near the jam mode `mode`, at rest without a mode
+    - `start`, `mode`: as for `simulate`; default: near the jam mode `mode`; without a mode, at rest
     - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, also in a jam
-    - `drift` below which a motion has settled, see `Measured`; typical: 1e-3 to 1e-8. A given drift must be reached. The
-      default is 1e-6, in single precision 1e-3, and a motion that is steady in the mean or creeps has settled too.
-      The distance of the motion from its steady state, estimated from the slowest decay of the carrier or the decrease of the
-      drift, must be below ten times the drift: with little damping a motion changes slowly long before it has settled
-    - `periods` of the lowest natural frequency: approximate length of a stretch; typical: 100 (the default)
-    - `stretches`: their largest number; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
-    - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-9)`, in single precision 1e-5
-    - `throw`: raise if the motion has not settled by then; otherwise the `drift` of the last run shows it, or its status if it
-      failed
+    - `drift`: drift below which a motion has settled, see `Measured`; typical: 1e-3 to 1e-8; default: 1e-6, in single precision
+      1e-3. A drift given here must be reached; with the default, motions that beat or creep also count as settled.
+      In addition, the distance of the motion from its steady state must be below ten times the drift, because with little
+      damping a motion changes slowly long before it has settled. The distance is estimated from the slowest decay of the
+      carrier, or from the decrease of the drift
+    - `periods`: approximate length of a stretch, in periods of the lowest natural frequency; typical: 100 (the default)
+    - `stretches`: largest number of stretches; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
+    - `stepsize_controller`: as for `simulate`, except `Accuracy`; default: `Tolerance(1e-9)`, in single precision 1e-5
+    - `throw`: raise if the motion has not settled after all stretches; otherwise the `drift` of the last run shows this, or its
+      status if the run failed
 
-    A motion that only loads at exactly one angle keep does not count as settled: if they start at one angle (`separation=0`),
-    its status is `would_separate`, see `Run`.
+    A motion that only coincident loads can keep does not count as settled: if loads start at one angle (`separation=0`) and
+    would separate after a small disturbance, the status is `would_separate`, see `Run`.
 
     **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
-    **Raises** `ComputationError` (status "not_settled", or "left_mode" if the loads went to another mode than they began in),
-    `InputError` for a drive whose speed changes; further errors as `simulate`.
+    **Raises** `ComputationError` (status "not_settled", or "left_mode" if the loads settled in another mode than `mode`),
+    `InputError` for a drive whose speed changes; and the errors of `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -125,18 +128,19 @@ def settle(
 
 @dataclasses.dataclass(frozen=True)
 class _SettlePlan:
-    """Plan of stretches of a run.
+    """Plan of a run in stretches.
 
     **Attributes**: `first`: plan of the first stretch; `stretches`: their largest number; `drift`: the drift below which the
-    motion has settled; `usual`: the default drift of the precision; `remembered`: the number of stretches on which the decision
-    about a steady mean is based, None if the motion must reach the drift; `decay`: the slowest decay of the carrier, 1/s.
+    motion has settled; `default_drift`: the default drift of the precision; `mean_stretches`: the number of stretches that
+    show whether the motion is steady in the mean, None if the motion must reach the drift; `decay`: the slowest decay of the
+    carrier, 1/s.
     """
 
     first: RunPlan
     stretches: int
     drift: float
-    usual: float
-    remembered: int | None
+    default_drift: float
+    mean_stretches: int | None
     decay: float
 
 
@@ -158,8 +162,8 @@ def _plan_settle(
     scene = with_settled_drives(scene, "a motion settles under a constant speed: use ConstantSpeed")
     count(periods, "periods")
     double = scene.top_speed.dtype.itemsize >= 8
-    usual = 1e-6 if double else 1e-3
-    # Stretches are whole turns: an imbalance then continues at its angle.
+    default_drift = 1e-6 if double else 1e-3
+    # Each stretch is a whole number of turns, so that an imbalance continues at its angle.
     length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
     start = ("rest" if mode is None else "jam") if start is None else start
     is_jam = isinstance(start, str) and start == "jam"
@@ -168,20 +172,20 @@ def _plan_settle(
     if is_jam and scene.is_plain and not jams_of.is_ready(scene):
         rest = initial_state(scene)
         prepare_run(plan_stretch(scene, length, rest, steps, throw=throw))
-        prepare_separation(scene, rest, WINDOW)
+        prepare_separation(scene, rest, WINDOW_SAMPLES)
     state = start_state(scene, start, mode, separation, throw=throw)
     return _SettlePlan(
         first=plan_stretch(scene, length, state, steps, throw=throw),
         stretches=count(stretches, "stretches"),
-        drift=usual if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True)),
-        usual=usual,
-        remembered=4 * math.ceil(_MEAN_STRETCHES * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
+        drift=default_drift if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True)),
+        default_drift=default_drift,
+        mean_stretches=4 * math.ceil(_MEAN_STRETCHES * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
         decay=_slowest_decay(scene),
     )
 
 
 def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
-    """Return the run of the last stretch, and true if the motion has settled or is unstable and continues at one angle."""
+    """Return the run of the last stretch, and True if the motion has settled, possibly with the status `would_separate`."""
     length, state = float(plan.first.end), plan.first.state
     coincident, drifts, measured, regimes = True, [], [], []
     while True:
@@ -193,15 +197,15 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
         drifts.append(float(run.drift))
         if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
             judged = _with_final_status(run, "done")
-            # No test is needed for loads that are not at exactly one angle: they leave an unstable motion.
+            # Loads that are not at exactly one angle need no test: they have already left a motion that is unstable.
             if is_coincident or status_name(judged.status) == "done":
                 return judged, True
-        if plan.remembered is not None:
+        if plan.mean_stretches is not None:
             measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
-            if len(measured) >= plan.remembered and _steady_in_the_mean(np.array(measured[-plan.remembered :])):
+            if len(measured) >= plan.mean_stretches and _steady_in_the_mean(np.array(measured[-plan.mean_stretches :])):
                 return _with_final_status(run, "beating"), True
             is_plain = plan.first.scene.is_plain
-            if is_plain and drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.usual):
+            if is_plain and drifts[-1] < SETTLED_DRIFT and plan.decay * length * len(measured) > -math.log(plan.default_drift):
                 regimes.append(run.regime)
                 if _is_creeping(regimes[-_CREEP_STRETCHES:]):
                     return _with_final_status(run, "creeping"), True
@@ -223,7 +227,7 @@ def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
 
 
 def _slowest_decay(scene: Scene) -> float:
-    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if one does not decay."""
+    """Return the smallest decay rate of free vibrations of the carrier with its loads, 1/s; 0 if a vibration does not decay."""
     mass, stiffness, damping = (np.asarray(matrix, float) for matrix in _matrices(scene))
     flow = np.linalg.solve(mass, -np.concatenate([stiffness, damping], axis=1))
     poles = np.linalg.eigvals(np.concatenate([np.eye(len(mass), 2 * len(mass), len(mass)), flow]))
@@ -234,10 +238,11 @@ def _slowest_decay(scene: Scene) -> float:
 def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -> float:
     """Estimate the relative distance of a motion from its steady state from the drifts of its stretches so far.
 
-    A distance that decays at the rate a falls by 1 - exp(-a T) of itself from one half of the measuring window to the other,
-    T apart; this decrease is the drift. Free vibrations that beat with the jam make some drifts small by chance; therefore the
-    largest of three drifts counts unless the vibrations decay within a window. The rate is the carrier's slowest `decay`, or,
-    if a vibration does not decay, the rate at which drifts fall from one stretch, of the length `stretch`, to the next.
+    A distance that decays at the rate a decreases by the fraction 1 - exp(-a T) during the time T between the two halves of the
+    measuring window; this decrease is the drift. Free vibrations that beat with the jam make some drifts small by chance.
+    Therefore the largest of three drifts is used, unless the vibrations decay within a window. The rate a is the slowest
+    `decay` of the carrier; if a vibration does not decay, it is the rate at which the drift decreases from one stretch, of the
+    length `stretch`, to the next.
     """
     half, recent = 0.5 * float(np.ptp(np.asarray(run.window.time))), max(drifts[-3:])
     if decay == 0.0 and len(drifts) >= 6 and recent > 0.0:
@@ -248,16 +253,17 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
     return math.inf if fall == 0.0 or (fall < 0.5 and len(drifts) < 3) else recent / fall
 
 
-def _steady_in_the_mean(seen: np.ndarray) -> bool:
-    """Return True if the values of stretches (4 n, 3 + nd), each with its drift first, scatter about constant means.
+def _steady_in_the_mean(measured: np.ndarray) -> bool:
+    """Return True if measured values scatter about constant means.
 
-    Changes below half the drift are not resolved.
+    **Arguments**: `measured` (4 n, 3 + nd): for each stretch the drift, the load speed, the force and the amplitudes. Changes
+    below half the drift are ignored.
     """
-    drift, values = seen[:, 0], seen[:, 1:]
-    place = np.arange(len(seen)) - (len(seen) - 1) / 2.0
+    drift, values = measured[:, 0], measured[:, 1:]
+    place = np.arange(len(measured)) - (len(measured) - 1) / 2.0
     fall = place @ np.log(drift) / (place @ place)
     rest = np.log(drift) - np.mean(np.log(drift)) - fall * place
-    if fall < _DECREASE_SLOPE * np.sqrt(rest @ rest / (len(seen) - 2) / (place @ place)):
+    if fall < _DECREASE_SLOPE * np.sqrt(rest @ rest / (len(measured) - 2) / (place @ place)):
         return False
     quarters = values.reshape(4, -1, values.shape[1])
     means = quarters.mean(axis=1)
@@ -269,7 +275,7 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
 
 
 def _is_creeping(regimes: Sequence[Regime]) -> bool:
-    """Return True if loads balance the rotor in each of some stretches and creep evenly along balanced arrangements."""
+    """Return True if the loads balance the rotor in each stretch, and creep evenly along balanced arrangements."""
     if len(regimes) < _CREEP_STRETCHES or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
         return False
     phase = np.array([np.asarray(regime.phase) for regime in regimes])
@@ -281,7 +287,7 @@ def _is_creeping(regimes: Sequence[Regime]) -> bool:
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:
-    """Raise `ComputationError` if the loads no longer turn at the speed of the jam mode in which they started."""
+    """Raise `ComputationError` if the load speed is not nearest to that of the jam mode in which the loads started."""
     modes = jam_modes(scene)
     speeds = np.asarray(modes.omega)
     away = {k: abs(float(speeds[modes.row(k)]) - float(run.omega)) for k in modes.mode_numbers()}

@@ -61,46 +61,48 @@ def simulate(
 
     - `scene` to integrate, see `vector_field` for its equations
     - `until`: end time, s or text such as "20 s"; typical: 5 to 60 s, that is 100 or more vibrations
-    - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly over
-      the time `spin_up`; default: half of `until`), or a `State`; see `initial_state`
+    - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest; the rotor speed rises smoothly during
+      the time `spin_up`, default: half of `until`), or a `State`; see `initial_state`
     - `mode`: number of the jam mode for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `spin_up`, s; typical: 1 to 20
     - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam 0. Loads
-      that start at exactly one angle (`separation=0`) stay at one angle (`Run.coincident`); if that motion repeats itself but
-      is unstable against their separation, the status is `would_separate`
-    - `save`: "all" keeps `samples` evenly spaced states; "window" keeps no trajectory, only the measured quantities
+      that start at exactly one angle (`separation=0`) stay at one angle (`Run.coincident`). If this motion settles although
+      slightly separated loads would leave it, the status is `would_separate`
+    - `save`: "all" keeps `samples` evenly spaced states; "window" keeps the measured quantities and the window, but no
+      trajectory
     - `samples` (default: 16384; 262144 for runs of more than 1024 turns of the rotor; 2000 under a JAX transformation);
-      typical: 20 for each vibration. They cost memory, hardly time
+      typical: 20 for each period of the vibration. They need memory, but hardly any time
     - `turns`: length of the measuring window at the end, in periods of the lowest natural frequency (at most half the run, and
       256 turns of the rotor); typical: 20 (the default)
-    - `estimate`: True to estimate the run's `error` by a second run with larger steps (half as many evaluations again). The
-      default is True if all numbers are known, that is not under a JAX transformation, and steps are not chosen by a controller
-      of diffrax
-    - `stepsize_controller`: how steps are chosen, see below
-    - `solver`, `adjoint`: those of diffrax, passed through. The defaults are `Rodas4` for known scenes whose loads (or carrier)
-      decay 100 times as fast as anything moves, otherwise Dormand and Prince's method of order 8 as `UnrolledDopri8`, in large
-      scenes and JAX transformations `LoopDopri8`; and reverse derivatives of the very steps that were taken. Forward
-      derivatives, `diffrax.ForwardMode()`, take less time for up to about ten parameters
-    - `max_steps`: the run fails after this number of steps; default: 500 for each turn of the fastest motion, under a JAX
-      transformation of the scene 2^20. A reverse derivative keeps a time for each of them: give fewer for large batches
+    - `estimate`: True to estimate the `error` of the run by a second run with larger steps, which needs about half as many
+      evaluations. The default is True, but False under a JAX transformation and with a step size controller of diffrax
+    - `stepsize_controller`: choice of the steps, see below
+    - `solver` and `adjoint` of diffrax. The default solver is `Rodas4` for scenes in which loads or carrier decay 100 times as
+      fast as the motion (not under a JAX transformation), otherwise the method of Dormand and Prince of order 8:
+      `UnrolledDopri8`, or `LoopDopri8` for large scenes and under JAX transformations. The default adjoint gives reverse
+      derivatives of exactly the steps that were taken. Forward derivatives, `diffrax.ForwardMode()`, take less time for up to
+      about ten parameters
+    - `max_steps`: the run fails after this number of steps; default: 500 for each turn of the fastest motion, and 2^20 under a
+      JAX transformation of the scene. A reverse derivative stores a time for each of these steps: use a smaller value for large
+      batches
     - `progress_meter` of diffrax, which shows the finished share of the time
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status shows the failure
 
     Choices of `stepsize_controller`:
 
-    - `Tolerance(1e-8)`: by the error that each step may make (the default, in single precision 1e-5); typical: 1e-6 to 1e-10
-    - `Accuracy(1e-4)`: by the `error` that the result may have; typical: 1e-3 to 1e-8. The run is repeated with smaller
-      tolerances until its estimated error is below it, 6 times at most, or fails as `not_accurate`. An error of 1e-8 takes
+    - `Tolerance(1e-8)`: the error of each step (the default; 1e-5 in single precision); typical: 1e-6 to 1e-10
+    - `Accuracy(1e-4)`: the `error` of the result; typical: 1e-3 to 1e-8. The run is repeated with smaller tolerances, at most 6
+      times, until its estimated error is below this value; otherwise the status is `not_accurate`. An error of 1e-8 takes
       about twice the time of an error of 1e-4
-    - `EqualSteps(2000)`: this number of equal steps; typical: 4 for each radian of the fastest motion
+    - `EqualSteps(2000)`: a number of equal steps; typical: 4 for each radian of the fastest motion
     - a step size controller of diffrax
 
-    **Returns** `Run`, which carries its estimated `error` and its cost.
+    **Returns** `Run`, with its estimated `error` and its cost.
 
-    - Gradients, forward and reverse, go through all of it; `jit` and `vmap` too
-    - In single precision angles are kept within a turn while time is integrated, those of the window are counted from a turn at
-      its beginning, and runs of more than 20,000 turns under a constant speed that keep a window only are cut into stretches,
-      so that they do not lose phase
+    - Forward and reverse derivatives, `jit` and `vmap` are supported
+    - In single precision, angles are kept within one turn during the integration, and angles of the window are relative to the
+      number of turns at its beginning. Runs of more than 20,000 turns at constant speed that keep only a window are divided
+      into stretches. Long runs therefore keep their phase
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 
@@ -138,7 +140,8 @@ def simulate(
 
 
 def run_planned(plan: RunPlan, *, throw: bool) -> Run:
-    """Return the run of a plan, not tested for separation. **Raises** `ComputationError` if it fails and `throw` is true."""
+    """Return the run of a plan, without a test for separation. **Raises** `ComputationError` if it fails and `throw` is
+    True."""
     begun = time.perf_counter()
     if plan.accuracy is not None:
         run = _run_to_accuracy(plan, plan.accuracy)
@@ -149,7 +152,7 @@ def run_planned(plan: RunPlan, *, throw: bool) -> Run:
     if plan.is_known:
         jax.block_until_ready((run.steps, run.error))
         run = dataclasses.replace(run, seconds=on_device(np.asarray(time.perf_counter() - begun, run.seconds.dtype)))
-    return outcome(run, plan.asked, plan.end, throw=throw, failures=_FAILURES, hint=partial(_hint, plan, run))
+    return outcome(run, plan.given_scene, plan.end, throw=throw, failures=_FAILURES, hint=partial(_hint, plan, run))
 
 
 def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:
@@ -164,7 +167,7 @@ def _run_stretch(plan: RunPlan, end: Array, state: State, control: Control, *, i
 
 
 def prepare_run(plan: RunPlan) -> None:
-    """Begin to compile the program of a run in a thread, while the numbers of its start are still unknown."""
+    """Compile the program of a run in a background thread while the values of its initial state are still computed."""
     call = _integration(plan, plan.end, plan.state, plan.integration.control, is_measured=True)
     in_background(partial(integrate.prepare, *call))
 
@@ -175,13 +178,13 @@ def _integration(
     """Return the arguments of `integrate` for one stretch."""
     integration, measuring = plan.integration._replace(control=control), None
     if plan.is_known and plan.integration.adjoint is None:
-        # One program for runs with any limit of steps, measured or not.
+        # One program serves runs with any limit of steps, measured or not.
         integration, measuring = _with_limit_as_number(integration), np.asarray(is_measured)
     return plan.scene, end, state, integration, measuring
 
 
 def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
-    """Return the plan with its limit of steps as an argument of the program, if the control of the steps allows it."""
+    """Return the plan with its limit of steps as an array argument of the program, if the control of the steps allows this."""
     control, most = integration.control, integration.max_steps
     if not isinstance(control, StepControl) or (control.steps is not None and float(control.steps) > most):
         return integration
@@ -192,7 +195,7 @@ def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
 def _run_in_stretches(plan: RunPlan, control: Control, *, is_measured: bool) -> Run:
     """Return the run of the last of several stretches.
 
-    Each begins at time 0 after whole turns of the rotor, with its angles within one turn.
+    Each stretch begins at time 0 after a whole number of turns of the rotor, with angles within one turn.
     """
     number, end = plan.stretches, float(plan.end)
     if isinstance(control, StepControl) and control.steps is not None:
@@ -220,7 +223,7 @@ def _sum(counts: list[Array]) -> Array:
 
 
 _COARSE_TOLERANCE_RATIO = 100.0
-"""Ratio of the tolerances of the second run (for the error estimate) and the first."""
+"""Tolerance of the second run (for the error estimate), in units of that of the first run."""
 
 
 def _coarser(control: StepControl) -> StepControl:
@@ -233,7 +236,10 @@ def _coarser(control: StepControl) -> StepControl:
 
 
 def _run_with_estimate(plan: RunPlan) -> Run:
-    """Return a run with the error that a second run with larger steps estimates; in parallel without a progress meter."""
+    """Return a run with its error, estimated by a second run with larger steps.
+
+    Both are computed in parallel unless there is a progress meter.
+    """
     control = plan.integration.control
     assert isinstance(control, StepControl)
     coarser = _coarser(control)
@@ -250,8 +256,10 @@ _ATTEMPTS = 6
 
 
 def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
-    """Return the run of the smallest tolerance needed for an estimated error of `accuracy`; status `not_accurate` if none
-    is small enough."""
+    """Return the first run, with successively smaller tolerances, whose estimated error is at most `accuracy`.
+
+    The status is `not_accurate` if no tolerance is small enough.
+    """
     control, dtype = plan.integration.control, plan.scene.top_speed.dtype
     assert isinstance(control, StepControl)
     floor, coarser = 10.0 * float(jnp.finfo(dtype).eps), _coarser(control)
@@ -262,11 +270,11 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
         if status_name(run.status) != "done" or float(run.error) <= accuracy:
             return run
         tolerance = float(cast(Array, control.tolerance))
-        # Smaller steps only add to the share of rounding in the error.
+        # With smaller steps, rounding errors alone would exceed the accuracy.
         radians = plan.fastest * latest.window.time[-1]
         if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, plan.scene, latest.steps, radians)) > accuracy:
             break
-        # The new tolerance is slightly smaller than proportional, since the error decreases more slowly than the tolerance.
+        # The tolerance is reduced more than in proportion, because the error decreases more slowly than the tolerance.
         share = min(max(0.2 * (accuracy / float(run.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(run.error)) else 1e-2
         before, coarser = latest, control
         control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), dtype))
@@ -281,14 +289,15 @@ def _compare_runs(
     coarser: StepControl,
     before: Array | np.ndarray,
 ) -> Run:
-    """Return the run with smaller steps, with its estimated error and the cost of both; `before`: previous evaluations."""
+    """Return the run with smaller steps, with its estimated error and the cost of both; `before`: evaluations of earlier
+    runs."""
     theirs, counted = (coarse.window.state, coarse.status), (fine.evaluations, before)
     error, evaluations = _estimate_error(plan.scene, plan.fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
 
 def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
-    """Return the share of the difference between two runs that is the error of the finer one, if the motion is smooth.
+    """Return the error of the finer of two runs of a smooth motion, as a share of the difference between both runs.
 
     With a method of order 8 the error falls with the power 8/9 of the tolerance and the power 8 of the number of steps. The
     powers used here are 0.45 and 3, which makes the estimate conservative.
@@ -311,9 +320,12 @@ def _estimate_error(
     coarser: StepControl,
     evaluations: tuple[Array, Array | np.ndarray],
 ) -> tuple[Array, Array]:
-    """Return the estimated error of a run, from its window and the states and the status of a run with larger steps, and the
-    sum of the `evaluations`; `fastest` as in `frequency_bounds`."""
-    # The error of a run that is compared with itself, or with one that failed, is not known.
+    """Return the estimated error of a run, and the sum of the `evaluations`.
+
+    **Arguments**: the `window` of the run; the states `theirs` and the `status` of a run with larger steps; `fastest`: see
+    `frequency_bounds`.
+    """
+    # The error is unknown if the second run failed, or if it has the same steps.
     found = status == RunStatus.done
     if control.steps is not None:
         found = found & (control.steps != coarser.steps)
@@ -325,7 +337,7 @@ def _estimate_error(
 
 
 def last_state(scene: Scene, run: Run) -> State:
-    """Return the last state of a run at constant speed, to continue it, with angles within a turn to keep their digits."""
+    """Return the last state of a run, from which it can continue, with angles within one turn so that no digits are lost."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, has_common_turns = wrap_angles(scene, last.displacement.dtype)
 
@@ -342,7 +354,7 @@ _FAILURES = ("max_steps_reached", "not_finite", "no_step", "not_accurate", "no_s
 
 
 def _hint(plan: RunPlan, run: Run, name: str) -> str:
-    """Return text on the place of a failure and on a change that may help."""
+    """Return text on the time of a failure and on a change that may help."""
     hint, kept = "", run.window if run.trajectory is None else run.trajectory
     times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
     if not bool(np.all(finite)) and bool(np.any(finite)):

@@ -32,11 +32,11 @@ Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: at rest; near a jam mode; at rest with a smooth spin-up of the rotor."""
 
 START_SEPARATION = math.radians(1.0)
-"""Angle between neighbouring loads at the start, rad, if they are not side by side. Loads at exactly one angle would stay at
-one angle, whether or not that is stable."""
+"""Angle between neighbouring loads at the start, rad, if they are not side by side. Loads at exactly one angle would stay
+there, even if this motion is unstable."""
 
 Rotation = Literal["rolling", "none"]
-"""Initial rotation of the loads about themselves: rolling on their track, or none in space."""
+"""Initial rotation of the loads about their own centres: "rolling" on their track, or "still", without rotation in space."""
 
 
 @validated
@@ -54,21 +54,22 @@ def initial_state(
     **Arguments**
 
     - `scene` of the state
-    - `start`: "rest" (platforms in equilibrium, loads at rest about the bottom of their track), "spin_up" (the same state;
-      `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
+    - `start`: "rest" (platforms in equilibrium, loads at rest near the bottom of their track), "spin_up" (the same state; in
+      `simulate` the rotor speed then rises smoothly), or "jam" (on the leading-order motion of a jam mode)
     - `mode`: number of the jam mode, for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
-    - `angles`: the loads' angles about the rotor's axis, rad, (count,); or one number for the middle of all loads, in place of
-      the angle of `Loads.rest` at rest and 0 in a jam. The platforms of a jam go with the mean angle; typical: -pi to pi
-    - `separation`: angle between neighbouring loads, rad; typical: 0.02. Loads that touch (`LoadContact`) start this much
-      further apart than side by side. Default: at rest side by side if the loads' `ball_radius` is known, otherwise 1 degree; 0
-      in a jam, whose theory is about loads at one angle, and for `angles` (count,). Loads with the same numbers that start at
-      exactly one angle (`separation=0`) stay at one angle, even if the motion is unstable against their separation
+    - `angles` (count,): the angles of the loads about the axis of the rotor, rad; or one value for the middle of all loads
+      (default: the angle of `Loads.rest` at rest, and 0 in a jam). The displacements of a jam belong to the mean angle;
+      typical: -pi to pi
+    - `separation`: angle between neighbouring loads, rad; typical: 0.02. For loads that touch (`LoadContact`) it is added to
+      the angle at which they are side by side. Default: at rest, side by side if the `ball_radius` of the loads is known,
+      otherwise 1 degree; 0 in a jam, whose theory assumes coincident loads, and for `angles` (count,). Loads with the same
+      parameters that start at exactly one angle (`separation=0`) stay at one angle, even if slightly separated loads would not
     - `throw`: raise if the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
 
     **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that does
-    not exist at the scene's rotor speed.
+    not exist at the rotor speed of the scene.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -79,7 +80,7 @@ def initial_state(
     if start not in ("rest", "jam", "spin_up"):
         raise InputError("start", f"is {quoted(start)}; it must be 'rest', 'jam' or 'spin_up'")
     if start != "jam" and mode is not None:
-        raise InputError("mode", f"is {quoted(mode)}, which is only for start='jam'; leave it out or start in a jam")
+        raise InputError("mode", f"is {quoted(mode)}; it is used only with start='jam': leave it out or start in a jam")
     scene = validate_scene(scene)
     mass = scene.machine.structure().mass
     zero = cast(Array, np.zeros(mass.shape[:1], mass.dtype))
@@ -123,16 +124,17 @@ def initial_state(
 
 
 def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:
-    """Return the loads' angles relative to their middle, (count,) rad; `one_each`: each load has its own angle already."""
+    """Return the angles (count,), rad, of the loads relative to their middle; `one_each`: the user gave an angle for each
+    load."""
     n = loads.count
     touching = has_term(exciter.effects, LoadInteraction)
-    wide = getattr(loads, "ball_radius", None) is not None
-    usual = separation is None and start != "jam"
-    side_by_side = not one_each and (touching or (usual and wide))
+    has_size = getattr(loads, "ball_radius", None) is not None
+    is_default = separation is None and start != "jam"
+    side_by_side = not one_each and (touching or (is_default and has_size))
     if separation is not None:
         gap = known_number(separation, "rad", "separation", low=0.0)
     else:
-        gap = min(START_SEPARATION, math.pi / n) if usual and not (wide or one_each) else 0.0
+        gap = min(START_SEPARATION, math.pi / n) if is_default and not (has_size or one_each) else 0.0
     evenly = gap * (np.arange(n) - 0.5 * (n - 1)).astype(exciter.drive.speed.dtype)
     return evenly + known(loads.offsets()) if side_by_side else evenly
 
@@ -140,13 +142,15 @@ def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | N
 @cached
 def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: Array) -> State:
     """Return the state in the jam of the given row, with the loads at the given angles."""
-    turned = displacement[row] * jnp.exp(1j * jnp.mean(angle))
-    return State(turned.real, -omega[row] * turned.imag, (angle,), (jnp.full_like(angle, omega[row]),))
+    rotated = displacement[row] * jnp.exp(1j * jnp.mean(angle))
+    return State(rotated.real, -omega[row] * rotated.imag, (angle,), (jnp.full_like(angle, omega[row]),))
 
 
 @validated
 def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> State:
-    """Return the state with the loads' own rotation, if effects of the scene release it; a state that has one stays as it is.
+    """Return the state completed by the rotation of the loads about their own centres, if effects of the scene release it.
+
+    A state that contains this rotation already is returned unchanged.
 
         c = p' - w axis x (p + r n),    s = - w axis . n        (n the normal of the contact)
 
@@ -178,7 +182,7 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
 
 
 def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation) -> ExciterState:
-    """Return the state of an exciter with the rotation of its loads, see `with_spin`."""
+    """Return the state of an exciter with the rotation of its loads about their own centres, see `with_spin`."""
     loads = exciter.loads
     has_drilling = has_term(exciter.effects, DrillingSpinRelease)
     has_slip = has_term(exciter.effects, SlipRelease)
@@ -214,13 +218,14 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
 
 
 def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
-    """Return the scene, for the start "spin_up" with a drive that rises over the time `spin_up` (s; default: half of `end`).
+    """Return the scene; for the start "spin_up", with drives whose speed rises during the time `spin_up`, s (default: `end`/2).
 
-    **Raises** `InputError` for a time with another start, for a time longer than the run, and for another drive.
+    **Raises** `InputError` if `spin_up` is given with another start or is longer than the run, and for drives whose speed is
+    not constant.
     """
     if not (isinstance(start, str) and start == "spin_up"):
         if spin_up is not None:
-            raise InputError("spin_up", "is only for start='spin_up'; leave it out or use start='spin_up'")
+            raise InputError("spin_up", "is used only with start='spin_up'; leave it out or use start='spin_up'")
         return scene
     drives = []
     for exciter in scene.exciters:
@@ -237,16 +242,16 @@ def _require_shorter(duration: float, end: float) -> None:
 
 
 def validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None = None) -> State:
-    """Return a user's initial state in the precision in which JAX computes, completed by the loads' own rotation.
+    """Return a user's initial state, converted to the precision of JAX and completed by `with_spin`.
 
-    **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `separation` is given beside it.
+    **Raises** `InputError` if its shapes do not fit the scene, or if a `mode` or `separation` is given together with it.
     """
     if separation is not None:
         raise InputError(
-            "separation", f"is {quoted(separation)}, which is only for named starts; put the angles into the State"
+            "separation", f"is {quoted(separation)}; it is used only with named starts: put the angles into the State"
         )
     if mode is not None:
-        raise InputError("mode", f"is {quoted(mode)}, which is only for start='jam'; leave it out if start is a State")
+        raise InputError("mode", f"is {quoted(mode)}; it is used only with start='jam': leave it out if start is a State")
     if len(state.exciters) != len(scene.exciters):
         raise InputError("start.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")
     nd = scene.machine.structure().mass.shape[0]
@@ -255,7 +260,7 @@ def validate_state(scene: Scene, state: State, mode: int | None, separation: Num
         with within(scene.place_of(k)):
             if exciter.drive.ideal != (own.rotor is None):
                 motor, ideal = (
-                    "(angle, speed), because the rotor of a motor is part of the state",
+                    "(angle, speed), because the angle and speed of a motor's rotor are part of the state",
                     "None, because the drive prescribes the motion of the rotor",
                 )
                 problem = f"under the drive {quoted(exciter.drive.kind)} it must be {motor if own.rotor is None else ideal}"

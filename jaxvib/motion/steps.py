@@ -1,4 +1,4 @@
-"""Choice of the steps of a time integration."""
+"""Choices of the steps of a time integration."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from jaxvib.units import require_real
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Steps of such a size that each makes an error of at most `tolerance`, relative, and absolute in natural units.
+    """Steps whose error is at most `tolerance`, both relative and absolute in natural units.
 
-    Natural units are the unbalance radius S/M of the loads for displacements, that times the rotor's speed for velocities, and
-    1 rad for angles, whose error is never relative.
+    Natural units are the unbalance radius S/M of the loads for displacements, S/M times the rotor speed for velocities, and
+    1 rad for angles. The error of an angle is only absolute.
 
-    **Arguments**: `tolerance`; typical: 1e-6 to 1e-10 in double precision, 1e-5 in single. The methods of order 8 need about
-    1.8 times the steps for a hundredth of the tolerance.
+    **Arguments**: `tolerance`; typical: 1e-6 to 1e-10 in double precision, 1e-5 in single. For one hundredth of the tolerance,
+    the methods of order 8 need about 1.8 times as many steps.
 
     **Raises** `InputError` for a value that is not a real number.
 
@@ -37,7 +37,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Steps of such a size that the estimated `error` of the whole result is at most this; found by repeated runs.
+    """Steps with which the estimated error of the whole result is at most `error`; the run is repeated to find them.
 
     **Arguments**: `error`, relative; typical: 1e-3 to 1e-8. An error of 1e-8 takes about twice the time of an error of 1e-4.
 
@@ -58,8 +58,8 @@ class Accuracy:
 class EqualSteps:
     """A number of steps of equal length.
 
-    **Arguments**: `number` of steps; typical: 4 for each radian of the fastest motion, 25 for each turn. The time grows in
-    proportion to it.
+    **Arguments**: `number` of steps; typical: 4 for each radian of the fastest motion, 25 for each turn. The computing time is
+    proportional to it.
 
     **Raises** `InputError` for a value that is not a real number.
 
@@ -87,7 +87,7 @@ def require(chosen: object, *kinds: type) -> None:
 
 
 def small_number(value: float, name: str, time: Array, least: float) -> float:
-    """Validate a tolerance or an accuracy: at least the given number of roundings in the precision of `time`.
+    """Return a tolerance or an accuracy; it must be at least `least` times the rounding unit of the precision of `time`.
 
     **Raises** `InputError` for other values.
     """

@@ -1,4 +1,4 @@
-"""Stiffness: rates of decay that are faster than the motion, and the method and steps of such runs."""
+"""Stiff scenes: decay rates that are much faster than the motion, and the method and the steps of their runs."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.runtime.programs import cached
 
 _MAX_DECAY_PER_STEP = 3.0
-"""Largest product of decay rate and explicit step for which the method is accurate; above about 6 it diverges."""
+"""Largest product of decay rate and length of an explicit step for which the method is accurate; above about 6 it diverges."""
 
 _STIFF_RATE_RATIO = 100.0
-"""Ratio of the rates of decay and motion beyond which the implicit method costs less than explicit steps."""
+"""Ratio of the rates of decay and motion above which the implicit method takes less time than explicit steps."""
 
-IMPLICIT_PER_RADIAN = 32.0
+IMPLICIT_STEPS_PER_RADIAN = 32.0
 """Number of equal implicit steps per radian of the fastest motion; the method of order 4 then has an error of about 1e-7."""
 
 _MAX_IMPLICIT_SIZE = 64
-"""Largest size of a state for which the dense matrices of the implicit method cost less than explicit steps."""
+"""Largest size of a state for which the implicit method, with dense matrices, takes less time than explicit steps."""
 
 
 @cached
@@ -38,8 +38,9 @@ def fastest_decay(scene: Scene) -> Array:
 
         max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j),      the largest eigenvalue of M^-1 C
 
-    Q' is the derivative of the resistance of a load by its rate, H its inertia, mu the trace of B M^-1 B^T: the motion of the
-    carrier reduces the effective inertia of the loads. Explicit steps must resolve this rate, even if the motion is slow.
+    Q' is the derivative of the resistance of a load with respect to its rate, H its inertia, mu the trace of B M^-1 B^T (the
+    motion of the carrier reduces the effective inertia of the loads). Explicit steps must resolve this rate, even if the motion
+    is slow.
     """
     scene = jax.lax.stop_gradient(scene)
     linear = linear_model(scene)
@@ -68,7 +69,7 @@ def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
 
 
 def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:
-    """Return the implicit method if the decay of a scene with known numbers is too fast for explicit steps, else None."""
+    """Return the implicit method if the decay of a scene is too fast for explicit steps, otherwise None."""
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
     return Rodas4() if size <= _MAX_IMPLICIT_SIZE and float(fastest_decay(scene)) > _STIFF_RATE_RATIO * float(fastest) else None
 
@@ -82,17 +83,18 @@ def steps_of(fastest: float, decay: float, per_radian: float, step: float | None
     if step is not None:
         return step, decay * step > _MAX_DECAY_PER_STEP
     if decay > _STIFF_RATE_RATIO * fastest:
-        return 1.0 / (IMPLICIT_PER_RADIAN * fastest), True
+        return 1.0 / (IMPLICIT_STEPS_PER_RADIAN * fastest), True
     return 1.0 / max(per_radian * fastest, decay / _MAX_DECAY_PER_STEP), False
 
 
 def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.ndarray:
-    """Return True if explicit steps of that length, s, diverge by the `decay`, 1/s."""
+    """Return True if explicit steps of the length `step`, s, diverge because of the decay rate `decay`, 1/s."""
     return decay * step > 2.0 * _MAX_DECAY_PER_STEP
 
 
 def advice(scene: Scene) -> str:
-    """Return the cause of short steps as the end of a sentence; empty if the decay is not faster than the motion."""
+    """Return the cause of short steps as the end of a sentence; empty if no decay is more than 10 times faster than the
+    motion."""
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""

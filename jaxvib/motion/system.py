@@ -1,5 +1,4 @@
-"""Vector field and state in the representation that integrates fastest: equations on scalars for small states, otherwise on
-arrays."""
+"""Vector field and state in the form that is integrated fastest: on scalars for small states, otherwise on arrays."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ _TURN = 2.0 * math.pi
 
 _LONG_ARRAY = 4
 """Smallest number of entries in an array of the state for which arrays are used instead of scalars. With arrays, derivatives
-take less time and programs compile faster. Runs take the same time as with scalars, and two thirds of it for 8 entries or
+take less time and programs compile faster. Runs take the same time as with scalars, or two thirds of it for 8 entries or
 more."""
 
 _MAX_UNROLLED_SIZE = 8
@@ -41,16 +40,16 @@ _MAX_UNROLLED_SIZE = 8
 class PackedSystem(eqx.Module):
     """Conversion between a `State` and the state of the integrator: a vector of its entries, or a tuple of scalars.
 
-    The unrolled method takes a tuple, whose scalars stay in processor registers. Any other method takes a vector, since
-    diffrax then saves, compares and carries one array instead of many.
+    The unrolled method uses a tuple, whose scalars stay in processor registers. All other methods use a vector, because diffrax
+    then stores, compares and copies one array instead of many.
 
-    If angles are wrapped, the state of the integrator contains each angle within a turn and, separately, the number of whole
-    turns. This preserves the phase in long runs in single precision, which cannot resolve the position within a turn of an
-    angle of a million radians.
+    If angles are wrapped, the state of the integrator contains each angle within one turn and, separately, the number of whole
+    turns. Long runs in single precision then keep their phase: single precision cannot resolve the position within a turn of
+    an angle of a million radians.
 
     **Arguments**
 
-    - the vector field and a state
+    - `field`: the vector field; `state`: a state
     - `wrapped`: True if angles are wrapped
     - `has_common_turns`: True if the same number of turns is subtracted from the angles of all loads, which keeps their
       differences
@@ -111,8 +110,7 @@ class PackedSystem(eqx.Module):
         return diffrax.ODETerm(self._rates)
 
     def method(self, adjoint: diffrax.AbstractAdjoint | None = None) -> diffrax.AbstractSolver:
-        """Return the method of order 8 in its fastest form, with derivatives by `adjoint`; default: step replay, see
-        `jaxvib.ode.replay`."""
+        """Return the method of order 8 in its fastest form, with derivatives by `adjoint` (default: `jaxvib.ode.replay`)."""
         # `args` is removed, since a method must not contain traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
         if self.size <= _MAX_UNROLLED_SIZE:
@@ -145,7 +143,8 @@ class PackedSystem(eqx.Module):
         return _add_turns(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
 
     def _angles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return a mask of the numbers that are angles, and for each number the index of the angle that defines its turns."""
+        """Return True for entries that are angles, and for each entry the index of the angle that defines its number of
+        turns."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         places = jax.tree.unflatten(
             self.treedef, [np.arange(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
@@ -161,7 +160,7 @@ class PackedSystem(eqx.Module):
         return is_angle, leader
 
     def _state(self, y: IntegratorState) -> State:
-        """Return states along a leading axis from the numbers of the integrator."""
+        """Return states along a leading axis from entries of the integrator's state."""
         rows = jnp.stack(y, axis=-1) if self.is_on_scalars else y
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         parts = [
@@ -189,7 +188,7 @@ class PackedSystem(eqx.Module):
 
 
 def _add_turns(y: IntegratorState, turns: IntegratorState, sign: float) -> IntegratorState:
-    """Add whole turns to numbers, with 2 pi in two parts, since the rounding of 2 pi would accumulate."""
+    """Add whole turns to entries, with 2 pi in two parts, because the rounding error of 2 pi would accumulate."""
 
     def turned(x: Array, n: Array) -> Array:
         high = np.asarray(_TURN, x.dtype)

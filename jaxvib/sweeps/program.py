@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.batch import BATCH_SIZE, PARTS, BatchPlan, run_in_batch
+from jaxvib.motion.batch import BATCH_SIZE, PARTS_OF_RUN, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.motion.stiffness import fastest_decay, steps_of
@@ -115,7 +115,7 @@ def planned(scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], unti
     if until / step > _MAX_STEPS:
         name = "until" if steps is None else "steps"
         raise InputError(name, f"needs {until / step:.3g} steps for every run; give a shorter run or fewer steps")
-    each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
+    each, between = (until - window) / (PARTS_OF_RUN * step), window / ((_SAMPLES - 1) * step)
     # 1e-9: a number that is whole up to rounding errors is not rounded up
     counts = (int(np.ceil(x - 1e-9)) or 1 for x in (each, between))
     return BatchPlan(until, window, _SAMPLES, *counts, implicit=implicit)

@@ -130,7 +130,7 @@ def test_ensemble_names_runs_in_which_balls_leave_the_wall():
     many = jv.ensemble(make, jnp.asarray([-1.0, 1.0, jnp.nan]), 0.02, stepsize_controller=steps, estimate=False)
     np.testing.assert_array_equal(many.detached[:2], [[False, True], [False, False]])
     assert [str(name) for name in status_names(many.status)] == ["detached", "done", "not_finite"]
-    assert "on which the equations hold it" in many.summary()
+    assert "the equations keep it on the track" in many.summary()
 
 
 def test_frequency_about_the_equator_is_the_resolved_one():

@@ -11,7 +11,7 @@ from scenes import published, some_state
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error
-from jaxvib.motion.plan import _made
+from jaxvib.motion.plan import _build_scenes
 from jaxvib.runtime import cache
 
 
@@ -143,7 +143,7 @@ def test_other_values_need_no_new_program(caplog):
 def test_seconds_are_those_of_the_whole_call(monkeypatch):
     """The clock is read first and last."""
     calls, ticks = [], iter(range(10, 100))
-    monkeypatch.setattr("jaxvib.motion.plan._made", lambda *asked: calls.append(clock()) or _made(*asked))
+    monkeypatch.setattr("jaxvib.motion.plan._build_scenes", lambda *asked: calls.append(clock()) or _build_scenes(*asked))
 
     def clock():
         return float(next(ticks))

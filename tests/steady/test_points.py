@@ -181,7 +181,7 @@ def test_wrong_points_end_in_one_sentence(ask, says):
 
 def test_run_without_a_trajectory_refuses_its_whole_motion():
     run = run_of(exciter((0.0, 0.5)))
-    with pytest.raises(jv.InputError, match="part is 'all', but the run kept its window only"):
+    with pytest.raises(jv.InputError, match="part is 'all', but the run kept only its window"):
         run.point(part="all")
 
 

@@ -21,8 +21,8 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 
 MIN_CHANGE_SCALE = 1e-4
-"""Smallest scale of changes, as a share of the unbalance radius S/M for amplitudes and of S n^2 for forces. It is needed
-because the amplitude and the force of a balanced rotor are almost zero."""
+"""Smallest scale for relative changes, in units of the unbalance radius S/M for amplitudes and of S n^2 for forces. It is
+needed because the amplitude and the force of a balanced rotor are almost zero."""
 
 Field = Callable[[Array, State], State]
 """Equations of motion: function from a time and a state to the rates of the state."""
@@ -36,8 +36,8 @@ class Trajectory(eqx.Module):
     - `time` (nt,), s
     - `state`: a `State` whose arrays have a leading axis over the times
     - `foundation_force` (nt, nb), N: force of the supports on the foundation in its nb directions
-    - `rotor_angles`, rad, without whole turns, and `rotor_speeds`, rad/s: an array (nt,) for each exciter; `rotor_angle` and
-      `rotor_speed` are those of the only one
+    - `rotor_angles`, rad, without whole turns, and `rotor_speeds`, rad/s: an array (nt,) for each exciter. If there is only one
+      exciter, `rotor_angle` and `rotor_speed` are its arrays
     """
 
     time: Array = eqx.field(metadata=in_unit("s", "time"))
@@ -71,15 +71,15 @@ class AbstractMeasured(eqx.Module):
     - `omega`, rad/s: mean speed of the loads over whole turns, and `load_speed` (count,), rad/s: the same for each load
     - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, that is half of peak to peak; for a force
       with two directions the root of the sum of both squares; typical: 0.5 to 10 mm, 10 N to 10 kN
-    - `drift`: the largest of three relative changes from the first to the second half of those turns
+    - `drift`: the largest of three relative changes from the first to the second half of these turns
     - `settled`: True if the drift is below 1e-3
 
-    The changes are
+    The three changes are
 
-    - of an amplitude, relative to the largest amplitude or to 1e-4 of the unbalance radius S/M if that is more (a balanced
-      rotor has no amplitude of its own)
-    - of the foundation force, relative to the largest one or to 1e-4 of S n^2, n the rotor's speed, if that is more
-    - of the loads' speeds, relative to `omega`
+    - the change of an amplitude, relative to the largest amplitude, or to 1e-4 of the unbalance radius S/M if that is more (the
+      amplitude of a balanced rotor is almost zero)
+    - the change of the foundation force, relative to the largest force, or to 1e-4 of S n^2 (n: rotor speed) if that is more
+    - the change of a load's speed, relative to `omega`
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -90,7 +90,7 @@ class AbstractMeasured(eqx.Module):
 
     @property
     def settled(self) -> Array:
-        """True if the motion repeats itself according to amplitudes and speed."""
+        """True if amplitudes, force and speeds no longer change."""
         return self.drift < 1e-3
 
     def extent(self, scene: Scene) -> str:
@@ -115,9 +115,11 @@ def trajectory(model: Model, times: Array, states: State) -> Trajectory:
 
 
 def turning_angles(scene: Scene, times: Callable[[], Array], states: State) -> tuple[Array, Array]:
-    """Return angles (nt, n), rad, and rates, rad/s, of all loads, and of the rotors of exciters without loads, in this order.
+    """Return angles (nt, n), rad, and rates, rad/s, of the turning masses of all exciters, in the order of the exciters.
 
-    **Arguments**: `times` (nt,) s of the states, which only rotors need.
+    They are the loads of an exciter, or, if it has no loads, its rotor.
+
+    **Arguments**: `times`: function that returns the times (nt,), s, of the states; it is called for rotors only.
     """
     columns: list[tuple[Array, Array]] = []
     for exciter, own in zip(scene.exciters, states.exciters, strict=True):
@@ -139,11 +141,12 @@ def turning_directions(scene: Scene) -> np.ndarray:
 
 
 def measure(model: Model, field: Field, times: Array, states: State, unit: State) -> Measured:
-    """Measure the amplitudes and the load speed of an evenly sampled stretch of motion, see `Measured`.
+    """Measure the amplitudes and the load speed of an evenly sampled part of a motion, see `Measured`.
 
-    Extrema and whole turns are computed on interpolants with the rates of the equations of motion, not on the samples.
-    `field` returns the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
-    `jax.tree_util.Partial`, not a plain function. `unit`: the scene's `natural_units`.
+    Extrema and whole turns are computed from interpolants that use the rates of the equations of motion, not from the samples.
+
+    **Arguments**: `field` returns the rates of a state at a time; it must be a pytree of its arrays, such as `Dynamics` or a
+    `jax.tree_util.Partial`, not a plain function; `unit`: the `natural_units` of the scene.
     """
     early, late, whole = _spans(model, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
@@ -222,13 +225,13 @@ def _outputs(model: Model, step: Array, state: State, rates: State) -> tuple[Arr
 
 
 def mean_speeds(times: Array, angle: Array, rate: Array, first: Sequence[int], last: Sequence[int] | None = None) -> Array:
-    """Return mean speeds over stretches of samples.
+    """Return mean speeds over parts of the samples.
 
-    Each is the mean over the whole turns before the last sample of the stretch, or over the stretch if that is less than a
-    turn.
+    Each is the mean over the whole turns that end at the last sample of the part, or over the whole part if it is shorter than
+    a turn.
 
-    **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each stretch
-    (default: the last sample of all). **Returns** (stretches, m) rad/s.
+    **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each part
+    (default: the last sample of all). **Returns** (parts, m) rad/s.
     """
     ends = [len(times) - 1] * len(first) if last is None else last
     each = jax.vmap(_mean_speed, in_axes=(None, 1, 1, None, None))
@@ -249,17 +252,17 @@ def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) ->
     i = jnp.argmin(jnp.where((k >= first) & (k <= last), jnp.abs(phi - target), jnp.inf))
     t_i, phi_i, rate_i = jnp.unstack(sample(i))
     start = t_i + (target - phi_i) / _away_from_zero(rate_i)
-    # One secant step on the cubic is accurate enough, since the sample is next to the root.
+    # One secant step on the cubic is accurate enough because the sample is next to the root.
     j = jnp.where(start > t_i, jnp.minimum(i + 1, last), jnp.maximum(i - 1, first))
     t_j, _, rate_j = jnp.unstack(sample(j))
     h = jnp.where(i == j, 1.0, t_j - t_i)
-    bend = (rate_j - rate_i) / h
-    start = t_i + (target - phi_i) / _away_from_zero(rate_i + 0.5 * bend * (start - t_i))
+    acceleration = (rate_j - rate_i) / h
+    start = t_i + (target - phi_i) / _away_from_zero(rate_i + 0.5 * acceleration * (start - t_i))
     return jnp.where(turns > 0, 2.0 * jnp.pi * turns * jnp.sign(total) / (end - start), total / (end - begin))
 
 
 def _step(times: Array) -> Array:
-    """Return the step of even samples as a mean over all of them, since late in a long run each time is rounded."""
+    """Return the step of even samples, averaged over all samples because each time is rounded late in a long run."""
     return (times[-1] - times[0]) / (times.shape[0] - 1)
 
 
@@ -270,7 +273,7 @@ def _away_from_zero(x: Array) -> Array:
 
 @cached
 def relative_amplitude(stretch: Trajectory, i: int, j: int) -> Array:
-    """Return the amplitude of platform `i` relative to platform `j` (from 1) over an evenly sampled stretch, m zero to peak."""
+    """Return the amplitude, m zero to peak, of platform `i` relative to platform `j` (from 1) over evenly spaced samples."""
     x, v = (values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity))
     (low, high), _, _ = locate_extrema(x, v * _step(stretch.time))
     return (high - low)[2] / 2.0

@@ -1,4 +1,4 @@
-"""Motion of points of a machine in a run, and the harmonic that fits its last turns."""
+"""Motion of points of a machine in a run, and the fit of a harmonic to the last turns of the run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.points import rows_in_plane
 
 _HARMONICS = 3
-"""Number of fitted harmonics. The second and the third remove their contribution from the first."""
+"""Number of fitted harmonics. The second and the third are fitted so that they do not influence the first."""
 
 
 class PointMotion(eqx.Module):
@@ -40,12 +40,13 @@ def motion_of_point(machine: Machine, kept: Trajectory, place: Place) -> PointMo
 
 @cached
 def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array, Array]:
-    """Return the first harmonic of evenly sampled displacements (nt, nd), and the mean square of everything else.
+    """Return the first harmonic of evenly sampled displacements (nt, nd), and the mean square of the remaining motion.
 
-    The means and the harmonics of `speed` are fitted by least squares. Weights that vanish at both ends (Hann's window) make
-    the result insensitive to frequencies that are not a multiple of `speed`.
+    The means and the harmonics of `speed` are fitted by least squares. Weights that vanish at both ends (Hann window) make the
+    result insensitive to frequencies that are not a multiple of `speed`.
 
-    **Returns** the complex amplitudes (nd,), with phase 0 in the middle of the time, and (nd, nd), see `Harmonic.rest`.
+    **Returns** the complex amplitudes (nd,), whose phase is measured from the middle of the time interval, and (nd, nd), see
+    `Harmonic.rest`.
     """
     count = time.shape[0]
     weight = jnp.asarray(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2, time.dtype)[:, None]

@@ -1,4 +1,4 @@
-"""Regime of a motion (swinging, jammed, balanced, ...) with the evidence."""
+"""Regime of a motion (swinging, jammed, balanced, ...) with the quantities from which it follows."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _SAME_SPEED = 3e-3
 and the second half."""
 
 _LOCKED_PHASE_CHANGE = 0.1
-"""Change of relative phases between both halves of the window below which they count as fixed, rad."""
+"""Change of the relative phases, rad, from one half of the window to the other below which they count as constant."""
 
 _STEADY_SLIP = 0.02
-"""Relative difference of the slip of a load in both halves of the window below which the slip is steady. A load with a steady
-slip is jammed, even if the slip is small."""
+"""Relative difference between the slips of a load in the two halves of the window, below which the slip is steady. A load with
+a steady slip is jammed, even if the slip is small."""
 
 _BALANCED_UNBALANCE_SHARE = 0.02
 """Residual unbalance below which loads count as balancing the rotor, relative to the unbalance of all loads at one angle."""
@@ -63,7 +63,7 @@ REGIMES = enumeration_names(RegimeName)
 
 
 class Regime(Result):
-    """Kind of motion over a part of a run, with the evidence for it.
+    """Kind of motion over a part of a run, with the quantities from which it follows.
 
     Returned by `regime` and `Run.regime`.
 
@@ -71,18 +71,19 @@ class Regime(Result):
 
     - `name`: a `RegimeName`
     - `pattern`: a `PhasePattern` of the loads
-    - `load_speed` (count,): mean speeds over whole turns, and `rotor_speed`, rad/s
-    - `ripple`: half of peak to peak of the loads' speed, the largest, rad/s
+    - `load_speed` (count,): mean speeds of the loads over whole turns, and `rotor_speed`, rad/s
+    - `ripple`: largest ripple of a load's speed (half of peak to peak), rad/s
     - `phase` (count,), rad: mean angle of each load relative to the first one (jammed) or to the rotor (turning with it)
     - `unbalance`: remaining unbalance of loads and rotor in the rotor's frame, relative to that of all loads; balanced below
       0.02
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed`, rad/s
-    - `mode`: the jam mode, 0 if the loads are not jammed. 2 k falls from the k-th natural frequency, the last one below the
-      loads' mean speed. 2 k + 1 rises from there to the next one, or to the rotor's speed if that is less. The mode is the one
-      whose end is nearer to the loads, so beyond the last of nd frequencies close to the rotor it is 2 nd + 1
-    - `caught`: True if the rotor itself is held at a resonance, below the speed that its motor would give it without a load
-    - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor's; steady below
-      0.003
+    - `mode`: estimated number of the jam mode; 0 if the loads are not jammed. Let natural frequency k be the last one below the
+      mean load speed. Mode 2 k begins at this frequency; mode 2 k + 1 ends at the next one, or at the rotor speed if that is
+      lower. The estimate is the mode whose end is nearer to the mean load speed. Beyond the last of nd frequencies, loads close
+      to the rotor speed are therefore in mode 2 nd + 1
+    - `caught`: True if the rotor itself stays at a resonance, below the speed at which its motor would turn without a load
+    - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor speed; the motion
+      is steady below 0.003
     """
 
     name: RegimeName
@@ -114,7 +115,7 @@ class Regime(Result):
         return status_name(self.pattern)
 
     def summary(self) -> str:
-        """Return the name and its evidence as text."""
+        """Return the kind of motion and the quantities from which it follows as text."""
         pattern = sentence(self.pattern)
         loads, rotor = (speed_text(speed) for speed in (self.load_speed, self.rotor_speed))
         evidence = [f"loads {loads}, rotor {rotor}, ripple {speed_text(self.ripple, 2)}"]
@@ -153,20 +154,21 @@ class Regime(Result):
 def regime(scene: Scene, stretch: Trajectory) -> Regime:
     """Return the kind of motion over a part of a run.
 
-    - Loads that go round by less than a turn swing
-    - Loads whose mean speed differs from the rotor's by less than 0.3 % turn with it, unless they fall behind steadily: by more
-      than 0.1 rad over the part, and by the same slip, to 2 %, in both halves
-    - They are balanced if loads and rotor together leave less than 2 % of the loads' own unbalance (static, and about tilts if
-      there are stations)
-    - Loads at one other speed with fixed relative phases are jammed
-    - A speed that changes by more than 0.3 % of the rotor's from one half of the part to the other is not steady
+    - Loads that make less than one turn swing
+    - Loads turn with the rotor if their mean speed differs from the rotor speed by less than 0.3 %, unless they fall behind
+      steadily: by more than 0.1 rad over the part, with slips in both halves that agree within 2 %
+    - They balance the rotor if the residual unbalance of loads and rotor together is less than 2 % of the unbalance of the
+      loads (static, and about tilts if the loads have stations)
+    - Loads that all turn at another speed with constant relative phases are jammed
+    - A motion is not steady if the speed of a load changes by more than 0.3 % of the rotor speed from one half of the part to
+      the other
 
     **Arguments**
 
     - `scene` of the run
     - `stretch`: a `Trajectory`, such as `run.window`; typical: 20 or more turns
 
-    **Returns** `Regime`; `jit` and `vmap` go through it. Its `name` is "unsettled" if the motion is not steady; nothing is
+    **Returns** `Regime`; `jit` and `vmap` are supported. If the motion is not steady, `name` is "unsettled" and no error is
     raised.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -199,11 +201,13 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED_PHASE_CHANGE
     behind = behind & (jnp.abs(slips[1] - slips[0]) < _STEADY_SLIP * jnp.abs(slips[1] + slips[0]) / 2.0)
     with_rotor = (jnp.abs(speed - rotor) < _SAME_SPEED * reference) & ~behind
-    # Mean of exp(i (phi_j - phi_1)), relative to the first load; the difference of the means of both halves shows if the phase
-    # is fixed.
-    to_first, moved = _relative(phi - phi[:, :1], half)
-    to_rotor, slid = _relative(phi - turn[:, None], half)
-    one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (jnp.max(moved) < _LOCKED_PHASE_CHANGE)
+    # Means of exp(i (phi_j - phi_1)), relative to the first load. If the means of both halves differ, the phase is not
+    # constant.
+    to_first, load_phase_change = _relative(phi - phi[:, :1], half)
+    to_rotor, rotor_phase_change = _relative(phi - turn[:, None], half)
+    one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (
+        jnp.max(load_phase_change) < _LOCKED_PHASE_CHANGE
+    )
 
     unbalance = _unbalance(scene, to_rotor, turn)
     name = RegimeName.where(steady, RegimeName.parted, RegimeName.unsettled)
@@ -231,12 +235,13 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
         resonance_speed=natural[nearest],
         mode=jnp.where(name == RegimeName.jammed, _mode(natural, mean, rotor), 0),
         caught=_is_rotor_stuck(scene, natural, rotor),
-        change=jnp.maximum(change, jnp.where(turning, jnp.max(slid), 0.0)),
+        change=jnp.maximum(change, jnp.where(turning, jnp.max(rotor_phase_change), 0.0)),
     )
 
 
 def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
-    """Return the jam mode of loads with a mean speed between ascending natural frequencies, infinite if missing."""
+    """Return the estimated jam mode of loads with the speed `mean`, see `Regime`; `natural`: ascending frequencies, inf if
+    missing."""
     ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
     below = jnp.sum(natural <= mean)
     rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
@@ -244,22 +249,24 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 
 
 def _is_rotor_stuck(scene: Scene, natural: Array, rotor: Array) -> Array:
-    """Return True if the rotor of a motor is caught at a resonance: at most 15 % below it, and more than 5 % below the speed of
-    the motor without load."""
+    """Return True if the rotor of a motor is caught at a resonance.
+
+    Its speed is then at most 15 % below or 2 % above the resonance, and more than 5 % below the no-load speed of the motor.
+    """
     if scene.drive.ideal:
         return jnp.zeros((), bool)
     return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
 
 
 def _relative(angle: Array, half: int) -> tuple[Array, Array]:
-    """Return the mean direction (count,) rad of angles (nt, count), and its change from the first to the second half."""
+    """Return the circular means (count,), rad, of angles (nt, count), and their changes from the first to the second half."""
     point = jnp.exp(1j * angle)
     early, late = jnp.mean(point[:half], axis=0), jnp.mean(point[half:], axis=0)
     return jnp.angle(jnp.mean(point, axis=0)), jnp.abs(jnp.angle(late * jnp.conj(early)))
 
 
 def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
-    """Return the residual unbalance of loads at `phase` to the rotor, relative to that of all loads at one angle.
+    """Return the residual unbalance of rotor and loads at the angles `phase` to the rotor, relative to all loads at one angle.
 
     For a rotor that tilts, the moment about the point of the loads is included, relative to the levers of the loads, or to the
     radius of gyration of the rotor if the levers are 0.
@@ -267,24 +274,26 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     mount, loads = scene.mount(), scene.loads
     each = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
-    thrown = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
-    own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in thrown), jnp.zeros_like(each[0]))
+    imbalances = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
+    own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in imbalances), jnp.zeros_like(each[0]))
     size = jnp.sum(jnp.abs(each))
-    left = jnp.abs(jnp.sum(each) + own) / size
+    residual = jnp.abs(jnp.sum(each) + own) / size
     if mount.tilt is None:
-        return left
+        return residual
     tilting = [scaled(lever, each) for lever in mount.levers[1:]]
-    moment = sum((imbalance.moment[0] + 1j * imbalance.moment[1] for imbalance in thrown), jnp.sum(sum(tilting, 0.0 * each)))
+    moment = sum(
+        (imbalance.moment[0] + 1j * imbalance.moment[1] for imbalance in imbalances), jnp.sum(sum(tilting, 0.0 * each))
+    )
     moment = sum((scaled(lever, own) for lever in mount.rotor_levers[1:]), moment)
     mass = scene.machine.carrier().mass
     rows = [jnp.linalg.solve(mass, row[0]) @ row[0] for row in mount.rows]
     whole = jnp.sum(jnp.abs(sum(tilting, 0.0 * each)))
-    return jnp.maximum(left, jnp.abs(moment) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
+    return jnp.maximum(residual, jnp.abs(moment) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
-    """Return the natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor the forward whirls at
-    its speed."""
+    """Return the natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor, the frequencies of
+    the forward whirls at the rotor speed."""
     if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])

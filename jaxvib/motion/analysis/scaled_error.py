@@ -21,9 +21,9 @@ from jaxvib.runtime.programs import cached
 def natural_units(scene: Scene) -> State:
     """Return the natural units of the state.
 
-    They are the unbalance radius S/M for displacements, S/M times the rotor's speed for velocities, 1 rad for angles, the
-    rotor's speed for their rates, and for a slip the rotor's speed times the loads' distance from the axis. S is the unbalance
-    of the loads, or that of the rotor if it is larger.
+    They are the unbalance radius S/M for displacements, S/M times the rotor speed for velocities, 1 rad for angles, the rotor
+    speed for rates of angles, and, for a slip, the rotor speed times the distance of the loads from the axis. S is the
+    unbalance of the loads, or that of the rotor if it is larger.
     """
     carrier, pairs = scene.machine.carrier(), [_exciter_units(exciter) for exciter in scene.exciters]
     unbalances = [unbalance for each, _ in pairs for unbalance in each]
@@ -54,14 +54,15 @@ def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
 
 
 def error_scale(state: State, unit: State) -> State:
-    """Return the scales of differences between states, one for each part of the state.
+    """Return the scales by which differences between states are divided, one for each part of the state.
 
-    The scale of displacements and velocities is the largest value, but at least the natural unit, since a motion at rest has no
-    scale. The scale of angles and speeds is the natural unit, 1 rad and the rotor speed.
+    The scale of displacements and of velocities is the largest value, but at least the natural unit, because a machine at rest
+    has no scale. The scale of angles and of their rates is the natural unit, 1 rad and the rotor speed.
 
-    **Arguments**: `state` a `State`, or a stretch of them whose arrays have a leading axis; `unit` its `natural_units`.
+    **Arguments**: `state`: a `State`, or several states whose arrays have a leading axis; `unit`: its `natural_units`.
 
-    **Returns** `State` of numbers; known ones are NumPy's, for which nothing is compiled.
+    **Returns** `State` with a scalar in each place. If the values are known, the scalars are computed by NumPy, without
+    compilation.
     """
     xp = numpy_of((state, unit))
 
@@ -90,12 +91,12 @@ def error_scale(state: State, unit: State) -> State:
 
 
 def scaled_error(a: State, b: State, scale: State) -> Array:
-    """Return the largest difference of two states over all their numbers, each relative to the `scale` of its part.
+    """Return the largest difference between the entries of two states, each relative to the `scale` of its part.
 
-    **Arguments**: `a`, `b` states, or stretches of them whose arrays have a leading axis; `scale` a `State` of numbers, see
+    **Arguments**: `a`, `b`: two states, or two sequences of states whose arrays have a leading axis; `scale`: see
     `error_scale`.
 
-    **Returns** a number, of NumPy if the states are known; NaN if one of them is not finite.
+    **Returns** a scalar, computed by NumPy if the states are known; NaN if one of them is not finite.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.array([x]), np.zeros(1), (np.array([3.0]),), (np.array([50.0]),)) for x in (2e-3, 1e-3))
@@ -106,7 +107,7 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
     xp = numpy_of((a, b, scale))
 
     def apart(x: Array, y: Array, unit: Array) -> Array:
-        with np.errstate(invalid="ignore"):  # a run that did not finish has NaN states
+        with np.errstate(invalid="ignore"):  # the states of a run that did not finish are NaN
             return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / xp.asarray(unit)
 
     return xp.max(xp.stack(jax.tree.leaves(jax.tree.map(apart, a, b, scale))))
@@ -119,27 +120,28 @@ def estimated_error(
     steps: Array | int = 0,
     radians: Array | np.ndarray | int = 0,
 ) -> Array:
-    """Return the error of a run, from its `difference` to a run with larger steps.
+    """Estimate the error of a run from its `difference` to a run with larger steps.
 
         difference x share + 2 eps (steps + radians)
 
-    The `share` is that of a smooth motion. If an effect is not smooth, the error depends on where steps meet its kinks, and
-    both runs may have the same error; therefore twice the difference counts. Rounding adds 2 eps for each step and for each
-    radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits it, since its equal steps round far
-    less.
+    The `share` of a smooth motion is used if all effects are smooth. Otherwise the error depends on the positions of the steps
+    relative to the kinks of the effects, and both runs may have the same error; therefore the share is 2. Rounding adds 2 eps
+    for each step and for each radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits this term,
+    because equal steps cause much smaller rounding errors.
 
-    **Arguments**: `difference`, see `scaled_error`; `steps` of the run; `radians`: phase of the fastest motion over the run.
+    **Arguments**: `difference`: see `scaled_error`; `share`: error of a smooth motion, relative to the difference; `steps` of
+    the run; `radians`: phase of the fastest motion over the run.
 
-    **Returns** a number, or an array of them.
+    **Returns** a scalar, or an array with one value for each run.
     """
     kept = share if all(term.is_smooth for effect in scene.all_effects for term in effect.terms()) else 2.0
     return difference * kept + 2.0 * float(np.finfo(scene.top_speed.dtype).eps) * (steps + radians)
 
 
 def turned(state: State, to: State) -> State:
-    """Return a state (or a stretch of them) with its angles moved by whole turns to be nearest to those of another.
+    """Return a state (or several states) with angles shifted by whole turns so that they are nearest to the angles of `to`.
 
-    In single precision angles are wrapped into a turn, and one of two close runs may have an additional turn.
+    In single precision angles are kept within one turn, and one of two close runs may have one turn more than the other.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.zeros(1), np.zeros(1), (np.array([phi]),), (np.array([50.0]),)) for phi in (3.1, -3.1))

@@ -1,13 +1,13 @@
-"""Stability of a motion with all loads at nearly one angle against their separation.
+"""Stability of coincident loads: growth of small differences between the angles of loads at nearly one angle.
 
-Loads that have equal parameters and start at one angle stay at one angle in exact arithmetic, whether or not the motion is
-stable. A run alone therefore does not show that they would separate. The linearized equations along the run do:
+Loads that have equal parameters and start at one angle stay at one angle in exact arithmetic, even if the motion is unstable. A
+run alone therefore does not show that they would separate. The linearized equations along the run show this:
 
     x' = A(t) x,    growth = ln(spectral radius of the transition matrix over whole turns of the loads) / duration
 
-For loads that have equal parameters on one track, x is the difference of two loads: it does not move the carrier, and all such
-differences obey the same equations. Otherwise x is the whole state. The transition matrix is a product of exponentials (a
-Magnus method of order 4 on the samples of the run): strong drag needs no smaller steps.
+If the loads have equal parameters and one track, x is the difference of two loads. Such a difference does not move the carrier,
+and all differences obey the same equations. Otherwise x is the whole state. The transition matrix is a product of exponentials
+(a Magnus method of order 4 on the samples of the run), so that strong drag needs no smaller steps.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from jaxvib.runtime.programs import cached
 NEARLY_ONE_ANGLE = 0.2
 """Largest angle between loads that count as loads at one angle, rad."""
 
-GROWTH = 1e-2
-"""Growth over the stretch, in e-folds, above which loads separate; smaller values are within the error of interpolation."""
+MIN_SEPARATION_GROWTH = 1e-2
+"""Logarithm of the growth over the samples above which loads separate. Smaller values can be errors of the interpolation."""
 
 
 def is_nearly_one_angle(angle: np.ndarray) -> bool:
@@ -47,13 +47,13 @@ def would_separate(scene: Scene, stretch: Trajectory) -> bool:
     """Return True if several loads have nearly one angle, and small differences of their angles grow."""
     time = np.asarray(stretch.time)
     near = [k for k, own in enumerate(stretch.state.exciters) if own.angle and is_nearly_one_angle(np.asarray(own.angle[0]))]
-    return any(separation_rate(scene, stretch, k) * float(time[-1] - time[0]) > GROWTH for k in near)
+    return any(separation_rate(scene, stretch, k) * float(time[-1] - time[0]) > MIN_SEPARATION_GROWTH for k in near)
 
 
 def separation_rate(scene: Scene, stretch: Trajectory, k: int = 0) -> float:
-    """Return the growth rate of small differences between angles of loads at nearly one angle, 1/s; negative for decay.
+    """Return the growth rate, 1/s, of small differences between angles of loads at nearly one angle; negative for decay.
 
-    **Arguments**: `stretch` an evenly sampled stretch of a run of `scene`, such as `run.window`; `k`, the number of the exciter
+    **Arguments**: `stretch`: an evenly sampled part of a run of `scene`, such as `run.window`; `k`: the number of the exciter
     with the loads, from 0.
     """
     phi = np.mean(np.asarray(stretch.state.exciters[k].angle[0]), axis=1)
@@ -66,7 +66,7 @@ def separation_rate(scene: Scene, stretch: Trajectory, k: int = 0) -> float:
 
 
 def prepare_separation(scene: Scene, state: State, samples: int) -> None:
-    """Begin to compile the program of `separation_rate` in a thread, for a stretch of states with the structure of `state`."""
+    """Compile the program of `separation_rate` in a background thread, for `samples` states with the structure of `state`."""
     states = jax.tree.map(lambda leaf: np.zeros((samples, *leaf.shape), leaf.dtype), state)
     times = np.zeros(samples, state.displacement.dtype)
     in_background(functools.partial(_transition.prepare, scene, times, states, np.asarray(0), 0))
@@ -76,7 +76,10 @@ def prepare_separation(scene: Scene, state: State, samples: int) -> None:
 def _transition(
     scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray, which: int
 ) -> tuple[Array, Array, Array]:
-    """Return the transition matrix from sample `first` to the last one, the logarithm of its factor, and the time between."""
+    """Return the transition matrix from sample `first` to the last sample, and the time between them, s.
+
+    The matrix is the product of the first result and the exponential of the second.
+    """
     field = vector_field(scene)
     step = (times[-1] - times[0]) / (times.shape[0] - 1)
     begin = jax.tree.map(lambda leaf: leaf[0], states)
@@ -106,7 +109,7 @@ def _transition(
 
 
 def _basis(scene: Scene, state: State, which: int) -> tuple[Callable[[Array], State], Callable[[State], Array], int]:
-    """Return the function from numbers x to a tangent of the state, its inverse, and the number of these numbers."""
+    """Return the function from the unknowns x to a tangent of the state, its inverse, and the number of unknowns."""
     exciter = scene.exciters[which]
     touching = has_term(exciter.effects, LoadInteraction)
     shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(exciter.loads))

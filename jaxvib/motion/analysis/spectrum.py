@@ -1,4 +1,4 @@
-"""Spectra of a run: of its end, or of successive segments (waterfall diagram)."""
+"""Spectra of the end of a run, or of successive segments of a run (waterfall diagram)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn
 
 _ZERO_PADDING_FACTOR = 4
-"""Ratio of the frequency resolution of a segment to the spacing of the computed frequencies, by zero padding; heights of peaks
-are then accurate to 2 %."""
+"""Factor by which zero padding reduces the spacing of the computed frequencies. With this factor the heights of peaks are
+accurate to 2 %."""
 
 _MAX_FREQUENCY_RATIO = 1.5
 """Largest frequency of spectra, in units of the largest rotor speed."""
@@ -37,7 +37,8 @@ class Spectrum(Result):
 
     Returned by `Run.spectrum`.
 
-    A piece is weighted by Hann's window; a vibration of constant amplitude has a peak of that height, zero to peak, to 2 %.
+    Each segment is weighted by the Hann window. The height of the peak of a steady vibration is its amplitude, zero to peak,
+    within 2 %.
 
     **Attributes** (P segments, nf frequencies)
 
@@ -64,7 +65,7 @@ class Spectrum(Result):
     units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
 
     def summary(self) -> str:
-        """Return as text the frequency with the largest amplitude of each coordinate in the last segment."""
+        """Return the largest amplitude of each coordinate in the last segment, with its frequency, as text."""
         last = self.amplitude[-1]
         peaks = np.argmax(last, axis=0)
         lines = [
@@ -84,10 +85,9 @@ class Spectrum(Result):
         unit: SpeedUnit | None = None,
         ax: Axes | None = None,
     ) -> Drawn:
-        """Plot amplitudes against frequency for one segment, or a waterfall diagram over time for several; larger amplitudes
-        are darker.
+        """Plot amplitudes over frequency for one segment, or a waterfall diagram over time for several segments.
 
-        Resonances and the speeds of rotor and loads are marked.
+        In a waterfall diagram larger amplitudes are darker. Resonances and the speeds of rotor and loads are marked.
 
         **Arguments**
 
@@ -121,10 +121,11 @@ class Spectrum(Result):
 
 
 def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None, parts: int) -> Spectrum:
-    """Return the spectrum of a run's window if `parts` is 1, otherwise those of this number of segments of its trajectory."""
+    """Return the spectrum of the window of a run if `parts` is 1, otherwise the spectra of `parts` segments of its
+    trajectory."""
     count(parts, "parts")
     if parts > 1 and trajectory is None:
-        raise InputError("parts", f"is {parts}, but the run saved its end only; simulate with save='all', or give 1")
+        raise InputError("parts", f"is {parts}, but the run saved only its end; simulate with save='all', or give 1")
     kept = window if parts == 1 or trajectory is None else trajectory
     time = np.asarray(kept.time, float)
     # Neighbouring segments overlap by one half, since the Hann window suppresses the ends of each segment.

@@ -27,7 +27,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import MIN_CHANGE_SCALE, Measured
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
+from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.run import SETTLED_DRIFT
@@ -49,16 +49,16 @@ from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known
 
-_WINDOW = 512
-"""Number of samples in the measuring window at the end: 25 in a period of the slowest resonance."""
+_WINDOW_SAMPLES = 512
+"""Number of samples in the measuring window at the end: 25 in each period of the lowest resonance."""
 
 _MAX_WINDOW_TURNS = 256
-"""Largest length of the window in turns of the rotor, as in `simulate`."""
+"""Largest length of the measuring window, in turns of the rotor, as in `simulate`."""
 
 
 class _Tolerance(WrappedController):
-    """Controller of the step size with errors relative to the norm of a complex vector, since its real or imaginary part is
-    often 0."""
+    """Step size controller with errors relative to the norm of a complex vector, because its real or imaginary part is often
+    0."""
 
     controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
@@ -144,12 +144,13 @@ def envelope(
 ) -> Envelope:
     """Integrate the averaged equations of a scene from 0 to `until`: amplitudes and load speeds in place of vibrations.
 
-    In a run-up through resonances, with capture or passage, each step spans many turns. The result is the limit of light loads:
+    Each step spans many turns, also in a run-up in which loads jam at a resonance or pass through it. The result is the limit
+    of light loads:
 
-    - its relative error is of first order in the loads' share of the mass times the dynamic magnification, and about as large
-      as the result's `ripple`; typical: 1e-3 to 0.1
-    - its equilibria are those of `jam_modes`
-    - near the boundary between capture and passage small differences decide the outcome: use `simulate` there
+    - its relative error is of first order in the loads' share of the mass, multiplied by the dynamic magnification, and about
+      as large as the `ripple` of the result; typical: 1e-3 to 0.1
+    - its equilibria are the jams of `jam_modes`
+    - near the boundary between jamming and passing, small differences decide the outcome: use `simulate` there
 
     The equations are given in `averaged_field`.
 
@@ -159,11 +160,11 @@ def envelope(
     - `until`, s; typical: 5 to 600
     - `start`, `mode`, `separation`, `spin_up`, `turns`, `adjoint`, `throw`: as in `simulate`. Each load has its own phase:
       loads with slightly different initial angles separate if the averaged motion at one angle is unstable
-    - `save`: "all" keeps `samples` (default 256) evenly spaced times; "window" keeps only the measuring window
-    - `stepsize_controller`: `Tolerance`, the allowed error of a step: both relative to the largest amplitude and absolute in
-      natural units (rotor speed for rates, 1 rad for phases); typical: 1e-3 to 1e-6, default 1e-4. Or a step size controller
-      of diffrax
-    - `solver` of diffrax for stiff systems; default: `Rodas4`
+    - `save`: "all" keeps `samples` (default 256) evenly spaced states; "window" keeps only the measuring window
+    - `stepsize_controller`: `Tolerance`, the allowed error of a step, both relative to the largest amplitude and absolute in
+      natural units (rotor speed for rates, 1 rad for phases); typical: 1e-3 to 1e-6, default 1e-4. A step size controller of
+      diffrax is also possible
+    - `solver`: a solver of diffrax for stiff systems; default: `Rodas4`
     - `max_steps`: the run fails after this number of steps; typical: 2^16 (the default)
 
     Gravity has no mean torque on a load that makes full turns. If a load is too slow to pass the top of its track, or its drag
@@ -195,7 +196,7 @@ def envelope(
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if isinstance(chosen, Tolerance):
         chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
-    asked, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
+    given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     choices = solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     if isinstance(start, str) and start == "jam" and not jams_of.is_ready(scene):
         rest = initial_state(scene)
@@ -207,7 +208,9 @@ def envelope(
         known = start in ("rest", "spin_up") and mode is None and separation is None
         state = None if known else initial_state(scene, start, mode=mode, separation=separation, throw=throw)
     run = _run(scene, end, state, *choices)
-    run = outcome(run, asked, end, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps))
+    run = outcome(
+        run, given_scene, end, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps)
+    )
     judged = when_known(lambda *_: _with_separation_status(run), run.steps, run.status)
     return run if judged is None else judged
 
@@ -222,7 +225,7 @@ def _with_separation_status(run: Envelope) -> Envelope:
         return run
     last = (np.asarray(x[-1]) for x in map(np.asarray, (run.window.omega, run.window.phase, run.window.displacement)))
     growth = float(_growth_at_end(at_constant_speed(run.scene), *last))
-    if not growth * float(time[-1] - time[0]) > GROWTH:
+    if not growth * float(time[-1] - time[0]) > MIN_SEPARATION_GROWTH:
         return run
     return dataclasses.replace(run, status=member(EnvelopeStatus, "would_separate"))
 
@@ -252,7 +255,7 @@ def _run(
     max_steps: int,
 ) -> Envelope:
     begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
-    # A start that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
+    # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(begin)
     begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
     model, nd = linear_model(scene), begin.displacement.shape[0]
@@ -261,8 +264,8 @@ def _run(
     speed, frequencies = frozen.drive.speed, estimated_frequencies(frozen)
     saves = _saves(speed, frequencies, end, samples, turns)
 
-    given = isinstance(control, diffrax.AbstractStepSizeController)
-    controller = control if given else diffrax.PIDController(rtol=control, atol=control)
+    is_controller = isinstance(control, diffrax.AbstractStepSizeController)
+    controller = control if is_controller else diffrax.PIDController(rtol=control, atol=control)
 
     rates, args = _rates(units.pack(begin), (field, units), nd)
     solution = solve(
@@ -287,8 +290,8 @@ def _run(
     turning = _turning(scene, field, begin, kept)
     status = _status(solution.result, exists, finite, turning)
     whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
-    seen = (_measure(model, kept), jnp.max(kept.ripple, axis=0), whole, kept)
-    measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
+    values = (_measure(model, kept), jnp.max(kept.ripple, axis=0), whole, kept)
+    measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), values)
     return Envelope(
         **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
         ripple=ripple,
@@ -305,7 +308,7 @@ def _saves(speed: Array, frequencies: Array, end: Array, samples: int, turns: in
     """Return the saved times: those of the measuring window at the end, and those of the whole run if `samples` is not 0."""
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
     window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _MAX_WINDOW_TURNS / speed)
-    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW_SAMPLES))]
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
     return saves
@@ -327,8 +330,10 @@ def _at_rest(scene: Scene) -> Amplitudes:
 
 
 def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[..., Array], Args]:
-    """Return the averaged equations as a function of the integrator's vector, and their arguments; on scalars for small
-    systems."""
+    """Return the averaged equations as a function of the integrator's vector, and their arguments.
+
+    For small systems the equations are computed on scalars.
+    """
 
     def on_arrays(t: Array, y: Array, args: tuple[Averaged, _Units]) -> Array:
         field, units = args

@@ -1,4 +1,4 @@
-"""Result of an averaged run: its motion, quantities and outcome."""
+"""Result of an averaged run: motion, measured quantities and status."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class EnvelopeStatus(eqx.Enumeration):
         "all loads are at nearly one angle, and this motion is unstable: slightly separated loads move away from it"
     )
     refused = REFUSED
-    not_turning = "gravity does not average out: a load turns too slowly, or its drag does not lift it against gravity"
+    not_turning = "gravity does not average out: a load turns too slowly, or its drag cannot lift it against gravity"
 
 
 class Envelopes(eqx.Module):
@@ -73,10 +73,10 @@ class Envelope(AbstractMeasured, Result):
     **Attributes**: those of `AbstractMeasured`, and
 
     - `status`: an `EnvelopeStatus`
-    - `ripple` (count,), rad: amplitude by which the vibration that averaging leaves out shakes each load's angle, largest over
-      the window. Amplitudes and speeds are off by a share of about this size; typical: 1e-3 to 0.1
-    - `trajectory` and `window`: `Envelopes`; the former None if only the window was requested
-    - `steps` taken, and `rejected`
+    - `ripple` (count,), rad: amplitude of the oscillation of each load's angle that averaging omits, the largest in the window.
+      It estimates the relative error of amplitudes and speeds; typical: 1e-3 to 0.1
+    - `trajectory` and `window`: `Envelopes`; `trajectory` is None if only the window was requested
+    - `steps`: number of accepted and rejected steps; `rejected`: number of rejected steps
     - `scene`
     """
 
@@ -90,7 +90,7 @@ class Envelope(AbstractMeasured, Result):
 
     @property
     def settled(self) -> Array:
-        """True if amplitudes and speed no longer change, and loads a little apart do not leave the motion."""
+        """True if amplitudes and speed no longer change, and slightly separated loads do not leave the motion."""
         return (self.drift < SETTLED_DRIFT) & (self.status != EnvelopeStatus.would_separate)
 
     def summary(self) -> str:

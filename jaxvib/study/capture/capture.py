@@ -113,9 +113,7 @@ class Capture(Result):
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
-            head += (
-                f"\n  detached: in {share:.3g} % of the runs a ball lost contact with its wall, on which the equations hold it"
-            )
+            head += f"\n  detached: in {share:.3g} % of the runs a ball lost contact with its wall; the equations keep it on the wall"
         if np.isnan(self.threshold):
             return head
         below = self.fraction[self.speed < float(self.threshold)]
@@ -335,7 +333,7 @@ def capture_time(run: Run, within: float = 0.05) -> Array:
     True
     """
     if run.trajectory is None:
-        raise InputError("run", "saved its window only; run simulate with save='all'")
+        raise InputError("run", "saved only its window; run simulate with save='all'")
     times, speed = run.trajectory.time, run.trajectory.rotor_speed[:, None]
     excess = jnp.abs(run.trajectory.state.azimuth_rate - speed) - within * jnp.abs(speed)
 

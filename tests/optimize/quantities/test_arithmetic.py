@@ -190,7 +190,7 @@ def test_quantities_in_time():
         (lambda: settling_time(until=3.0, spin_up=2.0, within=2.0), "less than 1"),
         (lambda: spring_cost([(1e4, 1.0)]), "at least two pairs"),
         (lambda: spring_cost([(1e4, 1.0), (1e3, 1.0)]), "must have ascending stiffnesses"),
-        (lambda: under(STIFFNESS, "x", {}), "give a dictionary"),
+        (lambda: under(STIFFNESS, "x", {}), "must be a dictionary"),
         (lambda: under(STIFFNESS, "x", {"drive.speed": "3 kg"}), "is not in rad/s"),
         (lambda: expected(STIFFNESS, {"machine.stiffness": 5.0}), "it must be between 0 and 1, such as 0.05"),
         (lambda: quantile(STIFFNESS, 1.5, {"machine.stiffness": 0.05}), "less than 1"),

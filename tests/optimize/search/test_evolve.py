@@ -97,18 +97,18 @@ def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
     found = np.concatenate([followed.of(first), followed.of(second)])[:, 0]
     awaited = [float(jam_modes(problem.space.at(jnp.asarray(z))).select(3).omega) for z in (*first, *second)]
     np.testing.assert_allclose(found, awaited, rtol=1e-9)
-    assert looked == [3] and len(followed.remembered[0]) == 6
-    np.testing.assert_allclose(followed.remembered[1], awaited, rtol=1e-9)
-    followed.remembered = followed.remembered[0], np.full(6, 1e-3)  # nothing is near there
+    assert looked == [3] and len(followed.latest[0]) == 6
+    np.testing.assert_allclose(followed.latest[1], awaited, rtol=1e-9)
+    followed.latest = followed.latest[0], np.full(6, 1e-3)  # nothing is near there
     np.testing.assert_allclose(followed.of(first)[:, 0], awaited[:3], rtol=1e-9)
     assert looked == [3, 3]
-    np.testing.assert_allclose(followed.remembered[1][-3:], awaited[:3], rtol=1e-9)
+    np.testing.assert_allclose(followed.latest[1][-3:], awaited[:3], rtol=1e-9)
     for _ in range(40):
         followed.of(second)
-    assert len(followed.remembered[0]) == len(followed.remembered[1]) <= 200
+    assert len(followed.latest[0]) == len(followed.latest[1]) <= 200
     monkeypatch.setattr(evolve_module, "_MAX_KNOWN_DESIGNS", 4)  # the last ones
     followed.of(first)
-    np.testing.assert_array_equal(followed.remembered[0], [second[2], *first])
+    np.testing.assert_array_equal(followed.latest[0], [second[2], *first])
 
 
 def test_evolutions_begin_anew_with_twice_the_population(monkeypatch):

@@ -192,7 +192,7 @@ def test_reverse_derivatives_are_the_forward_ones():
         ),
         (
             lambda s: capture_time(jv.simulate(s, 0.1, start=moving_state(s, -0.1), save="window", estimate=False)),
-            "run saved its window only",
+            "run saved only its window",
         ),
     ],
 )
