@@ -36,7 +36,7 @@ START_SEPARATION = math.radians(1.0)
 there, even if this motion is unstable."""
 
 Rotation = Literal["rolling", "none"]
-"""Initial rotation of the loads about their own centres: "rolling" on their track, or "still", without rotation in space."""
+"""Initial rotation of the loads about their own centres: "rolling" on their track, or "none" in space."""
 
 
 @validated
@@ -157,13 +157,13 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
     **Arguments**
 
     - `scene` whose effects release the rotation (`FreeSpin`, `Sliding`)
-    - `state` without it
-    - `rotation`: "rolling" (the default), for loads that roll on their track and do not spin on it, or "none", for loads that
-      do not turn in space, so that their contact slides if the scene has `Sliding`, as in the equation; typical: slips of 5 to
-      50 m/s for "none"
+    - `state` without this rotation
+    - `rotation`: "rolling" (the default), for loads that roll on their track without spin about the contact normal; or "none",
+      for loads that do not rotate in space (the equation above), so that their contact slides if the scene has `Sliding`;
+      typical: slips of 5 to 50 m/s for "none"
 
-    **Returns** `State`. **Raises** `InputError` for another name, and for a spin that the scene does not release or of a wrong
-    shape.
+    **Returns** `State`. **Raises** `InputError` for another name, and for a spin in the state that the scene does not release
+    or that has a wrong shape.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> loads = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)

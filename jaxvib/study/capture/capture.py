@@ -113,7 +113,8 @@ class Capture(Result):
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
-            head += f"\n  detached: in {share:.3g} % of the runs a ball lost contact with its wall; the equations keep it on the wall"
+            says = "a ball lost contact with its wall; the equations keep it on the wall"
+            head += f"\n  detached: in {share:.3g} % of the runs {says}"
         if np.isnan(self.threshold):
             return head
         below = self.fraction[self.speed < float(self.threshold)]

@@ -106,7 +106,7 @@ def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
     for _ in range(40):
         followed.of(second)
     assert len(followed.latest[0]) == len(followed.latest[1]) <= 200
-    monkeypatch.setattr(evolve_module, "_MAX_KNOWN_DESIGNS", 4)  # the last ones
+    monkeypatch.setattr(evolve_module, "_MAX_STORED_DESIGNS", 4)  # the last ones
     followed.of(first)
     np.testing.assert_array_equal(followed.latest[0], [second[2], *first])
 
