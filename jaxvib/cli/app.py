@@ -125,6 +125,7 @@ _GROUPS = {
         "optimize": "optimize",
         "sweep": "study.sweep",
         "show": "study.sweep",
+        "record": "study.record",
         "identify": "study.identify",
     },
     "Accuracy": {"cost": "study.cost", "audit": "study.audit"},
@@ -138,6 +139,7 @@ _ARGUMENTS = {
     "scene": "a scene file, such as `jaxvib new two-mass > machine.toml` makes",
     "design": "a design file, such as `jaxvib new design > design.toml` makes",
     "study": "a study file, such as `jaxvib new sweep > study.toml` makes",
+    "recording": "a file of a recorder, such as run_up.csv",
     "source": "a scene file, or a run.npz that `jaxvib simulate` saved",
 }
 """Descriptions of arguments of commands, for messages about missing ones."""

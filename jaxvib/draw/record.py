@@ -1,9 +1,12 @@
-"""Chart of a record and the model fitted to it."""
+"""Charts of a recording, and of a record and the model fitted to it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from jaxvib.display import speed_unit
 from jaxvib.draw.style import COLORS, GUIDE, Drawn, Onto, legend_above, panels
 
 
@@ -30,3 +33,44 @@ def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise:
     bottom.set_ylabel("fit - record, deg")
     bottom.set_xlabel("time, s")
     return figure if ax is None else ax
+
+
+_MAX_SHOWN_POINTS = 4000
+"""Number of points of a curve above which it is drawn by the smallest and the largest value of each part."""
+
+
+def recording_chart(
+    signals: Sequence[tuple[str, np.ndarray, np.ndarray]],
+    speed: tuple[np.ndarray, np.ndarray] | None = None,
+    *,
+    ax: Onto = None,
+) -> Drawn:
+    """Draw one panel for each signal (label, times s, values), and a last one for the `speed` (times s, rad/s) of the rotor.
+
+    >>> import numpy as np
+    >>> len(recording_chart([("frame, g", np.arange(9.0), np.ones(9))], (np.arange(9.0), np.ones(9))).axes)
+    2
+    """
+    figure, axes = panels(len(signals) + (speed is not None), size=(9.0, 1.9), share_x=True, ax=ax)
+    for axis, (label, time, values) in zip(axes, signals, strict=False):
+        axis.plot(*_extremes(time, values), color=COLORS[0], lw=0.6)
+        axis.set_ylabel(label)
+    if speed is not None:
+        unit, factor = speed_unit()
+        axes[-1].plot(speed[0], factor * speed[1], color=COLORS[1])
+        axes[-1].set_ylabel(f"rotor speed, {unit}")
+    axes[-1].set_xlabel("time, s")
+    return figure if ax is None else ax
+
+
+def _extremes(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a curve of at most `_MAX_SHOWN_POINTS` points with the smallest and the largest value of each part of it."""
+    size = -(-2 * values.size // _MAX_SHOWN_POINTS)
+    if size <= 2:
+        return time, values
+    count = values.size // size * size
+    parts = values[:count].reshape(-1, size)
+    low = np.min(parts, axis=1, where=np.isfinite(parts), initial=np.inf)
+    high = np.max(parts, axis=1, where=np.isfinite(parts), initial=-np.inf)
+    pairs = np.stack([low, high], axis=1).ravel()
+    return np.repeat(time[:count:size], 2), np.where(np.isfinite(pairs), pairs, np.nan)

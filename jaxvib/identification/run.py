@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.identification.records.agreement import check_agreement
+from jaxvib.identification.records.agreement import ROTOR_KINDS, check_agreement, rotor_speed
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.records.pulses import numbered_pulses, rising_edges
 from jaxvib.identification.records.recorded import described_channels, recorded_from_sep005
@@ -162,6 +162,14 @@ class MeasuredRun(eqx.Module):
     def rate(self, name: str) -> float:
         """Return the sampling rate, Hz, of the channel `name`: that of the median time step."""
         return 1.0 / float(np.median(np.diff(self.times[name])))
+
+    def rotor_speed(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return times, s, and the speed of the rotor, rad/s, from the pulses, or else the angle or the speed; None without.
+
+        The speed from pulses is the average over each turn.
+        """
+        channels = sorted(self.of_kind(*ROTOR_KINDS), key=lambda each: ROTOR_KINDS.index(each.kind))
+        return rotor_speed(channels[0], self.times[channels[0].name], self.values[channels[0].name]) if channels else None
 
     @property
     def span(self) -> tuple[float, float]:

@@ -20,6 +20,9 @@ from jaxvib.units.columns import unit_factor
 _ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 """Number of derivatives of the displacement in a kind of motion."""
 
+ROTOR_KINDS = ("pulses", "angle", "speed")
+"""Kinds of channels that measure the rotor's rotation, the most exact first."""
+
 _OTHER_UNITS = {
     "displacement": ("m", "mm", "um", "mil"),
     "velocity": ("m/s", "mm/s", "in/s"),
@@ -57,7 +60,7 @@ def check_agreement(
     too low for the speed of the rotor.
     """
     signals = [_Signal(channel, times[channel.name], values[channel.name]) for channel in channels]
-    speeds = [_speed(signal) for signal in signals if signal.channel.kind in ("pulses", "angle", "speed")]
+    speeds = [_Signal(each.channel, *rotor_speed(*each)) for each in signals if each.channel.kind in ROTOR_KINDS]
     motions = [_Signal(each.channel, each.time, _filled(each.value)) for each in signals if each.channel.kind in _ORDERS]
     notes = []
     for one, other in itertools.combinations(sorted(speeds, key=lambda each: each.channel.kind == "speed"), 2):
@@ -68,20 +71,20 @@ def check_agreement(
     return notes
 
 
-def _speed(signal: _Signal) -> _Signal:
-    """Return the speed of the rotor, rad/s, from any channel of it."""
-    channel, time, value = signal
+def rotor_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and the speed of the rotor, rad/s, from a channel of pulses, angle or speed; on average over each turn for
+    pulses, whose marks may be uneven."""
     if channel.kind == "speed":
         known = np.isfinite(value)
-        return _Signal(channel, time[known], value[known])
-    if channel.kind == "pulses":
-        angle, step = 2.0 * np.pi * value / channel.per_turn, channel.per_turn  # whole turns: marks may be uneven
-    else:
-        angle, step = value, max(1, time.size // 500)
-    angle, time = angle[::step], time[::step]
-    known = np.isfinite(angle)
-    angle, time = angle[known], time[known]
-    return _Signal(channel, 0.5 * (time[1:] + time[:-1]), np.diff(angle) / np.diff(time))
+        return time[known], value[known]
+    turned, step = (
+        (2.0 * np.pi * value / channel.per_turn, channel.per_turn)
+        if channel.kind == "pulses"
+        else (value, max(1, time.size // 500))
+    )
+    known = np.isfinite(turned[::step])
+    turned, time = turned[::step][known], time[::step][known]
+    return 0.5 * (time[1:] + time[:-1]), np.diff(turned) / np.diff(time)
 
 
 def _compare_speeds(one: _Signal, other: _Signal, source: str) -> list[str]:

@@ -1,0 +1,76 @@
+"""jaxvib record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from jaxvib.cli.app import Output, app, shared, table
+
+_SHOWN_TIMES = 9
+"""Number of times in the table of the rotor's speed."""
+
+
+@app.command("record")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--pulses", help="Name of the channel with the pulses of a tachometer.")
+@click.option("--per-turn", type=click.IntRange(min=1), default=1, show_default=True, help="Pulses per turn of the rotor.")
+@click.option("--speed", help="Name of the channel with the speed of the rotor [the first in rpm or rad/s].")
+@click.option("--rate", help="Sampling rate in place of the times in the file, such as '2 kHz'.")
+@shared
+def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None, rate: str | None, output: Output) -> None:
+    """Describe a RECORDING (CSV, TDMS, UFF, MAT, WAV, MF4): its channels with their units, rates, gaps and clipped readings,
+    and the speed of the rotor over time. --out adds the figure."""
+    import numpy as np  # slow imports, which --help does not need
+
+    from jaxvib.display import speed_text
+    from jaxvib.draw.record import recording_chart
+    from jaxvib.exchange.recordings.overview import overview_of, speed_of
+    from jaxvib.exchange.recordings.read import read_recording
+
+    channels = read_recording(recording, rate)
+    found = [overview_of(each) for each in channels]
+    run = speed_of(channels, pulses, speed, per_turn)
+    curve = None if run is None else run.rotor_speed()
+    notes = [note for each in found for note in each.notes] + ([] if run is None else list(run.notes))
+    signals = [
+        (f"{each.name}{f', {each.unit}' if each.unit else ''}", each.time, each.values)
+        for each in channels
+        if each.time is not None
+    ]
+    output.picture("recording.png", lambda: recording_chart(signals, curve))
+    document = {
+        "file": str(recording),
+        "channels": [{k: v for k, v in each._asdict().items() if k != "notes"} for each in found],
+        "speed": None,
+        "notes": notes,
+    }
+    rows_of_speed: list[list[str]] = []
+    if curve is not None:
+        time, values = curve
+        document["speed"] = {"start": values[0], "end": values[-1], "low": np.min(values), "high": np.max(values)}
+        shown = np.linspace(time[0], time[-1], _SHOWN_TIMES)
+        rows_of_speed = [[f"{t:.4g}", speed_text(float(np.interp(t, time, values)), 5)] for t in shown]
+
+    def text() -> str:
+        rows = [
+            [
+                each.name,
+                each.unit,
+                "" if np.isnan(each.rate) else f"{each.rate:.6g}",
+                f"{each.samples}",
+                "" if np.isnan(each.start) else f"{each.start:.4g} to {each.end:.4g}",
+                f"{each.low:.4g} to {each.high:.4g}",
+                f"{each.missing or ''}",
+                f"{each.clipped or ''}",
+            ]
+            for each in found
+        ]
+        heads = ["channel", "unit", "rate, Hz", "readings", "time, s", "values", "missing", "clipped"]
+        lines = [table(str(recording), heads, rows)]
+        if rows_of_speed:
+            lines.append(table("speed of the rotor", ["time, s", "speed"], rows_of_speed))
+        return "\n".join([*lines, *notes])
+
+    output.done(document, text, "recording")

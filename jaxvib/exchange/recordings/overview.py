@@ -1,0 +1,105 @@
+"""Overview of a recording: rate, gaps, missing and clipped readings of each channel, and the speed of the rotor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxvib.errors import InputError, quoted
+from jaxvib.identification.records.channel import UNITS, Channel
+from jaxvib.identification.records.recorded import Recorded
+from jaxvib.identification.records.sampling import clipped_at, even_samples
+from jaxvib.identification.run import MeasuredRun
+from jaxvib.units.columns import unit_factor
+
+_TWO_LEVELS = 0.9
+"""Share of readings at either end of the range above which a channel has two levels."""
+
+
+class ChannelOverview(NamedTuple):
+    """Overview of a channel, in the unit of the file.
+
+    **Attributes**
+
+    - `name`, `unit`, and `kinds` of channel that have such a unit
+    - `rate`, Hz, NaN without times; `samples`; `start` and `end`, s
+    - `low` and `high`: smallest and largest reading
+    - `missing` and `clipped`: numbers of readings
+    - `notes`: sentences about gaps, repairs and problems
+    """
+
+    name: str
+    unit: str
+    kinds: tuple[str, ...]
+    rate: float
+    samples: int
+    start: float
+    end: float
+    low: float
+    high: float
+    missing: int
+    clipped: int
+    notes: tuple[str, ...]
+
+
+def overview_of(recorded: Recorded) -> ChannelOverview:
+    """Return the overview of a channel; problems that would stop a fit are in its notes.
+
+    >>> t = np.arange(0.0, 2.0, 0.01)
+    >>> found = overview_of(Recorded("frame", "g", t, np.clip(np.sin(9.0 * t), -1.0, 0.8)))
+    >>> round(found.rate), found.kinds, found.clipped > 30
+    (100, ('acceleration',), True)
+    """
+    where = f"channel {quoted(recorded.name)}"
+    kinds = tuple(kind for kind, si in UNITS.items() if recorded.unit and unit_factor(recorded.unit, si) is not None)
+    known = recorded.values[np.isfinite(recorded.values)]
+    low, high = (float(np.min(known)), float(np.max(known))) if known.size else (np.nan, np.nan)
+    count, nan = recorded.values.size, float("nan")
+    missing, clipped = count - known.size, 0
+    notes: list[str] = []
+    rate, start, end = nan, nan, nan
+    if recorded.time is not None and recorded.time.size:
+        start, end = float(recorded.time[0]), float(recorded.time[-1])
+        try:
+            if recorded.time.size != count:
+                raise InputError(where, f"has {recorded.time.size} times but {count} values")
+            time, value, notes = even_samples(recorded.time, recorded.values, where)
+            rate, missing = 1.0 / float(time[1] - time[0]), int(np.count_nonzero(np.isnan(value)))
+            bottom, top = clipped_at(value)
+            clipped = int(np.count_nonzero((value <= bottom) | (value >= top)))
+            if clipped > _TWO_LEVELS * count:
+                notes.append(f"{where} has two levels, like the pulses of a tachometer")
+                clipped = 0
+            elif clipped:
+                notes.append(f"{where} is clipped at {' and '.join(f'{x:.4g}' for x in (bottom, top) if np.isfinite(x))}")
+        except InputError as error:
+            notes = [str(error)]
+    return ChannelOverview(
+        recorded.name, recorded.unit, kinds, rate, count, start, end, low, high, missing, clipped, tuple(notes)
+    )
+
+
+def speed_of(recorded: Sequence[Recorded], pulses: str | None, speed: str | None, per_turn: int) -> MeasuredRun | None:
+    """Return the run of a tachometer or of a channel of speed; None if neither is named and no channel has a unit of speed.
+
+    **Raises** `InputError` for an unknown name, and for pulses that cannot be used.
+    """
+    name = pulses or speed or next((each.name for each in recorded if each.unit.lower() in ("rpm", "1/min", "rad/s")), None)
+    if name is None:
+        return None
+    found = next((each for each in recorded if each.name.lower() == name.lower()), None)
+    if found is None:
+        raise InputError("pulses" if pulses else "speed", f"is {quoted(name)}; the channels are {_names(recorded)}")
+    if pulses is None and unit_factor(found.unit or "rad/s", "rad/s") is None:
+        raise InputError("speed", f"is {quoted(name)}, which is in {quoted(found.unit)}; give a channel in rpm, rad/s or Hz")
+    kind, unit = ("pulses", None) if pulses else ("speed", found.unit or None)
+    channel = Channel(found.name, kind, unit=unit, per_turn=per_turn)
+    if found.time is None:
+        raise InputError("pulses" if pulses else "speed", f"is {quoted(name)}, which has no times in the file; give rate")
+    return MeasuredRun.from_arrays([channel], {found.name: found.time}, {found.name: found.values}, source="recording")
+
+
+def _names(recorded: Sequence[Recorded]) -> str:
+    return ", ".join(quoted(each.name) for each in recorded[:20])
