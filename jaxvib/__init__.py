@@ -9,7 +9,7 @@ import jaxvib.code_changes  # noqa: F401  before all other imports, which it wat
 
 
 def _homes() -> dict[str, str]:
-    """The module each public name lives in: the imports of the stub beside this file, which type checkers read too."""
+    """Return the module that defines each public name, from the imports of the stub `__init__.pyi`, which type checkers use."""
     stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     return {alias.name: str(node.module) for node in imports for alias in node.names}

@@ -27,7 +27,7 @@ import numpy.typing as np_typing
 from jaxvib.errors import InputError, quoted, require_path
 
 _MAX_ENTRIES = 10**7
-"""Largest length of a list; longer lists are refused, since each entry is checked."""
+"""Largest length of a list; longer lists are refused, because each entry is checked."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -109,7 +109,7 @@ def _require_known(arguments: Mapping[str, Any]) -> None:
     for name, value in arguments.items():
         if any(map(_is_traced, jax.tree.leaves(value))):
             holder = type(value).__name__ if name == "self" else name
-            problem = "contains a number that JAX traces, but its value is needed here; call this outside of jit, grad and vmap"
+            problem = "contains a value that JAX traces, but the value is needed here; call this outside of jit, grad and vmap"
             raise InputError(holder, problem)
 
 

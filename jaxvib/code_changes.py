@@ -4,8 +4,8 @@ The keys of stored programs contain a digest of the source files. The code of a 
 edited after the import of jaxvib, or if a function, a constant or a member of a class was replaced (by a mock, a notebook, a
 patch). Such a process must neither store programs nor read stored ones.
 
-The class of each module of the package is replaced by one that records which names are set from outside; other modules are not
-changed. The members of classes are compared with those at the import, and files by their modification times. This does not
+The class of each module of the package is replaced by a class that records which names are set from outside; other modules are
+not changed. The members of classes are compared with those at the import, and files by their modification times. This does not
 detect changes inside arrays, dictionaries and other mutable objects, a new `__code__` of a function, or replacements in other
 packages.
 """
@@ -35,7 +35,7 @@ _Stamp: TypeAlias = "tuple[int, int, int] | None"
 
 
 class CodeState(NamedTuple):
-    """State of the code: `number` increases with each change; `is_on_disk` is True if it is that of the source files."""
+    """State of the code: `number` increases with each change; `is_on_disk` is True if the code equals the source files."""
 
     number: int
     is_on_disk: bool

@@ -26,15 +26,16 @@ class _Chosen:
 
 @validated
 def display_units(*, speed: SpeedUnit = "rpm", si: bool = False) -> None:
-    """Set the units of all texts, tables and figures of this process; without arguments, the usual ones of engineers.
+    """Set the units of all texts, tables and figures of this process; without arguments, the units that are usual in
+    engineering.
 
     The command-line option `--unit` sets `speed`.
 
     **Arguments**
 
     - `speed`: unit of speeds and frequencies, "rpm", "Hz" or "rad/s"
-    - `si`: True for m, N/m and kg; False for mm, N/mm and g where they suit the size of the number. Machines of dimensionless
-      numbers read best with `speed="rad/s", si=True`
+    - `si`: True for m, N/m and kg; False for mm, N/mm and g where they suit the size of the value. Use `speed="rad/s",
+      si=True` for machines with dimensionless parameters
 
     **Returns** None. **Raises** `InputError` for another unit.
 
@@ -106,7 +107,7 @@ def quantity_text(values: ArrayLike, unit: str, digits: int = 5, between: str = 
 
 
 def speed_text(values: ArrayLike, digits: int = 5, between: str = ", ") -> str:
-    """Return speeds, rad/s, as `quantity_text` does.
+    """Return speeds, rad/s, as text, see `quantity_text`.
 
     >>> speed_text(157.0796), speed_text([100.0, 200.0], 3, " .. ")
     ('1500 rpm', '955 .. 1.91e+03 rpm')

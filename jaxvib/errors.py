@@ -22,7 +22,7 @@ _MAX_WORD, _MAX_MESSAGE = 300, 2000
 
 
 def legible(text: object) -> str:
-    """Return a text on one line for a terminal, with control characters as escapes and long words and texts shortened.
+    """Return a text on one line for a terminal, with control characters escaped, and long words and texts shortened.
 
     >>> legible("a\\x1b[31m" + 1000 * "b")[:20]
     'a\\\\x1b[31mbbbbbbbbbbb'
@@ -44,7 +44,7 @@ class InputError(ValueError):
 
     **Arguments**, also attributes
 
-    - `field`: dotted name of the argument ("machine.mass[1]"), so that a file or a form can point at it
+    - `field`: dotted name of the argument ("machine.mass[1]"), so that a message about a file or a form can locate it
     - `problem`: the rest of the sentence, "is 0; a machine needs at least 1 load"
 
     >>> raise InputError("loads.count", "is 0; a machine needs at least 1 load")

@@ -56,7 +56,7 @@ def test_traced_numbers_are_answered_or_refused_in_a_sentence(trial):
                     ends[f"{call.name}({name})"] = trial.judged(lambda call=call, name=name: trial.traced(call, name))
     assert [(name, said) for name, (kind, said) in ends.items() if kind not in ("refused", "answered")] == []
     assert ends["jam_modes(scene)"][0] == "answered"
-    assert ends["balanced_states(scene)"][1].startswith("scene contains a number that JAX traces, but its value is needed here")
+    assert ends["balanced_states(scene)"][1].startswith("scene contains a value that JAX traces, but the value is needed here")
 
 
 def test_a_raw_error_and_a_boolean_as_a_number_are_seen(trial):

@@ -38,8 +38,8 @@ _EVEN, _ODD = _hermite()
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """Locate the extrema of an evenly sampled motion over its first half, its second half and all of it.
 
-    Between two samples the motion is the polynomial p of degree 7 through values and slopes of four samples, with these two in
-    the middle (at the ends the outermost four), and the error
+    Between two samples the motion is the polynomial p of degree 7 through values and slopes of four samples, where these two
+    are in the middle (at the ends: the outermost four), with the error
 
         |x - p| <= 0.32 / 8! max |d^8 x/ds^8|        (at the ends 0.88 / 8!)
 
@@ -93,7 +93,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
 def extremum_value(x: Array, v: Array, place: Array) -> Array:
     """Return the value at an extremum. Its derivatives include the change of the place between samples.
 
-    x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` counts from the first, in steps.
+    x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` is counted from the first sample, in steps.
     """
     polynomial, s = _polynomial(x, v), place - _MIDDLE
     slope = _derivative(polynomial)
@@ -104,8 +104,8 @@ def extremum_value(x: Array, v: Array, place: Array) -> Array:
 
 
 def greatest(values: Array) -> Array:
-    """Return the maximum of numbers (n,) with derivatives. Those of `jnp.max` are 0/0 if the compiler recomputes equal numbers
-    with other rounding."""
+    """Return the maximum of numbers (n,) with derivatives. The derivatives of `jnp.max` are 0/0 if the compiler recomputes
+    equal numbers with other rounding."""
     return values[jnp.argmax(values)]
 
 

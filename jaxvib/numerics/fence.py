@@ -2,7 +2,7 @@
 
 XLA's fusion on a CPU recomputes a value, with all its operands, for each use; for nested shared operands the work grows without
 bound. It does not recompute the result of a division, which it considers expensive. Therefore a value is divided by a 1 that
-XLA does not recognize as 1. LLVM, which compiles the code afterwards, does and removes the division.
+XLA does not recognize as 1. LLVM, which compiles the code afterwards, recognizes the 1 and removes the division.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def through_memory(values: Sequence[Array], one: Array) -> list[Array]:
 
 @jax.custom_jvp
 def _from_bits(stack: Array, one: Array) -> list[Array]:
-    """Unstack numbers by reading their bits, since the compiler would replace a number that is read as such by its operands.
-    Tangents are unstacked without this."""
+    """Unstack numbers by reading their bits. The compiler would replace a number that is read as a number by its operands.
+    Tangents are unstacked as numbers."""
     bits = jax.lax.bitcast_convert_type(stack, jnp.dtype(f"uint{8 * stack.dtype.itemsize}"))
     return [jax.lax.bitcast_convert_type(bits[i], stack.dtype) for i in range(len(stack))]
 

@@ -49,7 +49,7 @@ def grid_of(points: int, symmetric: bool) -> Grid:
     """Return the grid of `points` points on half a period if the motion has the half-turn symmetry, otherwise on a period.
 
     `points` is rounded to an even number for half a period and to an odd number for a period, so that the grid represents both
-    the cosine and the sine of the highest harmonic of e. Each precision has its own grid, since JAX caches an array with the
+    the cosine and the sine of the highest harmonic of e. Each precision has its own grid, because JAX caches an array with the
     precision of its first use.
     """
     return _grid_of(points, symmetric, jnp.result_type(float).itemsize == 8)
@@ -110,7 +110,8 @@ def deviation_analysis(grid: Grid) -> np.ndarray:
 
 
 def resampling(grid: Grid, to: Grid) -> np.ndarray:
-    """Return the matrix (M, M') from values of psi on `grid` to those on the grid `to`, by the harmonics of both grids."""
+    """Return the matrix (M, M') from values of psi on `grid` to those on the grid `to`, by the harmonics that both grids
+    have."""
     orders = min(grid.deviation_orders.size, to.deviation_orders.size)
     keep = np.tile(np.arange(grid.deviation_orders.size) < orders, 2)
     return deviation_analysis(grid)[:, keep] @ _synthesis(grid.deviation_orders[:orders], to.theta)

@@ -64,7 +64,8 @@ def _eliminate(a: Sequence[Sequence[_Entry]], b: tuple[Array, ...]) -> tuple[Arr
 
 
 def relative_to(metric: Array, matrix: Array) -> tuple[Array, Array]:
-    """L^-1 A L^-T (nd, nd) and L^-1 for a positive definite metric L L^T; its eigenvalues solve A x = value L L^T x."""
+    """L^-1 A L^-T (nd, nd) and L^-1 for a positive definite metric L L^T; the eigenvalues of the first matrix solve A x =
+    value L L^T x."""
     n = metric.shape[0]
     if n > 3:
         eye = jnp.eye(n, dtype=metric.dtype)
@@ -99,8 +100,8 @@ def root_or_zero(values: Array) -> Array:
 def hermitian_error(pencil: tuple[Array, Array], values: Array, shapes: Array) -> Array:
     """Relative errors (k,) of eigenvalues of A x = value B x, both Hermitian, by Rayleigh's quotient x^H A x / x^H B x.
 
-    Its error is of second order in that of the shape. The rounding of its terms, which cancel for soft springs beside stiff
-    ones, is included.
+    The error of the quotient is of second order in the error of the shape. The rounding of its terms, which cancel for soft
+    springs next to stiff ones, is included.
 
     **Arguments**: `pencil` A and B (n, n), B positive definite; `values` (k,); `shapes` (n, k).
     """
@@ -128,8 +129,8 @@ def hermitian_modes(square: Array) -> tuple[Array, Array]:
 def _small_modes(square: Array) -> tuple[Array, Array]:
     """Eigenvalues and vectors of real symmetric matrices up to 3 x 3 by unrolled Jacobi rotations.
 
-    The reason is not only speed: on two cores, library calls for large batches in one program can deadlock (jaxlib 0.10), and
-    large batches have machines of up to three platforms.
+    The reason is not only speed: on two cores, library calls for large batches in one program can deadlock (jaxlib 0.10).
+    Large batches occur for machines of up to three platforms.
     """
     n = square.shape[-1]
     entries = tuple(tuple(square[..., i, j] for j in range(n)) for i in range(n))
@@ -181,7 +182,7 @@ def magnitude(value: Array) -> Array:
 
 def small_solve(a: Array, b: Array) -> Array:
     """Return x of a x = b; unrolled for 1, 2 and 3 equations (many times faster than a library call under `vmap`), by
-    `eliminate` up to 8, by the library beyond: for a batch one system after the other, see `solve_in_turn`."""
+    `eliminate` up to 8 equations, otherwise by the library, for a batch one system after the other, see `solve_in_turn`."""
     n = b.shape[0]
     if n == 1:
         return b / a[0, 0]
@@ -204,7 +205,7 @@ def _unrolled_solve(a: Array, b: Array) -> Array:
 
 @_unrolled_solve.defjvp
 def _unrolled_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """a x' = b' - a' x, by the same adjugate: half the operations of differentiating it."""
+    """a x' = b' - a' x, from the same adjugate, with half the operations of its derivative."""
     (a, b), (da, db) = primals, tangents
     adjugate, determinant = _adjugate(a)
     x = _times(adjugate, b) / determinant
@@ -228,11 +229,9 @@ def _times(a: Array, b: Array) -> Array:
 
 @custom_vmap
 def solve_in_turn(a: Array, b: Array) -> Array:
-    """Return x of a x = b by the library, without derivatives. On a processor it is called for one system of a batch after the
-    other.
-
-    A batched call can deadlock there: its systems are computed by the threads that run such calls, and if all these threads
-    wait, none can compute (jaxlib before 0.11.2). From about 20 equations on, one after the other is also faster.
+    """Return x of a x = b by the library, without derivatives. On a CPU it is called for one system of a batch after the
+    other. A batched call can deadlock on a CPU: the same threads run such calls and compute their systems, and if all of them
+    wait, none can compute (jaxlib before 0.11.2). For about 20 equations and more, calls one after the other are also faster.
     """
     return jnp.linalg.solve(a, b)
 
@@ -253,8 +252,8 @@ def _solve_one_by_one(size: int, is_mapped: list[bool], a: Array, b: Array) -> t
 
 @custom_vmap
 def eigenvalues_in_turn(matrix: Array) -> Array:
-    """Eigenvalues of a matrix (n, n), (n,) complex, without vectors. The library is called for one of a batch after the other,
-    see `solve_in_turn`."""
+    """Eigenvalues of a matrix (n, n), (n,) complex, without vectors. The library is called for one matrix of a batch after the
+    other, see `solve_in_turn`."""
     return jnp.linalg.eigvals(matrix)
 
 
@@ -290,7 +289,7 @@ def _svd_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[tuple
 def refine_solution(product: Callable[[Array], Array], nearly: Callable[[Array], Array], b: Array, norm: Array) -> Array:
     """x of A x = b, with A x = `product`(x), its approximate inverse `nearly` and its row-sum `norm`.
 
-    It is corrected by the residual until this is a rounding error: usually not at all, at most 4 times.
+    The solution is corrected by its residual until only rounding errors are left: usually not at all, at most 4 times.
     """
     eps = jnp.finfo(norm.dtype).eps
 
@@ -314,8 +313,7 @@ def refine_solution(product: Callable[[Array], Array], nearly: Callable[[Array],
 
 
 def solve_definite(a: Array, b: Array) -> Array:
-    """x (n,) or (n, m) of a x = b, a symmetric and positive definite, without pivoting and therefore without
-    branches."""
+    """x (n,) or (n, m) of a x = b, a symmetric and positive definite, without pivots and therefore without branches."""
     rows = jnp.concatenate([a, b if b.ndim > 1 else b[:, None]], axis=1)
     for k in range(b.shape[0]):
         line = rows[k, 1:] / rows[k, 0]
@@ -345,11 +343,10 @@ def eliminate(a: Array, b: Array) -> Array:
 
 @jax.custom_jvp
 def unrolled_inverse(matrix: Array) -> Array:
-    """Inverse by unrolled Gauss-Jordan elimination, since a library call would prevent fusion in the time loop, and large
-    batches of them can deadlock on few cores (jaxlib 0.10).
-
-    Without pivoting, for diagonally dominant matrices such as 1/(gamma h) - J for small h. A step that has lost its digits is
-    rejected by its error estimate and repeated with a smaller h.
+    """Inverse by unrolled Gauss-Jordan elimination, because a library call would prevent fusion in the time loop, and large
+    batches of such calls can deadlock on few cores (jaxlib 0.10). There are no pivots; the matrix must be diagonally dominant,
+    such as 1/(gamma h) - J for small h. A step that has lost its digits is rejected by its error estimate and repeated with a
+    smaller h.
     """
     for i in range(matrix.shape[0]):
         here = np.arange(matrix.shape[0]) == i

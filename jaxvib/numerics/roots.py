@@ -23,13 +23,13 @@ def bracketed_root(
     fast: Callable[[Array], Array] | None = None,
     polish: Array | None = None,
 ) -> Array:
-    """Return the root of `f` between `low` and `high` (scalars), between which f changes sign once, to rounding error.
+    """Return the root of `f` between `low` and `high` (scalars) to rounding error; f must change sign once between them.
 
-    **Arguments**: `ends`: f(low) and f(high) if they are known; `fast`: the same function at lower cost, which the search
-    evaluates. f is then used for derivatives and, if `polish` is True (scalar), for final steps of Newton's method.
+    **Arguments**: `ends`: f(low) and f(high) if they are known; `fast`: the same function at lower cost, for the search. `f`
+    is then used only for derivatives and, if `polish` is True (scalar), for final steps of Newton's method.
 
-    Inverse quadratic interpolation if it is safe, otherwise bisection (Chandrupatla, Adv. Eng. Software 28, 1997).
-    Derivatives of any order by the implicit function theorem.
+    The method is inverse quadratic interpolation if it is safe, otherwise bisection (Chandrupatla, Adv. Eng. Software 28,
+    1997). Derivatives of any order follow from the implicit function theorem.
     """
 
     def solve(exact: Callable[[Array], Array], _: Array) -> Array:
@@ -57,10 +57,10 @@ def bracketed_root(
             a, fa = x, fx
             return steps + 1, a, fa, b, fb, next_share(jnp, (a, fa), (b, fb), (c, fc), tolerance), best, least
 
-        # Both ends at once: one copy of g in the program, not two.
+        # Both ends are evaluated at once, because the program then contains one copy of g, not two.
         f_low, f_high = jax.vmap(g)(jnp.stack([low, high])) if ends is None else ends
-        # The compiler may compute g(x) anew for every use, each rounded its own way; at the root the sign of the one can differ
-        # from that of the other and the bracket is lost: then the point where |g| was least is the root.
+        # The compiler may recompute g(x) for each use with other rounding. Near the root the signs of two copies can differ,
+        # and the bracket is lost. The point with the smallest |g| is then the root.
         at_low, at_high = size(f_low), size(f_high)
         best, least = jnp.where(at_low < at_high, low, high), jnp.minimum(at_low, at_high)
         start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
@@ -102,7 +102,7 @@ def next_share(
     """Return the next point of the search for a root between `newest` and `other`, as a fraction of the way; `before` is the
     point before these.
 
-    Points are (x, f(x)), numbers or arrays of the library `xp`, numpy or jax.numpy; `tolerance` relative.
+    Points are (x, f(x)), numbers or arrays of the library `xp`, numpy or jax.numpy; `tolerance` is relative.
     """
     (a, fa), (b, fb), (c, fc) = newest, other, before
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
@@ -113,6 +113,7 @@ def next_share(
 
 
 def _nonzero(slope: Array) -> Array:
-    """At a fold the slope is 0 and the derivative does not exist; the status states this, and no number overflows."""
+    """Replace a slope of 0 by a tiny one. At a fold the slope is 0 and the derivative does not exist, which the status states;
+    the replacement prevents an overflow."""
     tiny = jnp.finfo(slope.dtype).tiny ** 0.5
     return jnp.where(jnp.abs(slope) < tiny, tiny, slope)

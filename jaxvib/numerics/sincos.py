@@ -2,9 +2,9 @@
 
 XLA's CPU backend calls the C library once for each number. Here the angle is reduced by multiples of pi in three parts (Cody
 and Waite), for the cosine by odd multiples of pi/2, and one odd polynomial is evaluated at the remainder, within pi/2. The two
-functions share no value, since a compiler that recomputes values for each use would compute it twice. The
-error is below 1.1 times the distance of 1 to the next number for angles up to 1e5 and grows in proportion to the angle's own
-rounding beyond, as that of any sine of a rounded angle does.
+functions share no value, because a compiler that recomputes values for each use would compute it twice. For angles up to 1e5
+the error is below 1.1 times the distance from 1 to the next floating-point number. For larger angles it is proportional to the
+rounding error of the angle, like the error of any sine of a rounded angle.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _polynomial(terms: int) -> tuple[float, ...]:
 
 
 def _summed(z: Array, coefficients: Sequence[float]) -> Array:
-    """Polynomial sum_k coefficients_k z^k in pairs (Estrin), with a third of the dependent products of Horner's form."""
+    """Polynomial sum_k coefficients_k z^k in pairs (Estrin), with a third of the successive products of Horner's form."""
     parts: list[Array | float] = list(coefficients)
     while len(parts) > 1:
         parts = [parts[k] + parts[k + 1] * z if k + 1 < len(parts) else parts[k] for k in range(0, len(parts), 2)]
@@ -89,8 +89,8 @@ def _sine(x: Array, ahead: float) -> Array:
     constant, *others = _polynomial(_TERMS[dtype])
     # The largest term is added last, which keeps the roundings of the others as small as in Horner's form.
     total = constant + z * _summed(z, others)
-    # An odd number of half turns changes the sign: the last bit of the number, added to a number so large that it has no
-    # fraction, is shifted to the position of the sign. Operations on bits take almost no time.
+    # An odd number of half turns changes the sign. The number is added to a number so large that it has no fraction; its last
+    # bit is then shifted to the position of the sign. Operations on bits take almost no time.
     bits = np.dtype(f"uint{8 * dtype.itemsize}")
     beside = whole + 1.5 * 2.0 ** np.finfo(dtype).nmant
     sign = jax.lax.bitcast_convert_type(beside, bits) << bits.type(8 * dtype.itemsize - 1)

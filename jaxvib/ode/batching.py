@@ -1,4 +1,4 @@
-"""Batches of tangents of a derivative, or of runs, with their axis last, which suits vector instructions."""
+"""Batches of tangents or of runs along a last axis, which is the best layout for vector instructions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 from jaxvib.ode.types import Batched, Tangents
 
 VECTOR = 8
-"""Width of vectors of a processor; the number of tangents is padded to a multiple of it."""
+"""Number of values in a vector register of a processor; the number of tangents is padded to a multiple of it."""
 
 X = TypeVar("X")
 Out = TypeVar("Out")
@@ -23,11 +23,11 @@ _WithTangents: TypeAlias = Callable[[PyTree, Tangents], tuple[PyTree[Array], Tan
 
 
 def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents], tuple[Out, Tangents]]) -> Callable[[X], Out]:
-    """`function` with forward derivatives by `jvp`, and no reverse ones.
+    """`function` with forward derivatives by `jvp`, and without reverse derivatives.
 
-    Under `jacfwd` JAX maps the derivative along one tangent over all of them, and puts the axis of the tangents before all
-    others. Here `jvp` is called once for all tangents instead, which lie along a last axis: every number of the program
-    becomes a vector over the tangents, contiguous in memory.
+    Under `jacfwd` JAX maps the derivative along one tangent over all tangents, whose axis precedes all others. Here `jvp` is
+    called once for all tangents, which lie along a last axis. Every number of the program is then a vector over the tangents,
+    contiguous in memory.
 
     **Arguments**: `jvp(x, tangents)`: `function(x)` and its tangents; both tangents are `Tangents`.
 
@@ -59,16 +59,16 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
 
 
 def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out]) -> Callable[[X], Out]:
-    """`function`, under `vmap` computed by `batched`; with derivatives of every kind, which are mapped as JAX does it.
+    """`function`, which under `vmap` is computed by `batched`. It has derivatives of every kind; JAX maps them in its own way.
 
     JAX puts the batch before all other axes of the state of a loop. `batched` may keep it as the last axis: every number of the
     program is then a vector over the batch, contiguous in memory.
 
-    **Arguments**: `batched(x, mapped)`: `function(x)` of the whole batch, which lies along a last axis of those arrays of x
-    that are True in the tree `mapped`, and of all arrays of the result.
+    **Arguments**: `batched(x, is_batched)`: `function(x)` for the whole batch. The batch is the last axis of the arrays of x
+    that are True in the tree `is_batched`, and of all arrays of the result.
 
     >>> import jax, jax.numpy as jnp
-    >>> total = batch_last(jnp.sum, lambda x, mapped: jnp.sum(x, axis=0))
+    >>> total = batch_last(jnp.sum, lambda x, is_batched: jnp.sum(x, axis=0))
     >>> jax.vmap(total)(jnp.asarray([[1.0, 2.0], [3.0, 4.0]])).tolist()
     [3.0, 7.0]
     """
@@ -106,7 +106,8 @@ def flat_tangents(tangents: Tangents, like: PyTree) -> list[Array | None]:
 
 
 def _tangents_last(function: _WithTangents) -> _WithTangents:
-    """Convert a function for directions along a last axis to f(x, tangents) for one direction; a mapped f is called once."""
+    """Convert a function for directions along a last axis to f(x, tangents) for one direction. Under `vmap` the original
+    function is called once."""
 
     def single(x: PyTree, tangents: Tangents) -> tuple[PyTree[Array], Tangents]:
         y, out = function(x, jax.tree.map(lambda dx: dx[..., None], tangents))

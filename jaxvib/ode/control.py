@@ -16,11 +16,12 @@ from jaxtyping import PyTree
 from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, RealScalarLike, Terms, Y
 
 Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, PyTree[Array], diffrax.RESULTS]
-"""Acceptance of a step, beginning and end of the next one, True if the field jumps there, new state of the controller, True if
-the run can go on."""
+"""Acceptance of a step, beginning and end of the next one, True if the field jumps at its beginning, new state of the
+controller, True if the run can continue."""
 
 _State: TypeAlias = tuple[Array, Array | None]
-"""State of `PIController`: the 32nd root of the last accepted step's error, and the remaining steps if they are limited."""
+"""State of `PIController`: the 32nd root of the last accepted step's error, and the remaining number of steps if it is
+limited."""
 
 
 class PIController(diffrax.AbstractAdaptiveStepSizeController):
@@ -28,17 +29,22 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
         e = max |error| / (tolerance (unit + relative |y|)),    h_next = s e_before^(1/16) / e^(3/32) h
 
-    over all numbers of the state y; a step with e > 1 is rejected and tried again with h_next = s / e^(1/8) h. The exponents
-    are products of square roots, which cost less than a power. Steps that stay as long as they are have e = s^32: in double
-    precision s = 0.88 and e = 1/60, so that what adds up over 10^5 steps stays near the tolerance; in single precision s = 0.97
-    and e = 0.38, since estimates of less than that are soon errors of rounding, which shorter steps hardly lessen. h_next / h
-    lies between 0.2 and 5. A step whose error is not a number is rejected with e = infinity; where no shorter step advances the
-    time in its dtype, the run ends with `diffrax.RESULTS.dt_min_reached`, with more than `max_steps` steps with
-    `diffrax.RESULTS.max_steps_reached`: a limit that is a number of the program, so that another one needs no other program.
+    The maximum is taken over all entries of the state y.
 
-    **Attributes**: `tolerance` scalar, without a unit; `unit` and `relative`, trees like the state, of what counts as 1 in each
-    of its numbers (in its unit) and of which share of |y| is added to it. `relative` is 0 for angles: they grow without end,
-    and an error relative to them would let a long run lose its phase. `max_steps` a whole number, or None.
+    - A step with e > 1 is rejected and repeated with h_next = s / e^(1/8) h
+    - The powers are products of square roots, which cost less than a general power
+    - Steps of constant length have e = s^32. In double precision s = 0.88 and e = 1/60, so that the sum of the errors of 10^5
+      steps is near the tolerance. In single precision s = 0.97 and e = 0.38, because smaller estimates consist of rounding
+      errors, which shorter steps hardly reduce
+    - h_next / h lies between 0.2 and 5
+    - A step whose error is NaN is rejected with e = infinity. If no shorter step advances the time in its dtype, the run ends
+      with `diffrax.RESULTS.dt_min_reached`
+    - A run with more than `max_steps` steps ends with `diffrax.RESULTS.max_steps_reached`. The limit is an input of the
+      program, so that another limit needs no other program
+
+    **Attributes**: `tolerance` scalar, without a unit; `unit` and `relative`, trees like the state: the scale of each entry
+    (in its unit), and the fraction of |y| that is added to it. `relative` is 0 for angles, because they grow without limit,
+    and a long run would lose its phase with an error relative to them. `max_steps`: a whole number, or None.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -84,7 +90,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         func: Callable[[Terms, RealScalarLike, Y, Args], VF],
         error_order: RealScalarLike | None,
     ) -> tuple[RealScalarLike, _State]:
-        """The first step ends at t0 + dt0."""
+        """Return the end of the first step, t0 + dt0, and the initial state of the controller."""
         return t0 + dt0, (jnp.ones_like(self.tolerance), self.max_steps)
 
     def adapt_step_size(
@@ -98,7 +104,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         error_order: RealScalarLike,
         controller_state: _State,
     ) -> Decision:
-        """Acceptance of the step, beginning and end of the next one, and state of the controller."""
+        """Return the acceptance of the step, the beginning and the end of the next one, and the state of the controller."""
         root_before, left = controller_state
 
         def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
@@ -126,7 +132,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
 
 def moved_on(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
-    """True if the run can go on: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
+    """Return the success of a step: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
     shorter = (end > start) & (end < before)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 

@@ -40,7 +40,7 @@ _POLYNOMIALS = np.array(
         [20.300692582210083, -53.90207774663854, 50.255836422617605, -19.008209934160803, 2.3537586759714983, 0.0],
     ]
 )
-"""Polynomials of the stages that form states within a step, in the fraction of the step, highest power first.
+"""Polynomials, in the fraction of the step and with the highest power first, by which the stages form states within a step.
 
 Source: P. Kidger's diffrax 0.7 (Apache 2.0), `diffrax/_solver/dopri8.py`, without the stages whose polynomials are 0.
 """
@@ -56,7 +56,7 @@ ERROR = np.asarray(_TABLEAU.b_error)
 
 
 def ravel(tree: PyTree[Array], directions: int = 0) -> Array:
-    """Numbers of a tree as a vector (n,), or (n, directions) with that last axis."""
+    """Entries of a tree as a vector (n,), or as (n, directions) if all arrays have `directions` as last axes."""
     return jnp.concatenate([leaf.reshape(-1, *leaf.shape[leaf.ndim - directions :]) for leaf in jax.tree.leaves(tree)])
 
 
@@ -79,8 +79,8 @@ def dense_stages(stages: Array) -> Array:
 def linear_combination(weights: Array, stages: Array) -> Array:
     """sum_j weights_j stages_j; weights (..., stages), stages (stages, ...).
 
-    XLA computes a product once and vectorizes it; an unrolled sum would be recomputed, with its weights, for each use of one of
-    its numbers.
+    XLA computes a product once and vectorizes it. It would recompute an unrolled sum, with its weights, for each use of one of
+    its entries.
     """
     return jnp.tensordot(weights.astype(stages.dtype), stages, 1, precision="highest")
 
@@ -106,18 +106,19 @@ class Dopri8Interpolation(StepInterpolation):
 
 
 class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
-    """Common part of the forms of Dormand and Prince's pair: all but the computation of stages and of states within a step."""
+    """Common part of the forms of Dormand and Prince's pair: everything except the computation of stages and of states within
+    a step."""
 
     wrap: Callable[[Y], Y] | None = None
     tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
     term_structure: ClassVar = diffrax.AbstractTerm
 
     def order(self, terms: Terms) -> int:
-        """8."""
+        """Return 8."""
         return 8
 
     def func(self, terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> VF:
-        """The vector field, for the choice of the first step."""
+        """Return the rates, for the choice of the first step."""
         return terms.vf(t0, y0, args)
 
     @abc.abstractmethod
@@ -131,7 +132,7 @@ class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
         solver_state: VF,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Array, Y, VF]:
-        """The state at t1, the rates of all stages (stages, n), the error, the method's own state."""
+        """Return the state at t1, the rates of all stages (stages, n), the error, and the internal state of the method."""
 
     def step(
         self,
@@ -143,7 +144,7 @@ class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
         solver_state: VF,
         made_jump: BoolScalarLike,
     ) -> StepResult:
-        """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
+        """Compute a step from t0 to t1: the state, its error estimate, and the stages for the interpolation within the step."""
         end, stages, error, solver_state = self.advance(terms, t0, t1, y0, args, solver_state, made_jump)
         end = end if self.wrap is None else self.wrap(end)
         return end, error, dict(y0=y0, stages=dense_stages(stages)), solver_state, diffrax.RESULTS.successful
@@ -152,15 +153,15 @@ class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
 class UnrolledDopri8(AbstractDopri8):
     """Dormand and Prince's pair of order 8(7), its 13 stages written out one after another.
 
-    The same numbers as `diffrax.Dopri8`, in another form: no loop over stages, no arrays of stages, so that a small time loop
-    compiles into one piece of code; and a fence after each stage, without which XLA's fusion recomputes each stage for each use
-    (a step of 900 multiplications becomes one of 4500).
+    The results are those of `diffrax.Dopri8`. There is no loop over stages and no array of stages, so that a small time loop
+    compiles into one piece of code. Each stage is fenced; otherwise XLA's fusion recomputes each stage for each use, and a
+    step of 900 multiplications needs 4500.
 
-    Compiling takes longer than for `LoopDopri8`, several times as long with derivatives.
+    Compilation takes longer than for `LoopDopri8`, with derivatives several times as long.
 
-    **Arguments**: `batch`: true if many runs advance together, each number of the state an array over them: fences are then
-    those for arrays, otherwise those for scalars; `wrap` what is done to the state after each step, such as taking whole
-    turns out of its angles.
+    **Arguments**: `batch`: True if many runs advance together and each entry of the state is an array over them; fences for
+    arrays are then used, otherwise fences for scalars. `wrap`: function that is applied to the state after each step, for
+    example to remove whole turns from angles.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -176,7 +177,7 @@ class UnrolledDopri8(AbstractDopri8):
     interpolation_cls: ClassVar[Callable[..., Dopri8Interpolation]] = Dopri8Interpolation
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> VF:
-        """Rates at the start, since the last stage of a step is the first one of the next step."""
+        """Return the rates at the start, because the last stage of a step is the first stage of the next one."""
         return terms.vf(t0, y0, args)
 
     def advance(

@@ -53,11 +53,11 @@ class LoopDopri8(AbstractDopri8):
 
     Its program contains the equations once, for all stages.
 
-    **Arguments**: `tangents`: True if forward derivatives, and no reverse ones, are taken; those of a step are then computed
-    along all tangents at once, eight for little more than the cost of one. `reuse`: True to use the last stage of a step as the
-    first one of the next step, which saves one evaluation of fourteen. The start of the loop is then known at run time only,
-    therefore diffrax's adjoints have no reverse derivatives; those of `jaxvib.ode.replay` are unchanged. `wrap` as in
-    `UnrolledDopri8`.
+    **Arguments**: `tangents`: True if only forward derivatives are needed. The derivatives of a step are then computed along
+    all tangents at once; eight tangents cost little more than one. `reuse`: True to use the last stage of a step as the first
+    one of the next step, which saves one of fourteen evaluations. The start of the loop is then known at run time only;
+    therefore diffrax's adjoints have no reverse derivatives. The derivatives of `jaxvib.ode.replay` are not affected. `wrap`
+    as in `UnrolledDopri8`.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -113,13 +113,13 @@ def _linear_combination_jvp(inputs: tuple[Array, Array], tangents: tuple[Array |
     return linear_combination(weights, stages), sum(parts[1:], parts[0])
 
 
-def _linear_combination_batched(inputs: tuple[Array, Array], mapped: tuple[bool, bool]) -> Array:
-    weights, stages = (x if along else x[..., None] for x, along in zip(inputs, mapped, strict=True))
+def _linear_combination_batched(inputs: tuple[Array, Array], is_batched: tuple[bool, bool]) -> Array:
+    weights, stages = (x if along else x[..., None] for x, along in zip(inputs, is_batched, strict=True))
     return functools.reduce(operator.add, (w * k for w, k in zip(weights[:, None, :], stages, strict=True)))
 
 
 class _BatchedInterpolation(Dopri8Interpolation):
-    """`Dopri8Interpolation` with derivatives and batches of its own kind."""
+    """`Dopri8Interpolation` with its own rules for derivatives and batches."""
 
     combine: Callable[[tuple[Array, Array]], Array] = eqx.field(static=True)
 
@@ -134,7 +134,7 @@ _WITH_TANGENTS = functools.partial(_BatchedInterpolation, combine=multi_tangent_
 
 
 def _advance(inputs: _Inputs) -> _Step:
-    """One step."""
+    """Compute a step."""
     t0, dt, y0, known, args, terms = inputs
 
     def rates(share: RealScalarLike, y: Array) -> Array:
@@ -159,7 +159,7 @@ def _advance_batched(inputs: _Inputs, is_batched: Batched) -> _Step:
         return ravel(jax.tree.map(spread, tree, along), 1)
 
     if known is not None:
-        # All start with the first stage that is missing in one of them.
+        # All runs start with the first stage that is missing in one of them.
         known = (whole(known[0], known_too[0]), jnp.min(known[1]))
 
     def rates(share: RealScalarLike, y: Array) -> Array:
@@ -231,7 +231,8 @@ def _written_sum(weights: Array, stages: Array) -> Array:
 
 @_written_sum.defjvp
 def _written_sum_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Derivative as a product, since the transposed sum would add a whole array of stages for each pair of stages."""
+    """Return the derivative as a product, because the transposed sum would add a whole array of stages for each pair of
+    stages."""
     (weights, stages), (_, change) = primals, tangents  # the weights of the method are constant
     return _written_sum(weights, stages), linear_combination(weights, change[: len(weights)])
 
@@ -243,7 +244,8 @@ def _stages(
     over_step: Callable[[Numbers], Numbers],
     dt: Array,
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """A step's end, stages and error; y0, the stage that is known and the rates are trees of arrays (n, ...) alike."""
+    """Return the end, the stages and the error of a step; y0, the known stage and the rates are trees of arrays (n, ...) of
+    equal structure."""
     stages = jax.tree.map(lambda y: jnp.zeros((len(_ROWS), *y.shape), y.dtype), y0)
     if known is not None:
         stages = jax.tree.map(lambda k, first: k.at[0].set(first), stages, known[0])
@@ -262,5 +264,5 @@ def _stages(
         return jax.tree.map(lambda k, value: lax.dynamic_update_index_in_dim(k, value, j, 0), stages, new)
 
     stages = lax.fori_loop(0 if known is None else known[1], len(_ROWS), stage, stages)
-    # The state at the last stage is the end of the step; it is computed here so that the loop does not carry it.
+    # The state at the last stage is the end of the step. It is computed here, so that the loop does not have to carry it.
     return moved(stages, ROWS[-1]), stages, weighted(stages, ERROR)

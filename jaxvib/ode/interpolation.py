@@ -14,7 +14,7 @@ from jaxvib.ode.types import RealScalarLike, Y
 
 
 class StepInterpolation(diffrax.AbstractLocalInterpolation):
-    """States within a step from `t0` to `t1`, by the fraction of the step, which is 0 for a step of length 0."""
+    """States within a step from `t0` to `t1` as functions of the fraction of the step, which is 0 for a step of length 0."""
 
     t0: Any
     t1: Any

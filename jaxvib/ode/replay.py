@@ -1,4 +1,4 @@
-"""The step-replay adjoint: reverse derivatives of runs with adaptive steps."""
+"""Step-replay adjoint: reverse derivatives of runs with adaptive steps."""
 
 from __future__ import annotations
 
@@ -37,22 +37,21 @@ def solve(
     max_steps: int,
     progress: diffrax.AbstractProgressMeter | None = None,
 ) -> diffrax.Solution:
-    """`diffrax.diffeqsolve` from time 0 to `end`, which fails by its result alone.
+    """Integrate by `diffrax.diffeqsolve` from time 0 to `end`; a failure is reported in the result, not raised.
 
-    Its reverse derivatives are a step-replay adjoint, of the steps that the run has taken. If a controller chose the steps
-    again on the way back, they would differ by rounding and diverge: after some hundred turns they are other steps, with
-    inconsistent derivatives (errors up to 1e-3). Therefore a run that is differentiated records the start of each step and some
-    of the states. On the way back the states in between are recomputed, and each step is transposed separately, from the last
-    one to the first:
+    Reverse derivatives replay the steps that the run has taken. If the controller chose the steps again in the backward pass,
+    rounding would change them: after some hundred turns the steps would differ, and the derivatives would be inconsistent
+    (errors up to 1e-3). Therefore a run that is differentiated records the start of each step and some of the states. The
+    backward pass recomputes the states in between and transposes each step separately, from the last one to the first:
 
         (y_i+1, dense_i) = step(y_i, t_i, t_i+1, numbers),    saved(t) = within(dense_i, t_i, t_i+1, t)
 
-    Where steps end is constant, but for the last one, which ends at `end`, and for constant steps, which move with `end` and
-    `first_step`. A run of which no derivative is taken is done once, and notes nothing.
+    The ends of steps are constants, with two exceptions: the last step ends at `end`, and constant steps depend on `end` and
+    `first_step`. A run without derivatives is computed once, and records nothing.
 
-    **Arguments**: `adjoint` diffrax's, for another way: `diffrax.ForwardMode()` for forward derivatives. No function among the
-    arguments may hold on to traced arrays; `args` is for them. `saveat` saves states at given times and at the end. The method
-    carries nothing from step to step but rates. The others are as in diffrax.
+    **Arguments**: `adjoint`: an adjoint of diffrax in place of the replay, such as `diffrax.ForwardMode()` for forward
+    derivatives. Functions among the arguments must not contain traced arrays; pass these in `args`. `saveat` saves states at
+    given times and at the end. The method must carry only rates from step to step. The other arguments are as in diffrax.
 
     **Returns** diffrax's `Solution`.
     """
@@ -97,7 +96,7 @@ def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController
     return _solve(inputs, controller, diffrax.ForwardMode(), *rest)
 
 
-class _Notes(NamedTuple):
+class _Record(NamedTuple):
     """Record of a run: its number of steps, the end of each step (max_steps,), and states at regular numbers of steps."""
 
     steps: Array
@@ -106,8 +105,8 @@ class _Notes(NamedTuple):
 
 
 class _Slopes(NamedTuple):
-    """On the way back: slopes by the state, by the numbers of equations and arguments, by the end and the first step, by the
-    times that are saved; and the last of those that is still ahead."""
+    """State of the backward pass: derivatives with respect to the state, the arrays of equations and arguments, the end, the
+    first step and the saved times; and the index of the last saved time that the pass has not reached yet."""
 
     state: Y
     numbers: PyTree[Array | None]
@@ -120,27 +119,27 @@ class _Slopes(NamedTuple):
 @_with_replay.def_fwd
 def _forward(
     perturbed: PyTree[bool], inputs: _Inputs, controller: diffrax.AbstractStepSizeController, *rest: *_Rest
-) -> tuple[diffrax.Solution, _Notes]:
-    """Run with its record."""
+) -> tuple[diffrax.Solution, _Record]:
+    """Integrate, and record the run."""
     end, first_step, y0, args, saveat, term = inputs
     starts = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None)
     states = diffrax.SubSaveAt(steps=_spacing(y0, rest[1]))
-    noting = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, starts, states]), term)
-    solution = _solve(noting, controller, diffrax.ForwardMode(), *rest)
+    recorded_inputs = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, starts, states]), term)
+    solution = _solve(recorded_inputs, controller, diffrax.ForwardMode(), *rest)
     assert solution.ts is not None and solution.ys is not None
-    notes = _Notes(solution.stats["num_accepted_steps"], solution.ts[1], solution.ys[2])
-    return eqx.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], solution.ys[0])), notes
+    record = _Record(solution.stats["num_accepted_steps"], solution.ts[1], solution.ys[2])
+    return eqx.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], solution.ys[0])), record
 
 
 def _spacing(y0: Y, max_steps: int) -> int:
-    """Number of steps between recorded states; 1 if that takes at most 1 MiB."""
+    """Return the number of steps between recorded states; 1 if this needs at most 1 MiB."""
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(y0))
     return max(1, min(-(-max_steps * size // 2**20), max_steps))
 
 
 @_with_replay.def_bwd
 def _backward(
-    notes: _Notes,
+    record: _Record,
     cotangents: PyTree[Array | None],
     perturbed: PyTree[bool],
     inputs: _Inputs,
@@ -149,8 +148,8 @@ def _backward(
 ) -> PyTree[Array | None]:
     end, _, y0, _, saveat, _ = inputs
     differentiable, fixed = eqx.partition(inputs, perturbed)
-    way = _WayBack(
-        notes=notes,
+    backward = _BackwardPass(
+        record=record,
         solver=_with_tolerances(rest[0], controller),
         controller=controller,
         numbers=(differentiable[3], differentiable[5]),
@@ -159,19 +158,19 @@ def _backward(
         y0=y0,
         every=_spacing(y0, rest[1]),
     )
-    return _by_inputs(differentiable, cotangents, saveat, controller, way.saved, way.slopes(jnp.zeros_like(end)))
+    return _by_inputs(differentiable, cotangents, saveat, controller, backward.saved, backward.slopes(jnp.zeros_like(end)))
 
 
 @dataclasses.dataclass(frozen=True)
-class _WayBack:
+class _BackwardPass:
     """Backward pass over the steps of a run, from the last one to the first.
 
-    **Attributes**: the `notes` of the run, with a state after `every` so many steps, and `y0` before the first; `solver` and
-    `controller`; the `numbers` of arguments and equations that are differentiated, and the `others`; the derivatives by `saved`
-    states.
+    **Attributes**: the `record` of the run, with one state for each `every` steps, and the initial state `y0`; `solver` and
+    `controller`; the `numbers` of arguments and equations that are differentiated, and the `others`; `saved`: the derivatives
+    with respect to saved states.
     """
 
-    notes: _Notes
+    record: _Record
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
     numbers: PyTree[Array | None]
@@ -181,9 +180,9 @@ class _WayBack:
     every: int
 
     def slopes(self, zero: Array) -> _Slopes:
-        """Return the slopes after the whole backward pass; `zero` has the type of times."""
+        """Return the derivatives after the whole backward pass; `zero` has the type of times."""
         times = self.saved.times
-        reached = self.span(self.notes.steps - 1)[1]
+        reached = self.span(self.record.steps - 1)[1]
         slopes = _Slopes(
             state=self.saved.last,
             numbers=jax.tree.map(jnp.zeros_like, self.numbers),
@@ -192,30 +191,30 @@ class _WayBack:
             times=jnp.zeros_like(times),
             ahead=jnp.searchsorted(times, reached, side="right") - 1,
         )
-        start = ((self.notes.steps - 1) // self.every, slopes)
-        return jax.lax.while_loop(lambda carry: carry[0] >= 0, lambda carry: self.to_note(*carry), start)[1]
+        start = ((self.record.steps - 1) // self.every, slopes)
+        return jax.lax.while_loop(lambda carry: carry[0] >= 0, lambda carry: self.to_recorded_state(*carry), start)[1]
 
     def span(self, i: Array) -> tuple[Array, Array]:
         """Start and end of step i."""
-        starts = self.notes.starts[jnp.maximum(i - 1, 0)]
-        return jnp.where(i == 0, 0.0, starts), _end_before(self.controller, self.notes.starts[i])
+        starts = self.record.starts[jnp.maximum(i - 1, 0)]
+        return jnp.where(i == 0, 0.0, starts), _end_before(self.controller, self.record.starts[i])
 
     def step(self, y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
         """Return the state after a step, and the data of the interpolation within it."""
         args, term = eqx.combine(numbers, self.others)
-        # As after a jump, without values of the previous step.
+        # The step is computed without values of the previous step, as after a jump.
         y1, _, dense, _, _ = self.solver.step(term, t0, t1, y, args, self.solver.init(term, t0, t1, y, args), True)
         return y1, dense
 
     def over_step(self, i: Array, y: Y, slopes: _Slopes) -> _Slopes:
-        """Slopes before step i, which begins at the state y."""
+        """Return the derivatives before step i, which begins at the state y."""
         t0, t1 = self.span(i)
         before = jnp.where(i == 0, -jnp.inf, self.span(jnp.maximum(i - 1, 0))[1])
         (_, dense), transposed = jax.vjp(self.step, y, t0, t1, self.numbers)
         ahead, by_times, (by_dense, *by_span) = self.over_saved(dense, t0, t1, before, slopes)
         by_y, by_start, by_end, by_numbers = transposed((slopes.state, by_dense))
         by_bounds = ((i, by_start + by_span[0]), (i + 1, by_end + by_span[1]))
-        steps = self.notes.steps
+        steps = self.record.steps
         return _Slopes(
             state=by_y,
             numbers=jax.tree.map(jnp.add, slopes.numbers, by_numbers),
@@ -228,7 +227,8 @@ class _WayBack:
     def over_saved(
         self, dense: PyTree[Array], t0: Array, t1: Array, before: Array, slopes: _Slopes
     ) -> tuple[Array, Array, PyTree[Array]]:
-        """Slopes by the saved times in a step from t0 to t1 (after the time `before`), by its interpolation, t0 and t1."""
+        """Return the derivatives of the states saved in a step from t0 to t1 (after the time `before`) with respect to its
+        interpolation, t0 and t1."""
         times = self.saved.times
 
         def within(dense: PyTree[Array], t0: Array, t1: Array, t: Array) -> Y:
@@ -247,10 +247,10 @@ class _WayBack:
         carry = (slopes.ahead, slopes.times, none)
         return jax.lax.while_loop(is_within, taken, carry) if times.size else carry
 
-    def to_note(self, n: Array, slopes: _Slopes) -> tuple[Array, _Slopes]:
-        """Slopes at the n-th state that was noted, from those after the steps that follow it; n - 1 comes next."""
-        first, count = n * self.every, jnp.minimum(self.every, self.notes.steps - n * self.every)
-        noted = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), self.y0, self.notes.states)
+    def to_recorded_state(self, n: Array, slopes: _Slopes) -> tuple[Array, _Slopes]:
+        """Return n - 1, and the derivatives at the n-th recorded state from those after the steps that follow it."""
+        first, count = n * self.every, jnp.minimum(self.every, self.record.steps - n * self.every)
+        noted = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), self.y0, self.record.states)
         if self.every == 1:
             return n - 1, self.over_step(n, noted, slopes)
 
@@ -269,7 +269,7 @@ class _WayBack:
 
 
 def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractSolver:
-    """Implicit method with the tolerances of the controller, if it has none of its own."""
+    """Return an implicit method with the tolerances of the controller, unless the method has its own tolerances."""
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     finder = solver.root_finder
@@ -280,8 +280,8 @@ def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.Abstrac
 
 
 def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, j: Array) -> Array:
-    """Derivative of the start of step j of `count` by the end of the run: constant steps fill the time after the first one,
-    steps of a controller do not move."""
+    """Return the derivative of the start of step j of `count` with respect to the end of the run. Constant steps fill the time
+    after the first step; the steps of a controller do not depend on the end."""
     if isinstance(controller, diffrax.ConstantStepSize):
         return jnp.where((j > 1) | (count == 1), j / count, 0.0)
     return jnp.where(j == count, 1.0, 0.0)
@@ -297,8 +297,8 @@ def _end_before(controller: diffrax.AbstractStepSizeController, start: Array) ->
 
 
 class _Saved(NamedTuple):
-    """Derivatives of all saved states: times, ascending, and slopes by the states then; slopes by the state at the end; and at
-    which place of all lists of times, one after the other, each time stands."""
+    """Derivatives with respect to all saved states: ascending times with the derivatives at these times; the derivative with
+    respect to the state at the end; and the index of each time in the concatenated lists of times."""
 
     times: Array
     states: Y
@@ -332,7 +332,7 @@ def _by_inputs(
     saved: _Saved,
     slopes: _Slopes,
 ) -> PyTree[Array | None]:
-    """Slopes by the differentiated inputs, None for the others."""
+    """Return the derivatives with respect to the differentiated inputs, None for the others."""
     by_end, by_times = slopes.end, []
     parts = jnp.zeros_like(slopes.times).at[saved.places].set(slopes.times)
     for sub, by_ts in zip(saveat.subs, cotangents.ts, strict=True):

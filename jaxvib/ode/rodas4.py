@@ -52,7 +52,7 @@ class _Interpolation(StepInterpolation):
 
         y = (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1))
 
-    It does not use the rates at the ends of a step, which are useless for stiff equations.
+    It does not use the rates at the ends of a step, which are not accurate for stiff equations.
     """
 
     y0: Array
@@ -71,7 +71,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         (1/(gamma h) - J) k_i = f(t + c_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
 
     A step of any length costs one Jacobian J by forward mode, one inverse and 6 evaluations, without a Newton iteration. The
-    state is one vector of at most a few dozen numbers.
+    state must be one vector of at most a few dozen entries.
 
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.7.
     """
@@ -80,18 +80,19 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     interpolation_cls: ClassVar[Callable[..., _Interpolation]] = _Interpolation
 
     def order(self, terms: Terms) -> int:
-        """4."""
+        """Return 4."""
         return 4
 
     def error_order(self, terms: Terms) -> int:
-        """4: the estimated error of a step (embedded method of order 3) is proportional to the fourth power of its length."""
+        """Return 4: the estimated error of a step (embedded method of order 3) is proportional to the fourth power of its
+        length."""
         return 4
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Array, args: Args) -> None:
         """Initial state of the method, which is empty."""
 
     def func(self, terms: Terms, t0: RealScalarLike, y0: Array, args: Args) -> Array:
-        """The vector field."""
+        """Return the rates."""
         return terms.vf(t0, y0, args)
 
     def step(
@@ -104,7 +105,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         solver_state: None,
         made_jump: BoolScalarLike,
     ) -> StepResult:
-        """One step from t0 to t1."""
+        """Compute a step from t0 to t1."""
         h = t1 - t0
         # A step that only fills up an array has the length 0; 1/h must not divide by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)

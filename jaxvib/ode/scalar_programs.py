@@ -30,9 +30,8 @@ _MAX_RECOMPUTED = 8
 
 
 def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program without repeated operations and without operations whose results are not used.
-
-    Equations from automatic differentiation contain the same parts many times: a third to a half of them are removed.
+    """Return the same program without repeated operations and without operations whose results are not used. Equations from
+    automatic differentiation contain the same operations many times: a third to a half of them are removed.
     """
     first: dict[Var, Var | Literal] = {}
     done: dict[tuple[object, ...], JaxprEqn] = {}
@@ -104,7 +103,7 @@ def _evaluate_equation(equation: JaxprEqn, values: list[Array]) -> Sequence[Arra
     if inner is None:
         found = equation.primitive.bind(*values, **equation.params)
         return found if equation.primitive.multiple_results else [found]
-    # The only operation with a custom derivative in these programs.
+    # This is the only operation with a custom derivative in these programs.
     return unfenced_sine_and_cosine(*values) if "call_jaxpr" in equation.params else jaxpr_as_fun(inner)(*values)
 
 
@@ -130,7 +129,8 @@ def _variables(atoms: Iterable[Var | Literal]) -> list[Var]:
 
 
 def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instead | None]) -> ClosedJaxpr:
-    """Program in which operations with one result are replaced by those that `chosen` returns for them, if any."""
+    """Return the program with each operation that has one result replaced by the operations that `chosen` returns for it, if
+    any."""
     instead: dict[int, Var] = {}
     equations: list[tuple[JaxprEqn, Atoms]] = []
 

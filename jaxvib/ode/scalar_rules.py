@@ -59,7 +59,7 @@ def _is_zero(x: Scalar) -> bool:
 
 
 class ComplexParts:
-    """Complex number as two parts, one of which is often a known 0 that XLA would multiply."""
+    """Complex number as its two parts. One of them is often a known 0, with which XLA would multiply."""
 
     __slots__ = ("imag", "real")
 
@@ -131,7 +131,7 @@ def _div(x: Scalar, y: Scalar, **_: object) -> Scalar:
             return joined(x) / joined(y)
         return ComplexParts(_div(a, c), _div(b, c))
     if not jnp.issubdtype(jnp.result_type(x), jnp.floating):
-        return lax.div(jnp.asarray(x), jnp.asarray(y))  # of whole numbers, which is cut off
+        return lax.div(jnp.asarray(x), jnp.asarray(y))  # division of integers, which truncates
     if is_known(x) and is_known(y):
         return x / y
     return x if _is_zero(x) or (is_known(y) and y == 1) else x / y
@@ -169,7 +169,8 @@ def _bound(primitive: Primitive) -> Callable[..., Scalar]:
 
 
 def elementwise(rule: Callable[..., Scalar]) -> Rule:
-    """A rule for scalars as one for arrays of them; an array of one entry stands for one of any shape, as `clamp` has it."""
+    """Return the rule for arrays that applies a rule for scalars to each entry. A scalar argument is used for all entries, as
+    `clamp` needs it."""
 
     def apply(*given: Scalars, **params: object) -> Scalars:
         whole = np.broadcast_arrays(*given) if len(given) > 1 else list(given)
@@ -243,7 +244,7 @@ def _unstack(x: Scalars, *, axis: int) -> list[Scalars]:
 def _pad(x: Scalars, value: Scalars, *, padding_config: Sequence[tuple[int, int, int]]) -> Scalars:
     low, high, inner = zip(*padding_config, strict=True)
     if min(low) < 0 or min(high) < 0 or any(inner):
-        raise NotScalarizable("a pad that cuts off, or fills between entries")
+        raise NotScalarizable("a pad that removes entries, or inserts values between entries")
     out = np.empty([n + before + after for n, before, after in zip(x.shape, low, high, strict=True)], dtype=object)
     out.fill(value[()])
     out[tuple(slice(before, before + n) for n, before in zip(x.shape, low, strict=True))] = x

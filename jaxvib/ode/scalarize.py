@@ -177,9 +177,9 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
 
     The program on scalars computes intermediate values once (see `fenced`), therefore its time is proportional to the number
     of operations. It processes a large batch in blocks, therefore its memory does not grow with the batch. Its derivatives are
-    right but may be slow.
+    correct but may be slow.
 
-    **Arguments**: `function(x, shared)` gives a tree of arrays; the first leaf of x is a time or another finite scalar.
+    **Arguments**: `function(x, shared)` returns a tree of arrays; the first leaf of x is a time or another finite scalar.
 
     >>> import jax.numpy as jnp
     >>> scalarized_vmap(lambda x, c: c * x)(jnp.asarray([1.0, 2.0]), jnp.asarray(3.0)).tolist()
@@ -262,7 +262,7 @@ def _check_result(result: Scalars, aval: Any, name: str) -> Scalars:
     """Return the result of an operation after a check of shape and dtype against the program on arrays."""
     scalars = (x for x in result.flat if hasattr(x, "dtype"))
     if result.shape != aval.shape or any(x.dtype != aval.dtype for x in scalars):
-        raise NotScalarizable(f"{name}: its rule gave a shape or dtype different from {aval}")
+        raise NotScalarizable(f"{name}: its rule returned a shape or dtype different from {aval}")
     return result
 
 

@@ -35,13 +35,14 @@ DenseInfo: TypeAlias = dict[str, PyTree[Array]]
 """Data of the interpolation of a step: a dictionary whose keys are the attribute names of the interpolation."""
 
 StepResult: TypeAlias = tuple[Y, Y, DenseInfo, VF | None, diffrax.RESULTS]
-"""The state at the end of a step, its error, its interpolation, the method's own state, whether the step succeeded."""
+"""The state at the end of a step, its error, its interpolation, the internal state of the method, and the success of the
+step."""
 
 Norm: TypeAlias = Callable[[PyTree[Array]], RealScalarLike]
 """The size of a tree of numbers."""
 
 Tangents: TypeAlias = PyTree[Array | None]
-"""A tree like that of primal values, each array with a last axis over the tangent directions; None where all of them are 0."""
+"""A tree like that of primal values, each array with a last axis over the tangent directions; None if all of them are 0."""
 
 Batched: TypeAlias = PyTree[bool]
 """A tree like that of values, with True for each value that has an axis over the batch (`in_batched` of

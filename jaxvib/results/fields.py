@@ -74,8 +74,8 @@ def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
 def part(*axes: str, prefix: str = "") -> Part:
     """Return the metadata of a field that contains another tree of numbers, or a tuple of such trees.
 
-    **Arguments**: `axes`: names of axes that precede those of the tree; `prefix` of its names in labelled data. Several trees
-    of a tuple are numbered, and each has a separate axis "load".
+    **Arguments**: `axes`: names of axes that precede those of the tree; `prefix` of its names in labelled data. The trees of a
+    tuple with several trees are numbered, and each of them has its own axis "load".
     """
     return {"part": axes, "prefix": prefix}
 

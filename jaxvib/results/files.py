@@ -67,7 +67,7 @@ def load(path: str | Path) -> Any:
 
     **Returns** the result, bit for bit the same.
 
-    **Raises** `InputError` for a file that is missing, was not written by `save` or was changed since, or holds a class that no
+    **Raises** `InputError` for a file that is missing, was not written by `save`, was changed since, or names a class that no
     longer exists.
 
     >>> import pathlib, tempfile, jaxvib as jv
@@ -159,7 +159,7 @@ def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
         return {type(value).__name__: [_encoded(entry, arrays) for entry in value]}
     if isinstance(value, Mapping):
         return {"dict": [[_encoded(name, arrays), _encoded(entry, arrays)] for name, entry in value.items()]}
-    raise InputError("result", f"holds {quoted(value)}, which cannot be saved; save the data from which it was made")
+    raise InputError("result", f"contains {quoted(value)}, which cannot be saved; save the data from which it was computed")
 
 
 def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np.ndarray]) -> Plain:
@@ -173,7 +173,8 @@ def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np
 def _stored(array: np.ndarray, arrays: dict[str, np.ndarray]) -> str:
     if array.dtype.kind not in _KINDS:
         raise InputError(
-            "result", f"holds an array of the type {array.dtype}, which cannot be saved; save the data from which it was made"
+            "result",
+            f"contains an array of the type {array.dtype}, which cannot be saved; save the data from which it was computed",
         )
     name = f"array{len(arrays)}"
     arrays[name] = array

@@ -27,7 +27,7 @@ class Result(eqx.Module):
     """Base of all results: numbers with a status.
 
     - `status`, and its sentence `message`
-    - for a reader: `summary()`, which is also the representation, and a figure `plot()`
+    - as text and figure: `summary()`, which is also the representation, and `plot()`
     - as data: plain values `as_dict()`, a table `to_pandas()`, a labelled dataset `to_xarray()`
     - in a file: `save(path)`, `load(path)`
 
@@ -53,7 +53,7 @@ class Result(eqx.Module):
     @property
     @final
     def message(self) -> str:
-        """Sentence of the status; for several statuses, each sentence once with its number of occurrences."""
+        """Sentence of the status; for several statuses, each different sentence once, with its number of occurrences."""
         return sentence(self.status)
 
     @property
@@ -125,7 +125,7 @@ class Result(eqx.Module):
     def load(cls, path: str | Path) -> Self:
         """Read a result of this class written by `save` to the file `path`.
 
-        **Raises** `InputError` for a file that is missing or that holds something else.
+        **Raises** `InputError` for a file that is missing or contains something else.
         """
         found = files.load(path)
         if not isinstance(found, cls):

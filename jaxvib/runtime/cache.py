@@ -19,10 +19,10 @@ _folder: list[Path] = []
 
 @validated
 def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bool = False) -> Path:
-    """Cache compiled programs on disk; another process that computes the same then neither traces nor compiles.
+    """Cache compiled programs on disk; another process with the same computation then neither traces nor compiles it.
 
-    - There are two caches: jaxvib's own in `folder/programs` holds traced programs, JAX's compilation cache in `folder` itself
-      holds compiled ones (`jax_compilation_cache_dir` stays if it is set already)
+    - There are two caches: jaxvib's own cache of traced programs in `folder/programs`, and JAX's compilation cache of compiled
+      programs in `folder` itself (`jax_compilation_cache_dir` is not changed if it is already set)
     - jaxvib calls this function with the default folder, unless JAXVIB_AUTOMATIC=off in the environment
     - Programs that differ in shapes, in options, in a version of jaxvib or JAX, or in the processor have different keys. The
       folder may be deleted at any time
@@ -37,7 +37,7 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
     - `only_if_unset`: True keeps a folder that was chosen before
 
     **Returns** the folder. **Raises** `InputError` for a folder that cannot be created, that belongs to another user, or in
-    which others may write: users with write access to it can run code as you.
+    which others may write: users with write access to it can run code with your rights.
 
     >>> import jaxvib as jv
     >>> jv.use_cache("/dev/null")           # doctest: +IGNORE_EXCEPTION_DETAIL
@@ -80,7 +80,8 @@ def program_folder() -> Path | None:
 
 @contextlib.contextmanager
 def compiled_anew() -> Iterator[None]:
-    """Disable both caches within the context, to measure compile times of programs that are new to this process."""
+    """Disable both caches within the context, in order to measure the compile times of programs that this process has not
+    used."""
     folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
     set_program_folder(None)
     jax.config.update("jax_enable_compilation_cache", False)

@@ -119,7 +119,7 @@ def primal_of(tracer: object) -> object | None:
 
 
 def value_of(number: object) -> object:
-    """Return the value at which derivatives are taken; return a number unchanged if it has none, as under `jit` or `vmap`."""
+    """Return the primal value of a number. A number without one, as under `jit` or `vmap`, is returned unchanged."""
     while type(number).__name__ in ("JVPTracer", "LinearizeTracer") and hasattr(number, "primal"):
         number = number.primal  # pyright: ignore[reportAttributeAccessIssue]
     return number
@@ -167,7 +167,7 @@ def backend_started() -> bool:
 def accepted_flags(flags: list[str]) -> list[str]:
     """Return those of the `flags` that this jaxlib supports, because an unknown flag in XLA_FLAGS ends the process.
 
-    For an untested version of jaxlib each flag is tried in a separate process, which takes seconds; the outcome is stored in a
+    For an untested version of jaxlib each flag is tried in a separate process, which takes seconds; the result is stored in a
     file.
     """
     version, number = importlib.metadata.version("jaxlib"), _jaxlib()
@@ -248,11 +248,10 @@ def _unpatched(module: ModuleType | None, name: str) -> Any:
 
 @contextlib.contextmanager
 def no_host_checks() -> Iterator[None]:
-    """Trace Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
-
-    Errors need a callback into Python, and a program with a callback cannot be stored on disk. Equinox's own setting, the
-    environment variable EQX_ON_ERROR, is not sufficient: it is read when Equinox is imported, and applies to the whole process.
-    If it differs from the default, or if Equinox lacks one of the two attributes, the checks are not changed.
+    """Trace Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors. Errors need a callback into Python, and
+    a program with a callback cannot be stored on disk. Equinox's own setting, the environment variable EQX_ON_ERROR, is not
+    sufficient: it is read when Equinox is imported, and applies to the whole process. If it differs from the default, or if
+    Equinox lacks one of the two attributes, the checks are not changed.
     """
     errors = sys.modules.get("equinox._errors")
     plain = getattr(errors, "branched_error_if_impl", None)

@@ -27,7 +27,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
 
     With jax before 0.12 the first use of a public name of jaxvib calls this function, unless JAXVIB_AUTOMATIC=off in the
     environment: without `xla_cpu_small_while_loop_byte_threshold` XLA's CPU backend runs the body of all but the smallest loops
-    as a chain of small functions, and time integration takes many times as long; the time of steady answers hardly changes.
+    as a chain of small functions, and time integration takes many times as long; the time for steady states hardly changes.
     From 0.12 on XLA needs no flag, and jaxvib does not call this function. The flags, in `XLA_FLAGS`:
 
     - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
@@ -37,10 +37,10 @@ def prepare_cpu(devices: int | None = 1) -> str:
       without it
 
     OpenBLAS, which does the linear algebra of JAX and SciPy, is limited to one thread by OPENBLAS_NUM_THREADS=1, because its
-    waiting threads take the cores from everything else.
+    waiting threads take the cores from all other computations.
 
-    Flags that are set already stay as they are. Flags that the installed jaxlib does not know are left out, since XLA would end
-    the process.
+    Flags that are already set are not changed. Flags that the installed jaxlib does not know are omitted, because XLA would
+    end the process.
 
     **Arguments**: `devices`: number of CPU devices, at least 1; typical: 1 (the default); None: the number of cores that this
     process may use.
@@ -84,8 +84,8 @@ def prepare_cpu(devices: int | None = 1) -> str:
 def limit_blas_threads() -> None:
     """Let the linear algebra of JAX, which is SciPy's OpenBLAS, use one thread, unless OPENBLAS_NUM_THREADS is set.
 
-    Its threads wait for work in a busy loop and take the cores from everything else: a solution of 50 equations takes 14 ms of
-    the processor in place of 0.3 ms. There is no effect if SciPy's linear algebra was imported before.
+    Its threads wait for work in a busy loop and take the cores from all other computations: the solution of 50 equations needs
+    14 ms of processor time instead of 0.3 ms. There is no effect if SciPy's linear algebra was imported before.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -16,7 +16,7 @@ from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, jaxpr_as_fun, rewritt
 
 
 def operations(function: Callable[..., Any], *arguments: Any) -> int:
-    """Count the operations of the program of a function; those of loop bodies and called programs count once.
+    """Count the operations of the program of a function; operations in loop bodies and called programs are counted once.
 
     **Arguments**: those of the function; `jax.ShapeDtypeStruct` may stand for arrays. **Returns** a count.
 
@@ -51,7 +51,7 @@ _WITHOUT_EFFECT = ("name", "debug_info", "source_info")
 
 
 def program_text(program: ClosedJaxpr) -> list[str]:
-    """Return a program as text, one operation a line; it is the same in every process.
+    """Return a program as text with one operation in each line; the text is the same in every process.
 
     The text has the operations with their parameters, literals and constants, the operands of each, and the shapes and types of
     the results. Names, source lines and Python functions are left out.
@@ -125,7 +125,7 @@ def _text(value: Any, inner: list[Any] | None = None) -> str:
 def pruned(function: Callable[..., Sequence[Array]], *like: Array) -> Callable[..., list[Array]]:
     """Return the traced function of arrays like `like`, without the operations on which no result depends.
 
-    It is called before a derivative, which would otherwise include these operations.
+    Call it before a derivative, which would otherwise include these operations.
     """
     if not HAS_JAXPRS:
         return lambda *arrays: list(function(*arrays))

@@ -49,9 +49,9 @@ def cached(function: Callable[P, T] | None = None, *, outputs_from_solution: Cal
     First derivatives by `jax.jvp`, `grad`, `jacfwd` and `jacrev`, and batches by `vmap`, are separate programs, which are also
     cached. For derivatives of derivatives, and inside `jit`, JAX transforms the compiled function itself.
 
-    **Arguments**: `outputs_from_solution`: a function of the outputs and the arguments. It computes the outputs again, with the
-    same derivatives, but without the search for the solution; it may return None in place of an output. Reverse derivatives
-    are those of this function, or of the whole function if a needed output is None.
+    **Arguments**: `outputs_from_solution`: a function of the outputs and the arguments. It recomputes the outputs, with the
+    same derivatives, without the search for the solution, and may return None in place of an output. Reverse derivatives are
+    computed from this function, or from the whole function if a needed output is None.
     """
     return (
         CachedFunction(function) if function else functools.partial(CachedFunction, outputs_from_solution=outputs_from_solution)
@@ -76,7 +76,7 @@ class CachedFunction(Generic[P, T]):
         except TypeError as error:
             if "forward-mode" not in str(error):
                 raise
-            # JAX raises this error for forward derivatives of a run with the default adjoint, the replay of its steps.
+            # JAX raises this error for forward derivatives of a run with the default adjoint, which replays its steps.
             raise InputError(
                 "adjoint",
                 "supports reverse-mode derivatives only; for jvp and jacfwd of a run use adjoint=diffrax.ForwardMode()",

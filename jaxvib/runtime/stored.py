@@ -274,7 +274,7 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def _read(path: Path, home: Sharding) -> _Program | None:
-    """Read a program; return None, and let the caller write it again, if the file is missing, damaged or of another user."""
+    """Read a program; return None if the file is missing, damaged or of another user; the caller then writes it again."""
     try:
         with path.open("rb") as file:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():

@@ -115,7 +115,7 @@ def describe(value: object, array: Callable[[Any], Description]) -> Description:
 
 
 def rebuild(description: Description, arrays: Iterator[object]) -> Any:
-    """Build the tree of a description; `arrays` yields its arrays in the order in which `describe` reached them.
+    """Build the tree of a description; `arrays` yields its arrays in the order in which `describe` visited them.
 
     **Raises** `Undescribable` for a description that `describe` cannot produce.
 

@@ -1,4 +1,4 @@
-"""Conversion and checks of users' numbers. This is the only package that reads units; all other code uses SI."""
+"""Conversion of values with units, and checks of values, that users pass. All other packages use SI units only."""
 
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ _COLLECTED: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar(
 
 @contextlib.contextmanager
 def bounds_of_unknowns() -> Iterator[list[Array]]:
-    """Collect the conditions of traced numbers while parts of a scene are built.
+    """Collect the conditions of traced values while parts of a scene are built.
 
-    The yielded list receives, for each traced number, a traced Boolean that is True if the number is allowed.
+    The yielded list receives a traced Boolean for each traced value, True if the value is allowed.
     """
     found: list[Array] = []
     token = _COLLECTED.set(found)

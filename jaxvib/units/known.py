@@ -1,4 +1,4 @@
-"""Checks of numbers that have no value if JAX is transforming the computation (jit, grad, vmap)."""
+"""Checks of values that are not known if JAX is transforming the computation (jit, grad, vmap)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def is_known(*trees: PyTree) -> bool:
-    """Return True if every number in the trees has a value. Modules that plan a computation call it once per computation.
+    """Return True if no value in the trees is traced. Modules that plan a computation call it once per computation.
 
     >>> is_known({"mass": 1.0}, None)
     True
@@ -25,7 +25,7 @@ def is_known(*trees: PyTree) -> bool:
 
 
 def when_known(check: Callable[..., T], *values: PyTree) -> T | None:
-    """Return `check(*values)` of the values as Python numbers and NumPy arrays, or None if one of the numbers is traced.
+    """Return `check(*values)` of the values as Python numbers and NumPy arrays, or None if one of the values is traced.
 
     >>> when_known(lambda mass: mass > 0.0, np.asarray(2.0))
     True
@@ -38,11 +38,10 @@ def _plain(leaf: object) -> object:
     return array.item() if array.ndim == 0 else array
 
 
-def require_known(tree: PyTree, field: str, asking: str, instead: str) -> None:
-    """Raise `InputError` if a number in `tree` has no value.
-
-    The message names the argument `field`, the function `asking`, which needs the value in Python, and the remedy `instead`.
+def require_known(tree: PyTree, field: str, caller: str, instead: str) -> None:
+    """Raise `InputError` if a value in `tree` is traced. The message names the argument `field`, the function `caller`, which
+    needs the value in Python, and the remedy `instead`.
     """
     if not is_known(tree):
-        problem = f"holds numbers that JAX is transforming (jit, grad, vmap, ...), but {asking} needs their values in Python"
+        problem = f"contains values that JAX is transforming (jit, grad, vmap, ...), but {caller} needs them in Python"
         raise InputError(field, f"{problem}; {instead}")

@@ -133,7 +133,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 
 
 def require_real(value: object, unit: str, field: str) -> None:
-    """Check that a value is a real number or an array of real numbers. Every number that a user gives goes through this check.
+    """Check that a value is a real number or an array of real numbers. Every number that a user passes is checked by this
+    function.
 
     **Raises** `InputError` for Booleans, complex numbers, dates, masked values, bytes, lists, None and objects that are not
     numbers.

@@ -142,7 +142,7 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
     ("ask", "says"),
     [
         (lambda run, orbit: jv.sketch(3.0), "scene is 3.0; it must be a Scene"),
-        (lambda run, orbit: jax.jit(lambda s: jv.sketch(s) and 0.0)(SCENE), "a drawing needs their values"),
+        (lambda run, orbit: jax.jit(lambda s: jv.sketch(s) and 0.0)(SCENE), "a drawing needs them"),
         (lambda run, orbit: jv.animate(orbit), r"scene is missing; an Orbit does not contain it"),
         (lambda run, orbit: jv.animate(run, scene=SCENE), "scene is only for an Orbit"),
         (lambda run, orbit: jv.animate(SCENE), "it must be a Run or an Orbit"),
