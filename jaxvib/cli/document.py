@@ -26,8 +26,7 @@ def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Toleranc
 def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, object]:
     """Return the final values of a motion, and the values measured over its last turns."""
     structure = scene.machine.structure()
-    rotors = (run.window.rotor_speed,) if isinstance(run, jv.Envelope) else run.window.rotor_speeds
-    speeds = [speed[-1] for speed in rotors]
+    speeds = [speed[-1] for speed in run.window.rotor_speeds]
     return {
         "status": run.status_name,
         "message": run.message,

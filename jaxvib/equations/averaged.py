@@ -36,8 +36,9 @@ The equilibria are exactly the leading-order jams: V = i Omega Y and A = -Omega^
 its angle in the fixed frame is sigma phi with sigma = +1 (anticlockwise) or -1, and e = (1, -i sigma). The motor of an
 unbalance gives the torque T(w) in place of that of the drag, and I is the inertia of its rotor; under an ideal drive I is
 infinite. All exciters share the amplitudes Y and V. A set of amplitudes Y_k for each exciter, Y_k' = V_k - i w_k Y_k,
-describes the same motion with Y = sum_k Y_k e^{i psi_k}, because the equations are linear in them. The rotation of a housing
-with the machine, which changes the torque of a motor by -T'(w) c q', is neglected.
+describes the same motion with Y = sum_k Y_k e^{i psi_k}, because the equations are linear in them. The equations are therefore
+valid for exciters of different speeds too: Y then beats at the differences of the speeds. The rotation of a housing with the
+machine, which changes the torque of a motor by -T'(w) c q', is neglected.
 
 Source: the method of averaging, N. N. Bogoliubov, Yu. A. Mitropolsky, Asymptotic Methods in the Theory of Non-linear
 Oscillations, 1961; I. I. Blekhman, Synchronization in Science and Technology, 1988. The averaged equations are (1), (2) of the
@@ -134,6 +135,11 @@ class Averaged(eqx.Module):
         """True for the unbalances under ideal drives, whose speed is prescribed, (count,)."""
         each = [[count == 0 and drive.ideal] * max(count, 1) for count, drive in zip(self.counts, self.drives, strict=True)]
         return np.concatenate(each)
+
+    @property
+    def free_shifts(self) -> int:
+        """Number of shifts of phases that change no motion: one of all phases, or one of each prescribed phase."""
+        return max(int(np.sum(self.is_prescribed)), 1)
 
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
         """Return the time derivative of `state` at time `t`."""
@@ -371,6 +377,22 @@ def largest_growth(matrix: Array, neutral: Array | int) -> Array:
     return jnp.where(finite, growth, jnp.nan)
 
 
+def rotating_angles(scene: Scene, state: State) -> tuple[Array, Array]:
+    """Return the angles (count,) rad and rates, rad/s, of all rotating masses at t = 0, in their directions of rotation."""
+    each = []
+    for exciter, own in zip(scene.exciters, state.exciters, strict=True):
+        if own.angle:
+            angle, rate = own.angle[0], own.rate[0]
+        else:
+            drive, start = exciter.turning_drive, jnp.zeros_like(exciter.drive.speed)
+            angle, rate = drive.rotor_angle(start, own.rotor)[None], drive.rotor_speed(start, own.rotor)[None]
+        each.append((angle, rate) if exciter.direction == 1 else (-angle, -rate))
+    if len(each) == 1:
+        return each[0]
+    angles, rates = zip(*each, strict=True)
+    return jnp.concatenate(angles), jnp.concatenate(rates)
+
+
 def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
     """Return amplitudes of a state of the full equations: Re Y e^{i theta} = q, Re V e^{i theta} = q'.
 
@@ -378,7 +400,7 @@ def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
     loads' mean speed. If the loads turn at less than half the lowest natural frequency, they cannot have caused the vibration,
     and the carrier is assumed to vibrate freely at its natural frequencies. Each load's rate is used as its mean rate.
     """
-    (angle,), (rate,) = state.angle, state.rate
+    angle, rate = rotating_angles(scene, state)
     model = linear_model(scene)
     frequencies, shapes = model.modes()
     omega, theta = jnp.mean(rate), jnp.mean(angle)

@@ -23,6 +23,7 @@ from jax import Array
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
 from jaxvib.equations.linear import LinearModel, linear_model, rotating_direction
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive
+from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve, times
 
@@ -177,3 +178,16 @@ def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = N
     torque = torques_at(balance, influence_of(balance, w)[0], w, turn)
     residual = (balance.total_driving_torque(w, factor) + torque) / balance.torque_scale
     return residual[np.flatnonzero(~balance.is_prescribed)] if any(balance.is_prescribed) else residual
+
+
+def can_start(scene: Scene) -> Array:
+    """Return True for each exciter whose motor lifts its unbalance from rest against gravity, or that has none to lift."""
+    gravity = total_gravity(scene.all_effects)
+    each = []
+    for exciter in scene.exciters:
+        motor = exciter.drive.torque_and_inertia(*(jnp.zeros_like(exciter.drive.speed),) * 2)
+        if exciter.unbalance is None or motor is None or 1 not in gravity:
+            each.append(jnp.asarray(True))
+        else:
+            each.append(motor[0] > exciter.unbalance * jnp.abs(gravity[1]))
+    return jnp.stack(each)

@@ -68,7 +68,6 @@ def test_leaves_of_one_exciter_keep_their_order():
         jv.phase_jams,
         jv.balanced_states,
         jv.criterion,
-        jv.envelope,
         jv.audit,
         lambda s: jv.jam_orbit(s, omega=9.0),
         lambda s: jv.whirl(s, [9.0]),
@@ -77,7 +76,7 @@ def test_leaves_of_one_exciter_keep_their_order():
 )
 def test_theories_refuse_several_exciters(ask):
     with pytest.raises(jv.InputError, match=r"has 2 exciters; this function needs a scene with one, for several use"):
-        ask(two()) if ask is not jv.envelope else ask(two(), 1.0)
+        ask(two())
 
 
 @pytest.mark.parametrize("change", [{"unbalance": 0.1}, {"direction": -1}])

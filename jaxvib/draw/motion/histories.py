@@ -109,12 +109,9 @@ def time_histories(
     for k, name in enumerate(load_names(whole[2].shape[1])):
         _band(left, whole[0], scale * whole[2][:, k], k, name, bins)
         right.plot(part[0], scale * part[2][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
-    rotors = whole[3].shape[1]
-    for k in range(rotors):
-        look = {"color": "black" if rotors == 1 else COLORS[k % len(COLORS)], "ls": "--", "lw": 1.1}
-        left.plot(whole[0], scale * whole[3][:, k], label="rotor" if rotors == 1 else f"rotor {k}", **look)
-        if whole[2].shape[1] == 0:
-            right.plot(part[0], scale * part[3][:, k], **look)
+    _draw_rotor_speeds(left, whole[0], scale * whole[3])
+    if whole[2].shape[1] == 0:
+        _draw_rotor_speeds(right, part[0], scale * part[3])
     left.set_ylabel(f"speed, {unit}")
     legend_above(left, 6)
     left, right = axes[-2:]
@@ -142,6 +139,14 @@ def _band(
         axis.fill_between(middle, low, high, color=look["color"], alpha=0.22, lw=0.0, zorder=look["zorder"])
 
 
+def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray) -> None:
+    """Draw the speeds of the rotors (nt, exciters) as dashed lines."""
+    rotors = speeds.shape[1]
+    for k in range(rotors):
+        look = {"color": "black" if rotors == 1 else COLORS[k % len(COLORS)], "ls": "--", "lw": 1.1}
+        axis.plot(time, speeds[:, k], label="rotor" if rotors == 1 else f"rotor {k}", **look)
+
+
 def amplitude_histories(
     time: np.ndarray,
     amplitude: np.ndarray,
@@ -158,7 +163,8 @@ def amplitude_histories(
     """Draw the histories of an averaged run, a panel for each quantity; amplitudes are zero to peak.
 
     `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
-    (nt, count) and `rotor_speed` (nt,) are in rad/s, drawn in `unit`, and the foundation force `force` (nt, nb) is in N.
+    (nt, count) and `rotor_speed` (nt, exciters) are in rad/s, drawn in `unit`, and the foundation force `force` (nt, nb) is in
+    N.
     """
     unit, scale = speed_unit(unit)
     kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
@@ -173,8 +179,9 @@ def amplitude_histories(
         lines(axis, 1e3 * amplitude, own, [names[k] for k in own])
         axis.set_ylabel(label)
         legend_above(axis, 6)
-    lines(axes[-2], scale * load_speed, range(load_speed.shape[1]), load_names(load_speed.shape[1]))
-    axes[-2].plot(time, scale * rotor_speed, color="black", ls="--", lw=1.1, label="rotor")
+    if load_speed.shape[1]:
+        lines(axes[-2], scale * load_speed, range(load_speed.shape[1]), load_names(load_speed.shape[1]))
+    _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
     axes[-2].set_ylabel(f"speed, {unit}")
     legend_above(axes[-2], 6)
     lines(axes[-1], force, range(len(directions)), directions)

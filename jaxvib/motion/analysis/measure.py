@@ -49,15 +49,16 @@ class Trajectory(eqx.Module):
     @property
     def rotor_angle(self) -> Array:
         """Angle of the rotor of a scene with one exciter, rad, without whole turns. **Raises** `InputError` for several."""
-        return _only(self.rotor_angles, "rotor_angles")
+        return of_the_only(self.rotor_angles, "rotor_angles")
 
     @property
     def rotor_speed(self) -> Array:
         """Speed of the rotor of a scene with one exciter, rad/s. **Raises** `InputError` for several."""
-        return _only(self.rotor_speeds, "rotor_speeds")
+        return of_the_only(self.rotor_speeds, "rotor_speeds")
 
 
-def _only(values: tuple[Array, ...], name: str) -> Array:
+def of_the_only(values: tuple[Array, ...], name: str) -> Array:
+    """Return the value of the only exciter. **Raises** `InputError` that names the values of several."""
     if len(values) != 1:
         raise InputError(name, f"are those of {len(values)} exciters; read {name}[0] and so on")
     return values[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Literal, cast
 
 import diffrax
 import equinox as eqx
@@ -16,16 +16,26 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.boundary import validated
-from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_growth, averaged_loads, averaged_model
+from jaxvib.equations.averaged import (
+    Amplitudes,
+    Averaged,
+    amplitudes_of,
+    averaged_growth,
+    averaged_model,
+    require_rotating_masses,
+    rotating_angles,
+)
 from jaxvib.equations.linear import estimated_frequencies, linear_model
 from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
+from jaxvib.equations.torque_balance import can_start
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.base import terms_of, total_gravity
 from jaxvib.machine.effects.terms import LoadPotential
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.motion.analysis.measure import MIN_CHANGE_SCALE, Measured
+from jaxvib.motion.analysis.measure import MIN_CHANGE_SCALE, Measured, turning_directions
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
@@ -108,7 +118,7 @@ class _Tolerance(WrappedController):
 
 
 class _Units(eqx.Module):
-    """Units of the variables: the unbalance radius S/M of the loads, S/M times the rotor speed, the rotor speed, and 1 rad."""
+    """Units of the variables: the unbalance radius S/M, S/M times the rotor speed, the rotor speed, and 1 rad."""
 
     length: Array
     speed: Array
@@ -144,12 +154,13 @@ def envelope(
 ) -> Envelope:
     """Integrate the averaged equations of a scene from 0 to `until`: amplitudes and load speeds in place of vibrations.
 
-    Each step spans many turns, also in a run-up in which loads jam at a resonance or pass through it. The result is the limit
-    of light loads:
+    Each step spans many turns, also in a run-up in which loads jam at a resonance or pass through it. Several exciters may
+    synchronise, or turn at different speeds; steps are then as short as the beats. Each mass that turns, a load or the unbalance
+    of a rotor, counts as a load here. The result is the limit of light loads:
 
     - its relative error is of first order in the loads' share of the mass, multiplied by the dynamic magnification, and about
       as large as the `ripple` of the result; typical: 1e-3 to 0.1
-    - its equilibria are the jams of `jam_modes`
+    - its equilibria are the jams of `jam_modes` and the regimes of `synchronous_regimes`
     - near the boundary between jamming and passing, small differences decide the outcome: use `simulate` there
 
     The equations are given in `averaged_field`.
@@ -168,7 +179,8 @@ def envelope(
     - `max_steps`: the run fails after this number of steps; typical: 2^16 (the default)
 
     Gravity has no mean torque on a load that makes full turns. If a load is too slow to pass the top of its track, or its drag
-    cannot lift it from the bottom, the status is `not_turning`. Effects other than gravity raise `InputError`.
+    or motor cannot lift it from the bottom, the status is `not_turning`. Effects other than gravity, and an exciter with loads
+    and an unbalance or a motor, raise `InputError`.
 
     **Returns** `Envelope`. Forward and reverse derivatives, `jit` and `vmap` are supported.
 
@@ -186,7 +198,7 @@ def envelope(
     Source: see `averaged_field`.
     """
     scene = validate_scene(scene)
-    averaged_loads(scene)
+    require_rotating_masses(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
@@ -198,7 +210,7 @@ def envelope(
         chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
     given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     choices = solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
-    if isinstance(start, str) and start == "jam" and not jams_of.is_ready(scene):
+    if isinstance(start, str) and start == "jam" and scene.is_plain and not jams_of.is_ready(scene):
         rest = initial_state(scene)
         in_background(partial(_run.prepare, scene, end, rest, *choices), partial(_prepare_growth, scene, rest))
     if isinstance(start, State):
@@ -216,18 +228,22 @@ def envelope(
 
 
 def _with_separation_status(run: Envelope) -> Envelope:
-    """Return the run with the status `would_separate` if its loads stay at nearly one angle although this motion is
-    unstable."""
+    """Return the run with another status if it has settled in a motion that is unstable.
+
+    It is `would_separate` for loads of one exciter at nearly one angle, and `unstable` for exciters that turn at one speed.
+    """
     if not (float(run.drift) < SETTLED_DRIFT and status_name(run.status) == "done"):
         return run
-    phase, time = np.asarray(run.window.phase), np.asarray(run.window.time)
-    if not is_nearly_one_angle(phase):
+    phase, time, rate = (np.asarray(x) for x in (run.window.phase, run.window.time, run.window.load_speed))
+    plain = run.scene.is_plain
+    has_one_speed = phase.shape[1] > 1 and bool(np.max(np.ptp(phase, axis=0)) < SETTLED_DRIFT and np.all(rate != 0.0))
+    if not (is_nearly_one_angle(phase) if plain else has_one_speed):
         return run
     last = (np.asarray(x[-1]) for x in map(np.asarray, (run.window.omega, run.window.phase, run.window.displacement)))
     growth = float(_growth_at_end(at_constant_speed(run.scene), *last))
     if not growth * float(time[-1] - time[0]) > MIN_SEPARATION_GROWTH:
         return run
-    return dataclasses.replace(run, status=member(EnvelopeStatus, "would_separate"))
+    return dataclasses.replace(run, status=member(EnvelopeStatus, "would_separate" if plain else "unstable"))
 
 
 def _prepare_growth(scene: Scene, state: State) -> None:
@@ -239,7 +255,7 @@ def _prepare_growth(scene: Scene, state: State) -> None:
 @cached
 def _growth_at_end(scene: Scene, omega: np.ndarray, phase: np.ndarray, displacement: np.ndarray) -> Array:
     model = averaged_model(linear_model(scene))
-    return averaged_growth(model, *map(jnp.asarray, (omega, phase, displacement)))
+    return averaged_growth(model, jnp.asarray(omega), jnp.asarray(phase), jnp.asarray(displacement), neutral=model.free_shifts)
 
 
 @cached
@@ -261,7 +277,7 @@ def _run(
     model, nd = linear_model(scene), begin.displacement.shape[0]
     field, frozen = averaged_model(model), jax.lax.stop_gradient(scene)
     units = _units(jax.lax.stop_gradient(model))
-    speed, frequencies = frozen.drive.speed, estimated_frequencies(frozen)
+    speed, frequencies = frozen.top_speed, estimated_frequencies(frozen)
     saves = _saves(speed, frequencies, end, samples, turns)
 
     is_controller = isinstance(control, diffrax.AbstractStepSizeController)
@@ -276,7 +292,7 @@ def _run(
         y0=units.pack(begin),
         args=args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=_Tolerance(controller, (2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),
+        controller=_Tolerance(controller, (2 * nd, 2 * nd, *begin.rate.shape, *begin.phase.shape)),
         adjoint=adjoint,
         max_steps=max_steps,
     )
@@ -325,7 +341,7 @@ def _status(result: diffrax.RESULTS, exists: Array, finite: Array, turning: Arra
 
 def _at_rest(scene: Scene) -> Amplitudes:
     rest = initial_state(scene)
-    (angle,), (rate,) = rest.angle, rest.rate
+    angle, rate = rotating_angles(scene, rest)
     return Amplitudes(rest.displacement + 0.0j, rest.velocity + 0.0j, rate, angle - jnp.mean(angle))
 
 
@@ -357,11 +373,20 @@ def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
         amplitude=magnitude(state.displacement),
         foundation_force=magnitude(model.carrier.foundation_force(state.displacement, state.velocity)),
         omega=jnp.mean(state.rate),
-        load_speed=state.rate,
+        load_speed=_anticlockwise(model.scene, state.rate),
         phase=state.phase,
-        rotor_speed=model.scene.drive.rotor_speed(t, None),
+        rotor_speeds=tuple(
+            n if exciter.direction == 1 else -n
+            for exciter, n in zip(model.scene.exciters, field.rotor_speeds(t, state.rate), strict=True)
+        ),
         ripple=field.ripple(state),
     )
+
+
+def _anticlockwise(scene: Scene, rates: Array) -> Array:
+    """Return speeds (..., count) of the rotating masses in the fixed frame from those in their directions, or the reverse."""
+    directions = turning_directions(scene)
+    return rates if np.all(directions == 1) else jnp.asarray(directions) * rates
 
 
 def _measure(model: Model, window: Envelopes) -> Measured:
@@ -370,7 +395,7 @@ def _measure(model: Model, window: Envelopes) -> Measured:
     amplitude, force = jnp.max(window.amplitude, axis=0), jnp.max(window.foundation_force, axis=0)
     speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
     change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
-    unit, omega = natural_units(model.scene), jnp.mean(speeds)
+    unit, omega = natural_units(model.scene), jnp.mean(_anticlockwise(model.scene, speeds))
     drift = jnp.max(change) / jnp.maximum(jnp.max(amplitude), MIN_CHANGE_SCALE * unit.displacement)
     force_change = jnp.abs(jnp.max(window.foundation_force[half:], axis=0) - jnp.max(window.foundation_force[:half], axis=0))
     force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), MIN_CHANGE_SCALE * model.natural_force(unit))
@@ -385,14 +410,36 @@ def _measure(model: Model, window: Envelopes) -> Measured:
 
 
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
-    """Return True if every load can make full turns in its potential.
+    """Return True if every rotating mass can make full turns in the potential of gravity.
 
     At the end it must have the energy to pass the top, I w^2/2 > (max V - min V)/2. If it did not have this energy at the
-    start, drag must have been able to lift it, D n > max |dV/dphi|.
+    start, its drag or its motor must have been able to lift it, D n or T(0) > max |dV/dphi|.
     """
-    loads, potentials = scene.loads, terms_of(scene.all_effects, LoadPotential)
-    if not potentials:
-        return jnp.asarray(True)
+    starts, gravity = can_start(scene), total_gravity(scene.all_effects).get(1)
+    each, begins = [], np.cumsum([0, *(max(count, 1) for count in field.counts)])
+    for k, exciter in enumerate(scene.exciters):
+        here = slice(None) if len(scene.exciters) == 1 else slice(begins[k], begins[k + 1])
+        if exciter.loads is not None:
+            potential = _potential_of_loads(scene, exciter)
+            if potential is None:
+                continue
+            height, slope = potential
+            lifted = field.drag[here] * jnp.max(window.rotor_speeds[k] * exciter.direction) > slope
+        elif gravity is None or exciter.drive.ideal or exciter.unbalance is None:
+            continue
+        else:
+            height, lifted = 2.0 * exciter.unbalance * jnp.abs(gravity)[None], starts[k]
+        passes = height / field.inertia[here]
+        ends = jnp.min(window.load_speed[:, here] ** 2, axis=0) > passes
+        each.append(jnp.all(ends & (lifted | (begin.rate[here] ** 2 > passes))))
+    return jnp.all(jnp.stack(each)) if each else jnp.asarray(True)
+
+
+def _potential_of_loads(scene: Scene, exciter: Exciter) -> tuple[Array, Array] | None:
+    """Return max V - min V, J, and max |dV/dphi|, N m, of each load of an exciter over a turn, (count,); None without V."""
+    loads, potentials = exciter.loads, terms_of((*scene.effects, *exciter.effects), LoadPotential)
+    if loads is None or not potentials:
+        return None
 
     def potential(u: Array) -> Array:
         found = [term.energy(loads, (u,)) for term in potentials]
@@ -403,14 +450,14 @@ def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes
     height = jnp.stack([potential(u) for u in around])
     slope = jax.vmap(jax.grad(lambda u: jnp.sum(potential(u))))
     torque = slope(jnp.stack(around))
-    passes = (jnp.max(height, axis=0) - jnp.min(height, axis=0)) / field.inertia
-    lifted = field.drag * jnp.max(window.rotor_speed) > jnp.max(jnp.abs(torque), axis=0)
-    return jnp.all((jnp.min(window.load_speed**2, axis=0) > passes) & (lifted | (begin.rate**2 > passes)))
+    return jnp.max(height, axis=0) - jnp.min(height, axis=0), jnp.max(jnp.abs(torque), axis=0)
 
 
 def _units(model: Model) -> _Units:
-    mass = jnp.mean(jnp.diagonal(model.carrier.mass))
-    return _Units(averaged_loads(model.scene).unbalance() / mass, model.scene.drive.speed)
+    scene, mass = model.scene, jnp.mean(jnp.diagonal(model.carrier.mass))
+    if scene.is_plain:
+        return _Units(cast(CircularLoads, scene.loads).unbalance() / mass, scene.drive.speed)
+    return _Units(cast(Array, natural_units(scene).displacement), scene.top_speed)
 
 
 _HINTS = {

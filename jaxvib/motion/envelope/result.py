@@ -13,11 +13,13 @@ from jaxvib.boundary import validated
 from jaxvib.display import speed_text
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.motion.analysis.measure import AbstractMeasured
+from jaxvib.motion.analysis.measure import AbstractMeasured, of_the_only
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.results.status import status_name
 from jaxvib.steady.outcome import REFUSED
+from jaxvib.steady.points import Harmonic, PointAnswers
 
 if TYPE_CHECKING:
     from jaxvib.display import SpeedUnit
@@ -32,24 +34,29 @@ class EnvelopeStatus(eqx.Enumeration):
     not_finite = "the motion grew without bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     no_start = "the initial state does not exist or is not finite"
+    unstable = "the exciters turn at one speed, but this motion is unstable: the least disturbance ends it"
     would_separate = (
         "all loads are at nearly one angle, and this motion is unstable: slightly separated loads move away from it"
     )
     refused = REFUSED
-    not_turning = "gravity does not average out: a load turns too slowly, or its drag cannot lift it against gravity"
+    not_turning = (
+        "gravity does not average out: a load or an unbalance turns too slowly, or its drag or motor cannot lift it "
+        "against gravity"
+    )
 
 
 class Envelopes(eqx.Module):
-    """Averaged motion at some times.
+    """Averaged motion at some times. The loads are all masses that turn: loads, and rotors with an unbalance but no loads.
 
     **Attributes** (nt times)
 
     - `time` (nt,), s
-    - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes at the loads' mean angle
+    - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes at the loads' mean angle. If exciters turn at
+      different speeds, they beat
     - `amplitude` (nt, nd), m, and `foundation_force` (nt, nb), N, zero to peak
-    - `omega` (nt,): mean speed of the loads, and `load_speed` (nt, count), rad/s
-    - `phase` (nt, count) of each load relative to the mean angle, rad
-    - `rotor_speed` (nt,), rad/s
+    - `omega` (nt,): mean speed of the loads in their directions, and `load_speed` (nt, count), anticlockwise, rad/s
+    - `phase` (nt, count) of each load relative to the mean angle, rad, in its direction of rotation
+    - `rotor_speeds`: an array (nt,) for each exciter, anticlockwise, rad/s; `rotor_speed` is that of the only one
     - `ripple` (nt, count), rad, see `Envelope`
     """
 
@@ -61,14 +68,19 @@ class Envelopes(eqx.Module):
     omega: Array = eqx.field(metadata=in_unit("rad/s", "time"))
     load_speed: Array = eqx.field(metadata=in_unit("rad/s", "time", "load"))
     phase: Array = eqx.field(metadata=in_unit("rad", "time", "load"))
-    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "time"))
+    rotor_speeds: tuple[Array, ...] = eqx.field(metadata=in_unit("rad/s", "time", name="rotor_speed"))
     ripple: Array = eqx.field(metadata=in_unit("rad", "time", "load"))
 
+    @property
+    def rotor_speed(self) -> Array:
+        """Speed of the rotor of a scene with one exciter, rad/s. **Raises** `InputError` for several."""
+        return of_the_only(self.rotor_speeds, "rotor_speeds")
 
-class Envelope(AbstractMeasured, Result):
+
+class Envelope(AbstractMeasured, PointAnswers, Result):
     """Averaged run of a scene: the quantities of `AbstractMeasured` over the last turns, and the averaged motion.
 
-    Returned by `envelope`.
+    Returned by `envelope`. `ellipse` and `deck` describe the motion of points by the mean of the amplitudes over the window.
 
     **Attributes**: those of `AbstractMeasured`, and
 
@@ -90,23 +102,32 @@ class Envelope(AbstractMeasured, Result):
 
     @property
     def settled(self) -> Array:
-        """True if amplitudes and speed no longer change, and slightly separated loads do not leave the motion."""
-        return (self.drift < SETTLED_DRIFT) & (self.status != EnvelopeStatus.would_separate)
+        """True if amplitudes and speed no longer change, and slightly disturbed loads do not leave the motion."""
+        is_stable = (self.status != EnvelopeStatus.would_separate) & (self.status != EnvelopeStatus.unstable)
+        return (self.drift < SETTLED_DRIFT) & is_stable
+
+    def harmonic(self) -> Harmonic:
+        """Return the mean vibration of the coordinates over the window, at the mean speed of the loads."""
+        mean = jnp.mean(self.window.displacement, axis=0)
+        away = self.window.displacement - mean[None]
+        rest = 0.5 * (away.T @ jnp.conj(away)).real / away.shape[0]
+        return Harmonic(self.scene.machine, jnp.mean(self.window.omega), mean, rest)
 
     def summary(self) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak."""
-        unstable, first = bool(self.status == EnvelopeStatus.would_separate), []
-        state = "settled" if bool(self.settled) else "not settled: run longer"
-        end = EnvelopeStatus[EnvelopeStatus.done] if unstable else self.message
-        if unstable:
-            first, state = [f"not settled: {self.message}"], "periodic only while the loads are at one angle"
+        named, first = status_name(self.status), []
+        end, state = self.message, "settled" if bool(self.settled) else "not settled: run longer"
+        if named in ("would_separate", "unstable"):
+            first, end = [f"not settled: {self.message}"], EnvelopeStatus[EnvelopeStatus.done]
+            state = f"periodic only {'while the loads are at one angle' if named == 'would_separate' else 'until disturbed'}"
+        rotors = speed_text([speed[-1] for speed in self.window.rotor_speeds], 6)
+        rotor = "rotor" if len(self.window.rotor_speeds) == 1 else "rotors"
         return "\n".join(
             [
                 *first,
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
-                f"rotor at {speed_text(self.window.rotor_speed[-1], 6)}",
+                f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), {rotor} at {rotors}",
                 f"  {self.extent(self.scene)}",
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
@@ -121,8 +142,14 @@ class Envelope(AbstractMeasured, Result):
         from jaxvib.draw.motion.histories import amplitude_histories  # slow import
 
         kept, structure = self.window if self.trajectory is None else self.trajectory, self.scene.machine.structure()
+        exciters = self.scene.exciters
+        own = np.repeat([e.loads is not None for e in exciters], [1 if e.loads is None else e.loads.count for e in exciters])
         return amplitude_histories(
-            *map(np.asarray, (kept.time, kept.amplitude, kept.load_speed, kept.foundation_force, kept.rotor_speed)),
+            np.asarray(kept.time),
+            np.asarray(kept.amplitude),
+            np.asarray(kept.load_speed)[:, own],
+            np.asarray(kept.foundation_force),
+            np.stack([np.asarray(speed) for speed in kept.rotor_speeds], axis=1),
             names=structure.coordinates,
             units=structure.units,
             directions=structure.foundation_directions,

@@ -39,8 +39,9 @@ def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
 
 
 def at_constant_speed(scene: Scene) -> Scene:
-    """Return the scene with a rotor that has its working speed from the start."""
-    return scene.replace(drive=scene.drive.settled())
+    """Return the scene with rotors that have their working speed from the start, and motors that are off throughout."""
+    drives = [exciter.drive.settled() for exciter in scene.exciters]
+    return eqx.tree_at(lambda s: [exciter.drive for exciter in s.exciters], scene, drives)
 
 
 def _steps_for(scene: Scene) -> Array:

@@ -18,13 +18,13 @@ from jaxvib.equations.torque_balance import (
     TorqueBalance,
     assemble_torque_balance,
     balance_residuals,
+    can_start,
     influence_of,
     motion_of,
     torques_at,
     unknowns_of,
 )
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene
@@ -309,8 +309,7 @@ def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     status = RegimeStatus.where(bounded | ~jnp.isfinite(w), status, RegimeStatus.unbounded)
 
     known, at, moved = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z))
-    common = max(int(np.sum(balance.is_prescribed)), 1)
-    growth = averaged_growth(frozen.averaged, known, at, moved, common + neutral)
+    growth = averaged_growth(frozen.averaged, known, at, moved, frozen.averaged.free_shifts + neutral)
     numbers = {
         "speed": w,
         "phases": angles,
@@ -327,7 +326,7 @@ def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     }
     kept = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
     stable = there & (growth < -jnp.maximum(_MIN_DAMPING, 100.0 * eps) * w)
-    return {"status": status, "stable": stable, "can_start": _can_start(scene), **kept}
+    return {"status": status, "stable": stable, "can_start": can_start(scene), **kept}
 
 
 def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
@@ -336,19 +335,6 @@ def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
     each = np.repeat(np.arange(len(averaged.counts)), [max(count, 1) for count in averaged.counts])
     torque = jnp.zeros(len(averaged.counts), driving.dtype).at[each].add(driving)
     return torque * jnp.stack(balance.rotor_speeds(rate))
-
-
-def _can_start(scene: Scene) -> Array:
-    """Return True for each exciter whose motor lifts its unbalance from rest against gravity, or that has none to lift."""
-    gravity = total_gravity(scene.all_effects)
-    each = []
-    for exciter in scene.exciters:
-        motor = exciter.drive.torque_and_inertia(*(jnp.zeros_like(exciter.drive.speed),) * 2)
-        if exciter.unbalance is None or motor is None or 1 not in gravity:
-            each.append(jnp.asarray(True))
-        else:
-            each.append(motor[0] > exciter.unbalance * jnp.abs(gravity[1]))
-    return jnp.stack(each)
 
 
 def _has_one_speed(balance: TorqueBalance) -> Array:
