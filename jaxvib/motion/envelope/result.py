@@ -19,7 +19,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_name
 from jaxvib.steady.outcome import REFUSED
-from jaxvib.steady.points import Harmonic, PointAnswers
+from jaxvib.steady.points import Harmonic, PathsOfPoints
 
 if TYPE_CHECKING:
     from jaxvib.display import SpeedUnit
@@ -77,7 +77,7 @@ class Envelopes(eqx.Module):
         return of_the_only(self.rotor_speeds, "rotor_speeds")
 
 
-class Envelope(AbstractMeasured, PointAnswers, Result):
+class Envelope(AbstractMeasured, PathsOfPoints, Result):
     """Averaged run of a scene: the quantities of `AbstractMeasured` over the last turns, and the averaged motion.
 
     Returned by `envelope`. `ellipse` and `deck` describe the motion of points by the mean of the amplitudes over the window.
