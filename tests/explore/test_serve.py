@@ -3,46 +3,43 @@
 import contextlib
 import http.client
 import socket
-import threading
+import subprocess
+import sys
 import time
 
 import pytest
 
 pytest.importorskip("marimo")
-import uvicorn
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 import jaxvib as jv
-from jaxvib.explore import serve
 from jaxvib.machine.files import TEMPLATES
+
+SERVE = """
+import pathlib, sys
+from jaxvib.explore.serve import serve
+serve(pathlib.Path(sys.argv[1]), int(sys.argv[2]), False, lambda address: print(address, flush=True))
+"""
 
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    """Port and token of the page of a machine, served by marimo and uvicorn."""
+    """Port and token of the page of a machine, served by a process of its own, since marimo's threads do not end."""
     path = jv.save_scene(jv.scene_from_toml(TEMPLATES["one_mass"]), tmp_path_factory.mktemp("served") / "machine.toml")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    servers, said = [], []
-
-    def run(page, **options):
-        servers.append(uvicorn.Server(uvicorn.Config(page, **options)))
-        servers[0].run()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAXVIB_EXPLORE", "")
-        patch.setattr(uvicorn, "run", run)
-        patch.setattr(serve, "leave", lambda: None)
-        thread = threading.Thread(target=serve.serve, args=(path, port, False, said.append))
-        thread.start()
-        while not (servers and servers[0].started):
-            assert thread.is_alive()
+    with subprocess.Popen([sys.executable, "-c", SERVE, str(path), str(port)], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        token = server.stdout.readline().split("/")[3]
+        while True:
+            assert server.poll() is None
+            with contextlib.suppress(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port)):
+                break
             time.sleep(0.02)
-        yield port, said[0].split("/")[3]
-        servers[0].should_exit = True
-        thread.join()
+        yield port, token
+        server.terminate()
 
 
 def ask(port, path, method="GET", **headers):
