@@ -22,6 +22,8 @@ from jaxvib.machine.loads import Loads, balls, pendulums, rollers
 from jaxvib.machine.torus import torus_balls
 
 # Drives
+from jaxvib.machine.drives.controlled import Converter, SpeedControl, SpeedProfile, TorqueTable
+from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCircuit, InductionMotorElectrical, NamePlateMotor
 from jaxvib.machine.drives.drive import (
     ConstantSpeed,
     DCMotor,
@@ -186,6 +188,14 @@ __all__ = [
     "DCMotor",
     "InductionMotor",
     "SwitchedOff",
+    "Converter",
+    "SpeedControl",
+    "SpeedProfile",
+    "TorqueTable",
+    "DCMotorElectrical",
+    "InductionMotorCircuit",
+    "InductionMotorElectrical",
+    "NamePlateMotor",
     # Effects
     "Effect",
     "Gravity",

@@ -51,7 +51,8 @@ def test_scenes_hold_every_load_drive_and_effect():
     assert {exciter.carries for exciter in exciters} == {("loads",), ("unbalance",), ("loads", "unbalance")}
     assert kinds >= {"one_mass", "two_mass", "three_mass", "network", "planar_rotor", "rotor", "plane_body"}
     assert kinds >= {"ball", "roller", "pendulum", "torus_ball"}
-    assert kinds >= {"constant_speed", "spin_up", "run_up", "dc_motor", "induction_motor"}
+    assert kinds >= {"constant_speed", "spin_up", "run_up", "dc_motor", "induction_motor", "name_plate_motor"}
+    assert kinds >= {"dc_motor_electrical", "induction_motor_electrical", "converter", "speed_control"}
     effects = {type(effect) for scene in found for effect in scene.all_effects}
     assert effects == {getattr(jv, name) for name in jv.__all__ if is_effect(getattr(jv, name))}
 

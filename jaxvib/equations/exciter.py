@@ -75,6 +75,11 @@ class Motion(NamedTuple):
     housing: Array | None
     time: Array
 
+    @property
+    def driven_speed(self) -> Array:
+        """Speed of the rotor relative to its housing, rad/s."""
+        return self.speed if self.housing is None else self.speed - self.housing
+
 
 class Eliminated(NamedTuple):
     """Exciter whose own accelerations are expressed in terms of a, the accelerations of the mount's rows.
@@ -158,8 +163,12 @@ class RotorDynamics(eqx.Module):
         """
         return ExciterState(rotor=self._rotor_rates(motion, part, a))
 
-    def _rotor_rates(self, motion: Motion, part: Eliminated, a: Sequence[Array]) -> tuple[Array, Array] | None:
-        return None if part.rotor is None else (motion.speed, part.rotor[0] - dot(part.rotor[1], a))
+    def _rotor_rates(self, motion: Motion, part: Eliminated, a: Sequence[Array]) -> tuple[Array, ...] | None:
+        if part.rotor is None or motion.state.rotor is None:
+            return None
+        states = motion.state.rotor[2:]
+        rates = self.drive.state_rates(motion.time, motion.driven_speed, states) if states else ()
+        return (motion.speed, part.rotor[0] - dot(part.rotor[1], a), *rates)
 
     def _add_rotor(
         self,
@@ -191,8 +200,8 @@ class RotorDynamics(eqx.Module):
 
     def _motor(self, motion: Motion) -> tuple[Array, Array] | None:
         """Return the torque of a motor, at its speed relative to the housing, and its inertia; None under an ideal drive."""
-        speed = motion.speed if motion.housing is None else motion.speed - motion.housing
-        return self.drive.torque_and_inertia(motion.time, speed)
+        states = () if motion.state.rotor is None else motion.state.rotor[2:]
+        return self.drive.torque_and_inertia(motion.time, motion.driven_speed, states)
 
     def _braking_torque(self, motion: Motion, drag: Array, coupling: Axes) -> tuple[Array, list[Array]]:
         """Return (T, c) of the torque T + c . a, N m, with which loads, gravity and imbalance brake the rotor.

@@ -108,7 +108,7 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         weight = total_gravity(effects).get(1)
         if exciter.unbalance is not None and weight is not None:
             parts.append(exciter.unbalance * weight * jnp.sin(turn))
-        motor = drive.torque_and_inertia(t, rate)
+        motor = drive.torque_and_inertia(t, rate, (own.rotor or ())[2:])
         if motor is not None:
             parts.append(0.5 * motor[1] * rate**2)
     supports = zip(terms_of(scene.effects, SupportForce), model.supports, strict=True)
@@ -210,7 +210,7 @@ def _drive_torque(
     of its loads.
     """
     turn, driven, braking = rotor
-    motor = dynamics.drive.torque_and_inertia(t, driven)
+    motor = dynamics.drive.torque_and_inertia(t, driven, (state.rotor or ())[2:])
     if motor is not None:
         return motor[0]
     torque = braking + _imbalance_rate(exciter, mount, turn) @ acceleration

@@ -41,7 +41,8 @@ class ExciterState(eqx.Module):
 
     - `angle` and `rate`: a tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),)
       in rad and rad/s; () without loads
-    - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it; None under an ideal drive
+    - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it, followed by the states of the motor, such as
+      currents; None under an ideal drive
     - `spin` of the loads if effects release it, see `Spin` and `with_spin`; otherwise None
 
     >>> import jax.numpy as jnp, jaxvib as jv
@@ -52,7 +53,7 @@ class ExciterState(eqx.Module):
 
     angle: tuple[Array, ...] = eqx.field(metadata=in_unit("rad", "load"), default=())
     rate: tuple[Array, ...] = eqx.field(metadata=in_unit("rad/s", "load"), default=())
-    rotor: tuple[Array, Array] | None = None
+    rotor: tuple[Array, ...] | None = None
     spin: Spin | None = None
 
 
@@ -96,7 +97,7 @@ class State(eqx.Module):
         velocity: Array,
         angle: tuple[Array, ...] = _OMITTED,
         rate: tuple[Array, ...] = _OMITTED,
-        rotor: tuple[Array, Array] | None = _OMITTED,
+        rotor: tuple[Array, ...] | None = _OMITTED,
         spin: Spin | None = _OMITTED,
         *,
         exciters: Sequence[ExciterState] | None = None,
@@ -129,7 +130,7 @@ class State(eqx.Module):
         return self.exciter.rate
 
     @property
-    def rotor(self) -> tuple[Array, Array] | None:
+    def rotor(self) -> tuple[Array, ...] | None:
         """Angle and speed of the rotor of the only exciter, if a motor drives it."""
         return self.exciter.rotor
 

@@ -78,9 +78,17 @@ class _TorqueInput(Motor):
         """Return the sum of the motor's torque and the additional torque."""
         return self.extra if self.motor is None else self.motor.torque(speed) + self.extra
 
-    def torque_at(self, t: Array, speed: Array) -> Array:
+    def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
         """Return the sum of the motor's torque at time `t` and the additional torque."""
-        return self.extra if self.motor is None else self.motor.torque_at(t, speed) + self.extra
+        return self.extra if self.motor is None else self.motor.torque_at(t, speed, states) + self.extra
+
+    def state_units(self) -> tuple[Array, ...]:
+        """Return the typical magnitudes of the states of the motor."""
+        return () if self.motor is None else self.motor.state_units()
+
+    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the time derivatives of the states of the motor."""
+        return () if self.motor is None else self.motor.state_rates(t, speed, states)
 
 
 class RotorInputs(NamedTuple):
@@ -222,7 +230,8 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
         put_loads(f"{place}angle", "rad", own.angle)
         put_loads(f"{place}rate", "rad/s", own.rate)
         if own.rotor is not None:
-            put(np.asarray(own.rotor), _rotor_signals(place)[:2])
+            states = [Signal(f"{place}motor.state{k + 1}", "") for k in range(len(own.rotor) - 2)]
+            put(np.asarray(own.rotor), [*_rotor_signals(place)[:2], *states])
         if own.spin is not None and own.spin.drilling is not None:
             put_loads(f"{place}drilling_spin", "rad/s", (own.spin.drilling,))
         if own.spin is not None and own.spin.slip is not None:

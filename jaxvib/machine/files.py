@@ -15,7 +15,9 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, written
 from jaxvib.machine.carrier import Machine
+from jaxvib.machine.drives.controlled import Converter, SpeedControl, SpeedProfile, TorqueTable
 from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp, SwitchedOff
+from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCircuit, InductionMotorElectrical, NamePlateMotor
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
@@ -63,6 +65,14 @@ DRIVES = {
     "dc_motor": DCMotor,
     "induction_motor": InductionMotor,
     "switched_off": SwitchedOff,
+    "name_plate_motor": NamePlateMotor,
+    "dc_motor_electrical": DCMotorElectrical,
+    "induction_motor_circuit": InductionMotorCircuit,
+    "induction_motor_electrical": InductionMotorElectrical,
+    "torque_table": TorqueTable,
+    "speed_profile": SpeedProfile,
+    "converter": Converter,
+    "speed_control": SpeedControl,
 }
 SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
 
@@ -297,8 +307,9 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
     entries = {name: _built_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
-    if isinstance(values.get("motor"), Mapping):  # a part within a part
-        entries["motor"] = _built(values["motor"], prefix + "motor", DRIVES)
+    for name in ("motor", "reference"):  # drives within a drive
+        if isinstance(values.get(name), Mapping):
+            entries[name] = _built(values[name], prefix + name, DRIVES)
     return build(**{**values, **entries})
 
 

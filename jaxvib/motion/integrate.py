@@ -66,7 +66,10 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
     one, zero, dtype = jnp.ones(()), jnp.zeros(()), state.displacement.dtype
 
     def relative_of(own: ExciterState) -> ExciterState:
-        rotor, spin = None if own.rotor is None else (zero, one), jax.tree.map(jnp.ones_like, own.spin)
+        rotor, spin = (
+            None if own.rotor is None else (zero, *(one for _ in own.rotor[1:])),
+            jax.tree.map(jnp.ones_like, own.spin),
+        )
         return ExciterState((zero,) * len(own.angle), (one,) * len(own.rate), rotor, spin)
 
     relative = State(one, one, exciters=tuple(map(relative_of, state.exciters)))

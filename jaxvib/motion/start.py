@@ -66,7 +66,7 @@ def initial_state(
       parameters that start at exactly one angle (`separation=0`) stay at one angle, even if slightly separated loads would not
     - `throw`: raise if the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
-    A motor's rotor starts at rest, at the angle 0.
+    A motor's rotor starts at rest, at the angle 0, without currents.
 
     **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that does
     not exist at the rotor speed of the scene.
@@ -93,7 +93,7 @@ def initial_state(
         return middle + _places(exciter, loads, start, separation, one_each=one_each)
 
     def at_rest(exciter: Exciter) -> ExciterState:
-        rotor = None if exciter.drive.ideal else (zero[0], zero[0])
+        rotor = None if exciter.drive.ideal else (zero[0],) * (2 + len(exciter.drive.state_units()))
         if exciter.loads is None:
             return ExciterState(rotor=rotor)
         first, *others = exciter.loads.rest()

@@ -10,6 +10,16 @@ LINKED = PLATFORMS | {"link_stiffness": "N/m", "link_damping": "N s/m"}
 INERTIA = {"transverse_inertia": "kg m^2", "polar_inertia": "kg m^2"}
 TERMS = {"stiffness_terms": "N/m, N, N m", "damping_terms": "N s/m, N s, N m s"}
 LOADS = {"mass": "kg", "radius": "m", "drag": "N s/m"}
+CIRCUIT = {
+    "voltage": "V",
+    "frequency": "rad/s",
+    "stator_resistance": "ohm",
+    "rotor_resistance": "ohm",
+    "stator_leakage": "H",
+    "rotor_leakage": "H",
+    "magnetizing_inductance": "H",
+    "inertia": "kg m^2",
+}
 UNITS = {
     "machines": {
         "one_mass": PLATFORMS,
@@ -34,6 +44,20 @@ UNITS = {
         "dc_motor": {"speed": "rad/s", "stall_torque": "N m", "inertia": "kg m^2"},
         "induction_motor": {"speed": "rad/s", "breakdown_torque": "N m", "inertia": "kg m^2"},
         "switched_off": {"at": "s", "bearing": "N m s"},
+        "name_plate_motor": {"power": "W", "rated_speed": "rad/s", "inertia": "kg m^2", "frequency": "rad/s"},
+        "dc_motor_electrical": {
+            "voltage": "V",
+            "resistance": "ohm",
+            "torque_constant": "N m/A",
+            "inertia": "kg m^2",
+            "inductance": "H",
+        },
+        "induction_motor_circuit": CIRCUIT,
+        "induction_motor_electrical": CIRCUIT,
+        "torque_table": {"speeds": "rad/s", "torques": "N m", "inertia": "kg m^2"},
+        "speed_profile": {"times": "s", "speeds": "rad/s"},
+        "converter": {},
+        "speed_control": {"gain": "N m s", "integral_gain": "N m", "torque_limit": "N m", "inertia": "kg m^2"},
     },
     "effects": {
         "gravity": {"g": "m/s^2"},

@@ -13,11 +13,11 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
-_SPEED = unit("rad/s", low=0.0, open_low=True, words="rotor speed")
-_INERTIA = unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the rotor")
+SPEED = unit("rad/s", low=0.0, open_low=True, words="rotor speed")
+INERTIA = unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the rotor")
 
-Rotor = tuple[Array, Array] | None
-"""Angle (rad) and speed (rad/s) of the rotor if they are states of the motion, otherwise None."""
+Rotor = tuple[Array, ...] | None
+"""Angle (rad), speed (rad/s) and the states of the motor if they are states of the motion, otherwise None."""
 
 
 class Drive(Part):
@@ -64,11 +64,19 @@ class Drive(Part):
         """Return the rotor's angular acceleration at time `t` (s), rad/s^2; None if it follows from torques."""
 
     @abc.abstractmethod
-    def torque_and_inertia(self, t: Array, speed: Array) -> tuple[Array, Array] | None:
+    def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array] | None:
         """Return the torque T (N m) at time `t` (s) and the rotor's `speed` (rad/s), and the rotor's inertia J (kg m^2).
 
-        None if no torque changes the speed.
+        None if no torque changes the speed. `states` of the motor, see `Motor.state_units`; without them the steady torque.
         """
+
+    def state_units(self) -> tuple[Array, ...]:
+        """Return the typical magnitudes of the states of a motor beside the angle and the speed; () without such states."""
+        return ()
+
+    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the time derivatives of the `states` of a motor at time `t` (s) and the rotor's `speed` (rad/s)."""
+        return ()
 
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times at which the acceleration jumps, which must be ends of steps."""
@@ -103,10 +111,18 @@ class Clockwise(Drive):
         acceleration = self.drive.rotor_acceleration(t)
         return None if acceleration is None else -acceleration
 
-    def torque_and_inertia(self, t: Array, speed: Array) -> tuple[Array, Array] | None:
+    def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array] | None:
         """Return the torque of the drive at the opposite speed with the opposite sign, and its inertia."""
-        motor = self.drive.torque_and_inertia(t, -speed)
+        motor = self.drive.torque_and_inertia(t, -speed, states)
         return None if motor is None else (-motor[0], motor[1])
+
+    def state_units(self) -> tuple[Array, ...]:
+        """Return the typical magnitudes of the states of the drive."""
+        return self.drive.state_units()
+
+    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the time derivatives of the states of the drive at the opposite speed."""
+        return self.drive.state_rates(t, -speed, states)
 
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times of the jumps of the drive."""
@@ -114,7 +130,7 @@ class Clockwise(Drive):
 
 
 def _mirrored(rotor: Rotor) -> Rotor:
-    return None if rotor is None else (-rotor[0], -rotor[1])
+    return None if rotor is None else (-rotor[0], -rotor[1], *rotor[2:])
 
 
 class IdealDrive(Drive):
@@ -167,7 +183,7 @@ class IdealDrive(Drive):
         """Return `acceleration_at`."""
         return self.acceleration_at(t)
 
-    def torque_and_inertia(self, t: Array, speed: Array) -> None:
+    def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> None:
         """Return None, because no torque changes the speed."""
 
     def settled(self) -> Drive:
@@ -216,17 +232,20 @@ class Motor(Drive):
     def rotor_acceleration(self, t: Array) -> None:
         """Return None, because the acceleration follows from the torques."""
 
-    def torque_and_inertia(self, t: Array, speed: Array) -> tuple[Array, Array]:
+    def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array]:
         """Return `torque_at` and `inertia`."""
-        return self.torque_at(t, speed), self.inertia
+        return self.torque_at(t, speed, states), self.inertia
 
-    def torque_at(self, t: Array, speed: Array) -> Array:
-        """Return the torque at time `t` (s) and the rotor's `speed`, N m; default: `torque`, which does not depend on time."""
+    def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
+        """Return the torque at time `t` (s) and the rotor's `speed` (rad/s), N m.
+
+        It is `torque`, unless the motor changes with time or has `states`.
+        """
         return self.torque(speed)
 
     @abc.abstractmethod
     def torque(self, speed: Array) -> Array:
-        """Return T at the rotor's `speed` (rad/s), N m."""
+        """Return the steady torque T at the rotor's `speed` (rad/s), N m."""
 
 
 class ConstantSpeed(IdealDrive):
@@ -245,7 +264,7 @@ class ConstantSpeed(IdealDrive):
 
     constant = True
 
-    speed: Array = eqx.field(metadata=_SPEED)
+    speed: Array = eqx.field(metadata=SPEED)
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number):
@@ -285,7 +304,7 @@ class SpinUp(IdealDrive):
     [0.0, 50.0, 100.0, 100.0]
     """
 
-    speed: Array = eqx.field(metadata=_SPEED)
+    speed: Array = eqx.field(metadata=SPEED)
     duration: Array = eqx.field(metadata=unit("s", low=0.0, open_low=True, words="duration of the spin-up"))
     kind: str = eqx.field(static=True)
 
@@ -332,7 +351,7 @@ class RunUp(IdealDrive):
     Source: Artyunin 2013, section IV.
     """
 
-    speed: Array = eqx.field(metadata=_SPEED)
+    speed: Array = eqx.field(metadata=SPEED)
     acceleration: Array = eqx.field(metadata=unit("rad/s^2", low=0.0, open_low=True, words="acceleration of the run-up"))
     kind: str = eqx.field(static=True)
 
@@ -380,9 +399,9 @@ class DCMotor(Motor):
     1.0
     """
 
-    speed: Array = eqx.field(metadata=_SPEED)
+    speed: Array = eqx.field(metadata=SPEED)
     stall_torque: Array = eqx.field(metadata=unit("N m", low=0.0, open_low=True, words="stall torque of the motor"))
-    inertia: Array = eqx.field(metadata=_INERTIA)
+    inertia: Array = eqx.field(metadata=INERTIA)
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number, stall_torque: Number, inertia: Number):
@@ -418,12 +437,12 @@ class InductionMotor(Motor):
     Source: Kloss's formula for the steady torque; transients of the currents are neglected.
     """
 
-    speed: Array = eqx.field(metadata=_SPEED)
+    speed: Array = eqx.field(metadata=SPEED)
     breakdown_torque: Array = eqx.field(metadata=unit("N m", low=0.0, open_low=True, words="breakdown torque of the motor"))
     breakdown_slip: Array = eqx.field(
         metadata=unit("", low=0.0, open_low=True, high=1.0, open_high=True, words="breakdown slip of the motor")
     )
-    inertia: Array = eqx.field(metadata=_INERTIA)
+    inertia: Array = eqx.field(metadata=INERTIA)
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number, breakdown_torque: Number, breakdown_slip: Number, inertia: Number):
@@ -439,8 +458,12 @@ class InductionMotor(Motor):
 
     def torque(self, speed: Array) -> Array:
         """Return the torque of Kloss's formula."""
-        slip = 1.0 - speed / self.speed
-        return 2.0 * self.breakdown_torque * slip * self.breakdown_slip / (slip**2 + self.breakdown_slip**2)
+        return kloss_torque(1.0 - speed / self.speed, self.breakdown_torque, self.breakdown_slip)
+
+
+def kloss_torque(slip: Array, breakdown_torque: Array, breakdown_slip: Array) -> Array:
+    """Return 2 T_b s s_b / (s^2 + s_b^2), N m."""
+    return 2.0 * breakdown_torque * slip * breakdown_slip / (slip**2 + breakdown_slip**2)
 
 
 class SwitchedOff(Motor):
@@ -490,13 +513,21 @@ class SwitchedOff(Motor):
         """Return the friction of the bearings."""
         return -self.bearing * speed
 
-    def torque_at(self, t: Array, speed: Array) -> Array:
+    def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
         """Return the torque of the motor at `speed` before the time `at`, afterwards the friction of the bearings."""
-        return jnp.where(t < self.at, self.motor.torque(speed), self.torque(speed))
+        return jnp.where(t < self.at, self.motor.torque_at(t, speed, states), self.torque(speed))
+
+    def state_units(self) -> tuple[Array, ...]:
+        """Return the typical magnitudes of the states of the motor."""
+        return self.motor.state_units()
+
+    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the rates of the `states` of the motor at time `t` (s) and the rotor's `speed` (rad/s)."""
+        return self.motor.state_rates(t, speed, states)
 
     def jump_ts(self) -> tuple[Array, ...]:
-        """Return the time at which the motor is switched off."""
-        return (self.at,)
+        """Return the time at which the motor is switched off, and the times of the motor's jumps."""
+        return (self.at, *self.motor.jump_ts())
 
     def settled(self) -> Drive:
         """Return the motor, switched off from the start."""

@@ -44,7 +44,7 @@ def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
     for term in terms_of(effects, RotorImbalance):
         unbalances.append(jnp.sqrt(sum(x**2 for x in term.at(jnp.zeros_like(arm)).static)))
     one = jnp.ones_like(speed)
-    rotor = None if exciter.drive.ideal else (one, speed)
+    rotor = None if exciter.drive.ideal else (one, speed, *exciter.drive.state_units())
     if loads is None:
         return unbalances, ExciterState(rotor=rotor)
     drilling = speed if has_term(effects, DrillingSpinRelease) else None
@@ -79,7 +79,7 @@ def error_scale(state: State, unit: State) -> State:
         return ExciterState(
             tuple(xp.asarray(unit.angle[0]) for _ in own.angle),
             tuple(xp.asarray(unit.rate[0]) for _ in own.rate),
-            None if unit.rotor is None else (xp.asarray(unit.rotor[0]), xp.asarray(unit.rotor[1])),
+            None if unit.rotor is None else tuple(map(xp.asarray, unit.rotor)),
             spin,
         )
 
@@ -156,7 +156,7 @@ def turned(state: State, to: State) -> State:
     def moved(own: ExciterState, to: ExciterState) -> ExciterState:
         rotor = None
         if own.rotor is not None and to.rotor is not None:
-            rotor = (near(own.rotor[0], to.rotor[0]), own.rotor[1])
+            rotor = (near(own.rotor[0], to.rotor[0]), *own.rotor[1:])
         return ExciterState(tuple(map(near, own.angle, to.angle)), own.rate, rotor, own.spin)
 
     return State(state.displacement, state.velocity, exciters=tuple(map(moved, state.exciters, to.exciters)))

@@ -226,6 +226,11 @@ def plan_synchronous(
 def _require_one_body(exciter: Exciter, place: str) -> None:
     """**Raises** `InputError` for an exciter whose bodies have no common speed."""
     loads, drive = exciter.loads, exciter.drive
+    if drive.state_units():
+        problem = (
+            "whose states, such as currents, this function does not include; use a motor with a steady torque, or simulate"
+        )
+        raise InputError(f"{place}drive", f"is {quoted(drive.kind)}, {problem}")
     if loads is None:
         return
     if exciter.unbalance is not None or has_term(exciter.effects, RotorImbalance):

@@ -102,9 +102,18 @@ def operation_counts() -> list[OperationCount]:
 
 
 def _build_with_halves(build: Callable[..., T]) -> T:
-    """Build an effect or a drive with the value 0.5 for each required number, and with a DC motor where it needs a motor."""
+    """Build an effect or a drive with the value 0.5 for each required number that may be 0.5, and with others that it needs."""
+    needed = {
+        "motor": DCMotor(1.0, 1.0, 1.0),
+        "reference": ConstantSpeed(1.0),
+        "breakdown_ratio": 2.0,
+        "pole_pairs": 1,
+        "times": [0.5, 1.0],
+        "speeds": [0.5, 1.0],
+        "torques": [0.5, -0.5],
+    }
     required = [each.name for each in inspect.signature(build).parameters.values() if each.default is each.empty]
-    return build(**{name: DCMotor(1.0, 1.0, 1.0) if name == "motor" else 0.5 for name in required})
+    return build(**{name: needed.get(name, 0.5) for name in required})
 
 
 def _rotor(stations: Numbers) -> Machine:

@@ -92,7 +92,17 @@ def scenes_of_exciters() -> dict[str, jv.Scene]:
     imbalance = jv.StaticImbalance(0.005)
     pendulums = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1)
     turning = [(motors[0], -0.2, 1), (motors[1], 0.3, -1)]
+    circuit = {"stator_resistance": 1.0, "rotor_resistance": 1.0, "stator_leakage": 0.005, "rotor_leakage": 0.005}
+    electrical = jv.InductionMotorElectrical(400.0, 314.0, 2, **circuit, magnetizing_inductance=0.15, inertia=0.2)
+    table, profile = jv.TorqueTable([0.0, 100.0], [10.0, -2.0], 0.2), jv.SpeedProfile([0.0, 1.0, 2.0], [0.0, 90.0, 80.0])
+    control = jv.SpeedControl(profile, gain=0.5, integral_gain=2.0, torque_limit=8.0, inertia=0.2)
+    several = [electrical, jv.Converter(table, profile), control, jv.DCMotorElectrical(24.0, 0.6, 0.1, 0.2, 0.002)]
+    several.append(jv.NamePlateMotor(1e3, 150.0, 2.5, 0.2))
     found = {
+        "body in a plane, electrical and controlled drives": (
+            body,
+            [jv.Exciter(drive=drive, unbalance=1.5, at=(0.1 * k, 0.4)) for k, drive in enumerate(several)],
+        ),
         "two exciters on platforms": (
             two,
             [jv.Exciter(loads_of_two, SPEED, at=1), jv.Exciter(pendulums, motors[0], at=2, effects=(imbalance,))],

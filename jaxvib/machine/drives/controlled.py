@@ -1,0 +1,310 @@
+"""Drives by tables and controllers: speed profiles, torque tables, converters, speed control."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.drives.drive import INERTIA, ConstantSpeed, Drive, IdealDrive, Motor
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number, Numbers
+from jaxvib.units.known import when_known
+
+
+class TorqueTable(Motor):
+    """Motor, switched on at t = 0, with a measured or catalogued torque over its speed.
+
+    The torque follows straight lines between the points. The first and the last line continue beyond them.
+
+    **Arguments** (SI, or strings with a unit)
+
+    - `speeds` of the points, rad/s, in ascending order, at least 2; typical: ["0 rpm", "1000 rpm", "1500 rpm"]
+    - `torques` at these speeds, N m: the first positive, the last 0 or negative; typical: -10 to 200
+    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+
+    Its `speed` without a load is the last one at which the torque becomes 0.
+
+    **Raises** `InputError` for a wrong unit, speeds that do not ascend, and torques that do not fall to 0.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.TorqueTable([0.0, 100.0, 160.0], ["10 N m", "20 N m", "-4 N m"], inertia=0.02)
+    >>> float(motor.speed), float(motor.torque(50.0)), float(motor.torque(170.0))
+    (150.0, 15.0, -8.0)
+    """
+
+    speeds: Array = eqx.field(metadata=unit("rad/s", low=0.0, words="speed of the torque table", each="point"))
+    torques: Array = eqx.field(metadata=unit("N m", words="torque of the torque table", each="point", typical=10.0))
+    inertia: Array = eqx.field(metadata=INERTIA)
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, speeds: Numbers, torques: Numbers, inertia: Number):
+        self.speeds, self.torques = _points(TorqueTable, speeds=speeds, torques=torques)
+        self.inertia = read_numbers(TorqueTable, "drive", inertia=inertia)["inertia"]
+        self.kind = "torque_table"
+        when_known(_require_fall, self.torques)
+
+    @property
+    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Speed without a load: the last one at which the torque becomes 0, rad/s."""
+        last = self.torques.shape[0] - 2 - jnp.argmax(self.torques[-2::-1] > 0.0)
+        n, m, torque, after = self.speeds[last], self.speeds[last + 1], self.torques[last], self.torques[last + 1]
+        return n + (m - n) * torque / (torque - after)
+
+    def torque(self, speed: Array) -> Array:
+        """Return the torque on the line of the two nearest points."""
+        inner, infinite = self.speeds[1:-1], np.full(1, np.inf, self.speeds.dtype)
+        low, high = jnp.concatenate([-infinite, inner]), jnp.concatenate([inner, infinite])
+        slopes = jnp.diff(self.torques) / jnp.diff(self.speeds)
+        rise = jnp.clip(jnp.asarray(speed)[..., None], low, high) - self.speeds[:-1]
+        return self.torques[0] + jnp.sum(slopes * rise, axis=-1)
+
+
+def _points(part: type[eqx.Module], **lists: Numbers) -> list[Array]:
+    """Return the lists of a table of points. **Raises** `InputError` unless the first ascends and all are of one length."""
+    (first, *others), (name, *names) = (found := read_numbers(part, "drive", **lists)).values(), found
+    n = np.size(first)
+    if np.ndim(first) != 1 or n < 2:
+        raise InputError(f"drive.{name}", f"has {n} value{'s' if n > 1 else ''}; a list of at least 2 is needed")
+    for other, values in zip(names, others, strict=True):
+        if np.shape(values) != (n,):
+            raise InputError(f"drive.{other}", f"has {np.size(values)} values; {n} are needed, one for each of the {name}")
+    when_known(lambda known: _require_ascending(known, name), first)
+    return [first, *others]
+
+
+def _require_ascending(values: np.ndarray, name: str) -> None:
+    steps = np.diff(values)
+    if np.any(steps <= 0.0):
+        k = int(np.argmax(steps <= 0.0)) + 1
+        raise InputError(f"drive.{name}[{k}]", f"is {values[k]:g} after {values[k - 1]:g}; list the {name} in ascending order")
+
+
+def _require_fall(torques: np.ndarray) -> None:
+    if torques[0] <= 0.0 or torques[-1] > 0.0:
+        needed = "the first must be positive, and the last 0 or negative, so that the motor has a speed without a load"
+        raise InputError("drive.torques", f"are {torques[0]:g} N m first and {torques[-1]:g} N m last; {needed}")
+
+
+class SpeedProfile(IdealDrive):
+    """Rotor whose speed is prescribed at several times, with constant accelerations between them.
+
+    The speed before the first time is the first speed, and the speed after the last time is the last one. The acceleration
+    jumps at the times; `simulate` ends a step at each of them.
+
+    **Arguments** (SI, or strings with a unit)
+
+    - `times` of the points, s, in ascending order, at least 2; typical: [0, 5, 60, 70]
+    - `speeds` at these times, rad/s, at least 0; typical: ["0 rpm", "1500 rpm", "1500 rpm", "0 rpm"]
+
+    Its working speed `speed` is the last one, or the largest if the rotor comes to rest.
+
+    **Raises** `InputError` for a wrong unit, times that do not ascend, and a rotor that never turns.
+
+    >>> import jaxvib as jv
+    >>> drive = jv.SpeedProfile([0.0, 2.0, 6.0, 8.0], [0.0, 100.0, 100.0, 0.0])
+    >>> [float(drive.speed_at(t)) for t in (1.0, 4.0, 7.0, 9.0)], float(drive.angle_at(9.0))
+    ([50.0, 100.0, 50.0, 0.0], 600.0)
+    """
+
+    times: Array = eqx.field(metadata=unit("s", low=0.0, words="time of the speed profile", each="point"))
+    speeds: Array = eqx.field(metadata=unit("rad/s", low=0.0, words="speed of the speed profile", each="point"))
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, times: Numbers, speeds: Numbers):
+        self.times, self.speeds = _points(SpeedProfile, times=times, speeds=speeds)
+        self.kind = "speed_profile"
+        when_known(_require_turning, self.speeds)
+
+    @property
+    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Working speed: the last one, or the largest if the rotor comes to rest, rad/s."""
+        return jnp.where(self.speeds[-1] > 0.0, self.speeds[-1], jnp.max(self.speeds))
+
+    def _elapsed(self, t: Array) -> tuple[Array, Array]:
+        """Return the time spent in each segment until `t`, and the acceleration in it."""
+        lengths = jnp.diff(self.times)
+        return jnp.clip(t - self.times[:-1], 0.0, lengths), jnp.diff(self.speeds) / lengths
+
+    def speed_at(self, t: Array) -> Array:
+        """Return the speed on the line between the two nearest points."""
+        elapsed, acceleration = self._elapsed(t)
+        return self.speeds[0] + jnp.sum(acceleration * elapsed)
+
+    def angle_at(self, t: Array) -> Array:
+        """Return the sum of v T + a T^2 / 2 over the segments, and the angle before the first and after the last time."""
+        elapsed, acceleration = self._elapsed(t)
+        within = jnp.sum(elapsed * (self.speeds[:-1] + 0.5 * acceleration * elapsed))
+        before, after = jnp.minimum(t, self.times[0]), jnp.maximum(t - self.times[-1], 0.0)
+        return within + self.speeds[0] * before + self.speeds[-1] * after
+
+    def acceleration_at(self, t: Array) -> Array:
+        """Return the acceleration of the segment, 0 before the first and after the last time."""
+        _, acceleration = self._elapsed(t)
+        return jnp.sum(jnp.where((t >= self.times[:-1]) & (t < self.times[1:]), acceleration, 0.0))
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        """Return the times of the points."""
+        return tuple(self.times)
+
+    def settled(self) -> Drive:
+        """Return `ConstantSpeed` at the last speed. **Raises** `InputError` if the rotor comes to rest."""
+        when_known(_require_steady_speed, self.speeds)
+        return ConstantSpeed(cast(Array, self.speed))
+
+
+def _require_turning(speeds: np.ndarray) -> None:
+    if not np.any(speeds > 0.0):
+        raise InputError("drive.speeds", "are all 0; at least one must be greater than 0")
+
+
+def _require_steady_speed(speeds: np.ndarray) -> None:
+    if speeds[-1] == 0.0:
+        problem = "end at 0, so there is no steady motion; use simulate, or a profile that ends at a speed"
+        raise InputError("drive.speeds", problem)
+
+
+class Converter(Motor):
+    """Motor on a frequency or voltage converter that changes its speed without a load over time.
+
+        T(t, theta') = T_motor(theta' + n_motor - n(t))
+
+    The torque depends on the difference to n(t) as it does on the difference to n_motor without a converter. This is exact for
+    a `DCMotor` whose voltage is changed, and for Kloss's formula at constant flux (voltage in proportion to the frequency).
+
+    **Arguments**
+
+    - `motor` without states, such as an `InductionMotor`
+    - `reference` n(t): an ideal drive, such as a `RunUp`, a `SpinUp` or a `SpeedProfile`
+
+    **Raises** `InputError` for a motor or a reference of the wrong type.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.InductionMotor("1500 rpm", breakdown_torque=70.0, breakdown_slip=0.2, inertia=0.02)
+    >>> ramp = jv.Converter(motor, jv.RunUp("1500 rpm", acceleration=50.0))
+    >>> round(float(ramp.torque_at(1.0, 50.0)), 6), round(float(ramp.torque_at(1.0, 50.0 - 31.41592653589793)), 6)
+    (0.0, 70.0)
+    """
+
+    motor: Motor
+    reference: IdealDrive
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, motor: Motor, reference: IdealDrive):
+        if not isinstance(motor, Motor) or motor.jump_ts() or motor.state_units() or isinstance(motor, Converter):
+            needed = "it must be a motor without states and switches, for example InductionMotor(...)"
+            raise InputError("drive.motor", f"is {quoted(motor)}; {needed}")
+        _require_ideal(reference)
+        self.motor, self.reference, self.kind = motor, reference, "converter"
+
+    @property
+    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Working speed of the reference."""
+        return self.reference.speed
+
+    @property
+    def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Inertia of the motor's rotor."""
+        return self.motor.inertia
+
+    def torque(self, speed: Array) -> Array:
+        """Return the torque at the working speed of the reference."""
+        return self.motor.torque(speed + self.motor.speed - self.speed)
+
+    def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
+        """Return the torque at time `t`."""
+        return self.motor.torque(speed + self.motor.speed - self.reference.speed_at(t))
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        """Return the times of the jumps of the reference."""
+        return self.reference.jump_ts()
+
+    def settled(self) -> Drive:
+        """Return the converter at the working speed."""
+        return Converter(self.motor, cast(IdealDrive, self.reference.settled()))
+
+
+class SpeedControl(Motor):
+    """Motor whose torque is controlled so that its speed follows a reference (proportional and integral, with a limit).
+
+        T_u = gain (n(t) - theta') + z,    T = T_u between -torque_limit and torque_limit
+        z' = integral_gain (n(t) - theta' + (T - T_u) / gain)
+
+    The integral z is a state of the motor (`state.rotor[2]`, N m). The last term keeps it from growing while the torque is at
+    its limit. Theories of steady motions need a torque over the speed, which this drive does not have: use `ConstantSpeed`
+    there.
+
+    **Arguments** (SI, or strings with a unit; all greater than 0)
+
+    - `reference` n(t): an ideal drive, such as a `RunUp`
+    - `gain`, N m s; typical: 0.05 to 5
+    - `integral_gain`, N m; typical: gain divided by 0.1 to 1 s
+    - `torque_limit`, N m; typical: 1.5 to 2.5 times the rated torque
+    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
+
+    **Raises** `InputError` for a wrong unit, a value that is not positive, and a reference of the wrong type.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> drive = jv.SpeedControl(jv.ConstantSpeed(100.0), gain=0.5, integral_gain=2.0, torque_limit=8.0, inertia=0.02)
+    >>> [float(drive.torque_at(0.0, speed, (jnp.asarray(1.0),))) for speed in (0.0, 95.0, 100.0)]
+    [8.0, 3.5, 1.0]
+    """
+
+    reference: IdealDrive
+    gain: Array = eqx.field(metadata=unit("N m s", low=0.0, open_low=True, words="gain of the speed control"))
+    integral_gain: Array = eqx.field(metadata=unit("N m", low=0.0, open_low=True, words="integral gain of the speed control"))
+    torque_limit: Array = eqx.field(metadata=unit("N m", low=0.0, open_low=True, words="torque limit of the motor"))
+    inertia: Array = eqx.field(metadata=INERTIA)
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, reference: IdealDrive, gain: Number, integral_gain: Number, torque_limit: Number, inertia: Number):
+        _require_ideal(reference)
+        given = {"gain": gain, "integral_gain": integral_gain, "torque_limit": torque_limit, "inertia": inertia}
+        self.gain, self.integral_gain, self.torque_limit, self.inertia = read_numbers(SpeedControl, "drive", **given).values()
+        self.reference, self.kind = reference, "speed_control"
+
+    @property
+    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Working speed of the reference."""
+        return self.reference.speed
+
+    def _torques(self, t: Array, speed: Array, integral: Array) -> tuple[Array, Array, Array]:
+        """Return the error of the speed, the torque without a limit, and the torque."""
+        error = self.reference.speed_at(t) - speed
+        unlimited = self.gain * error + integral
+        return error, unlimited, jnp.clip(unlimited, -self.torque_limit, self.torque_limit)
+
+    def torque(self, speed: Array) -> Array:
+        """**Raises** `InputError`, because the torque does not follow from the speed."""
+        problem = "whose torque does not follow from the speed; use ConstantSpeed at its working speed, or simulate"
+        raise InputError("drive", f"is a speed control, {problem}")
+
+    def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
+        """Return the torque at time `t`."""
+        return self._torques(t, speed, states[0])[2] if states else self.torque(speed)
+
+    def state_units(self) -> tuple[Array, ...]:
+        """Return the torque limit."""
+        return (self.torque_limit,)
+
+    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the rate of the integral in `states`, N m/s, at time `t` (s) and the rotor's `speed` (rad/s)."""
+        error, unlimited, torque = self._torques(t, speed, states[0])
+        return (self.integral_gain * (error + (torque - unlimited) / self.gain),)
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        """Return the times of the jumps of the reference."""
+        return self.reference.jump_ts()
+
+    def settled(self) -> Drive:
+        """Return the drive with the working speed as its reference."""
+        return eqx.tree_at(lambda drive: drive.reference, self, self.reference.settled())
+
+
+def _require_ideal(reference: object) -> None:
+    if not isinstance(reference, IdealDrive):
+        raise InputError("drive.reference", f"is {quoted(reference)}; it must be an ideal drive, for example RunUp(...)")
