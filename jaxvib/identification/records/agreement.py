@@ -41,6 +41,9 @@ _COHERENT, _STRONG = 0.9, 1e-3
 _SEGMENTS = 8
 """Number of segments of a record whose spectra are averaged."""
 
+_ALIASING_LENGTH, _ALIASING_PIECES = 8192, 64
+"""Number of samples of a piece of a record, and largest number of pieces, whose spectrum is examined for aliasing."""
+
 _DRIFT = 3.0
 """Drift of a clock, relative to its standard error, above which it is stated."""
 
@@ -233,7 +236,11 @@ def _aliasing(motion: _Signal, speeds: Sequence[_Signal], source: str) -> list[s
     if fastest > 0.5 * rate:
         problem = f"is sampled at {rate:.4g} Hz, less than twice the largest speed of the rotor, {fastest:.4g} Hz"
         raise InputError(where, f"{problem}: its vibration is aliased; record at more than {2.56 * fastest:.3g} Hz")
-    power = np.abs(np.fft.rfft((motion.value - np.mean(motion.value)) * np.hanning(motion.value.size))) ** 2
+    length = min(motion.value.size, _ALIASING_LENGTH)
+    starts = np.unique(np.linspace(0, motion.value.size - length, _ALIASING_PIECES).astype(int))
+    pieces = np.stack([motion.value[k : k + length] for k in starts])
+    window = np.hanning(length)
+    power = np.mean(np.abs(np.fft.rfft((pieces - np.mean(pieces, axis=1, keepdims=True)) * window, axis=1)) ** 2, axis=0)
     share = float(np.sum(power[int(0.8 * power.size) :]) / max(float(np.sum(power)), 1e-300))
     if share > 0.5:
         problem = f"has {share:.0%} of its power between 0.4 and 0.5 times its sampling rate of {rate:.4g} Hz"

@@ -32,21 +32,28 @@ def rising_edges(time: np.ndarray, level: np.ndarray, where: str) -> np.ndarray:
     [0.00796, 0.05796]
     """
     known = np.isfinite(level)
-    time, level = time[known], level[known]
+    if not np.all(known):
+        time, level = time[known], level[known]
     low, high = (float(x) for x in np.quantile(level, [0.01, 0.99])) if level.size else (0.0, 0.0)
     if level.size and high - low < 0.5 * np.ptp(level):  # pulses shorter than a hundredth of their period
         low, high = float(np.min(level)), float(np.max(level))
     if high <= low:
         raise InputError(where, "is constant; give a channel with the pulses of the tachometer")
-    level = (level - low) / (high - low)
-    state = np.where(level > _HIGH, 1, np.where(level < _LOW, 0, -1))
-    last = np.maximum.accumulate(np.where(state >= 0, np.arange(state.size), -1))
-    state = np.where(last >= 0, state[np.maximum(last, 0)], -1)
-    starts = np.flatnonzero((state[1:] == 1) & (state[:-1] == 0)) + 1
-    rises = np.flatnonzero((level[1:] >= 0.5) & (level[:-1] < 0.5)) + 1
-    after = rises[np.searchsorted(rises, starts, side="right") - 1]
-    share = (0.5 - level[after - 1]) / (level[after] - level[after - 1])
+    middle = 0.5 * (low + high)
+    bottoms = _starts(level < low + _LOW * (high - low))
+    tops = _starts(level > low + _HIGH * (high - low))
+    before = np.searchsorted(bottoms, tops) - 1  # the last time at which the signal became low
+    _, first = np.unique(before, return_index=True)
+    tops = tops[first[before[first] >= 0]]
+    rises = _starts(level >= middle)
+    after = rises[np.searchsorted(rises, tops, side="right") - 1]
+    share = (middle - level[after - 1]) / (level[after] - level[after - 1])
     return time[after - 1] + share * (time[after] - time[after - 1])
+
+
+def _starts(flags: np.ndarray) -> np.ndarray:
+    """Return the indices at which stretches of True begin."""
+    return np.flatnonzero(flags & ~np.concatenate([[False], flags[:-1]]))
 
 
 def numbered_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:

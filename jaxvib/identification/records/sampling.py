@@ -62,7 +62,9 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
     (100, 2, ["run: channel 'frame' has 1 gap; the longest is 0.03 s at 0.39 s"])
     """
     require_ascending(time, where)
-    time, value, notes = _own_rate(time, np.where(np.isfinite(value), value, np.nan), where)
+    if not np.all(np.isfinite(value)):
+        value = np.where(np.isfinite(value), value, np.nan)
+    time, value, notes = _own_rate(time, value, where)
     missing = np.isnan(value)
     if np.any(missing):
         count = int(np.count_nonzero(missing))
@@ -86,6 +88,8 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
 
 def _own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return the samples of a channel that has a reading only at every n-th time, without the other times."""
+    if not np.any(np.isnan(value)):
+        return time, value, []
     there = np.flatnonzero(~np.isnan(value))
     if there.size < MIN_SAMPLES:
         raise InputError(where, f"has {there.size} readings; at least {MIN_SAMPLES} are needed, record more")
@@ -98,6 +102,9 @@ def _own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarr
 
 
 def _on_grid(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    even = np.linspace(time[0], time[-1], time.size)
+    if np.max(np.abs(time - even)) <= _JITTER * (even[1] - even[0]):
+        return even, value, []
     steps = np.diff(time)
     step = float(np.median(steps))
     step = float(np.mean(steps[steps < _GAP * step]))  # not rounded to the digits of the file
@@ -114,8 +121,9 @@ def _on_grid(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarra
             )
         notes.append(f"{where} has {found}; {place}")
     index = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / step), 1.0))]).astype(int)
-    slope, start = np.polyfit(index - index[-1] / 2.0, time, 1)
-    grid = start + slope * (np.arange(index[-1] + 1) - index[-1] / 2.0)
+    centred = index - np.mean(index)
+    slope = float(centred @ time / (centred @ centred))
+    grid = np.mean(time) + slope * (np.arange(index[-1] + 1) - np.mean(index))
     error = np.max(np.abs(time - grid[index]))
     if error <= max(_JITTER * slope, _resolution(time)):
         even = np.full(grid.size, np.nan)
