@@ -123,7 +123,7 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
             if not isinstance(kind, str):
                 break
             try:
-                kind = eval(kind, names)  # safe, since annotations are code of this package
+                kind = eval(kind, names)  # safe, because annotations are code of this package
             except NameError as error:
                 names[error.name or ""] = _MATPLOTLIB_CLASSES.get(error.name or "", Any)
             except (TypeError, AttributeError):

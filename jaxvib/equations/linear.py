@@ -357,8 +357,8 @@ def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[Circ
 def require_circular(loads: Loads, drive: Drive) -> None:
     """**Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`."""
     if not loads.circular:
-        holds = "this function needs loads on a circle (property circular): ball, roller, pendulum"
-        raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {holds}; use simulate for others")
+        needed = "this function needs loads on a circle (property circular): ball, roller, pendulum"
+        raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {needed}; use simulate for others")
     if not drive.ideal:
         raise InputError(
             "drive.kind",

@@ -103,7 +103,7 @@ class Loads(Part):
 
     @property
     def has_bearing(self) -> bool:
-        """True if each load hangs on the shaft by a bearing of its own, as a pendulum does."""
+        """True if each load is attached to the shaft by its own bearing, as a pendulum is."""
         return False
 
     @abc.abstractmethod

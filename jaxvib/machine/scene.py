@@ -284,7 +284,7 @@ class Scene(Part):
     @property
     def mounting(self) -> Mount:
         """Directions and shapes of the only exciter's mount, without values."""
-        # A property, since each analysis reads it and a method of an Equinox module costs 30 us a call.
+        # A property, because each analysis reads it and a method of an Equinox module costs 30 us a call.
         return shapes_of(self.machine, self.exciter.place)[1]
 
     def replace(self, **parts: Any) -> Scene:

@@ -118,8 +118,8 @@ class TorusBalls(Loads):
         """Return N against the wall of the tube."""
         (f, a), m = u, self.mass
         normal = (jnp.sin(a) * jnp.cos(f), jnp.sin(a) * jnp.sin(f), -jnp.cos(a))
-        held = self._arm(a) * rate[0] ** 2 * jnp.sin(a) + self.gap * rate[1] ** 2
-        return NormalForce(m * (held - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
+        centrifugal = self._arm(a) * rate[0] ** 2 * jnp.sin(a) + self.gap * rate[1] ** 2
+        return NormalForce(m * (centrifugal - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
 
     def natural_frequency(self, speed: Array) -> Array:
         """Return w sqrt((R + rho) / (kappa rho)), rad/s.

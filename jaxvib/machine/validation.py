@@ -100,12 +100,12 @@ def _allowed_value(scene: Scene) -> Array | None:
 
 
 _MAX_SPEED, _MAX_RADIUS, _MAX_SAG, _MIN_MASS = 700.0, 5.0, 1.0, 10.0
-"""Largest usual rotor speed, rad/s, radius of loads, m, and sag of a machine under its own weight, m, judged above this mass:
-machines of dimensionless numbers have masses of about 1."""
+"""Largest usual rotor speed, rad/s, largest usual radius of loads, m, largest usual sag of a machine under its own weight, m,
+and smallest mass, kg, of machines whose sag is examined. Machines with dimensionless parameters have masses of about 1."""
 
 
 def implausible_numbers(scene: Scene) -> list[str]:
-    """Return a sentence for each number of a scene that was probably meant in another unit.
+    """Return a sentence for each parameter of a scene that was probably intended in another unit.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

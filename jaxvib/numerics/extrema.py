@@ -21,8 +21,8 @@ _MIDDLE = (NODES - 1) / 2.0
 def _hermite() -> tuple[np.ndarray, np.ndarray]:
     """Matrices (4, 3) and (4, 4) to the even and the odd coefficients, see `_polynomial`.
 
-    They act on the sums and the differences of two values or slopes: those at -1/2 and 1/2, and those at -3/2 and 3/2. The sum
-    of the inner values is not among them, since the values are relative to it.
+    They act on the sums and the differences of two values or two slopes, at -1/2 and 1/2, and at -3/2 and 3/2. The sum of the
+    inner values is omitted, because all values are relative to it.
     """
     nodes, even = np.asarray([[0.5], [1.5]]), np.asarray([0, 2, 4, 6])
 
@@ -51,7 +51,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """
     n, half = len(x), len(x) // 2
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
-    # The first and the last four samples serve two steps each. (Slices are read faster than samples at given indices.)
+    # The first and the last four samples are used for two steps each. Slices are read faster than samples at given indices.
     last = n - NODES + 1
     windows = (
         [jnp.concatenate([y[k : k + 1], y[k : last + k], y[last + k - 1 : last + k]]) for k in range(NODES)] for y in (x, v)
@@ -110,17 +110,16 @@ def greatest(values: Array) -> Array:
 
 
 def _extrema_between(x: Array, v: Array, polynomial: list[Array], start: np.ndarray) -> tuple[Array, Array]:
-    """Return the place of the extremum between each two neighbouring samples, from 0 to 1, and the value there.
+    """Return the place of the extremum in each step between two samples, from 0 to 1, and the value at this place. In a step
+    without an extremum it is the value of the first sample.
 
-    Without an extremum the value is that of the first of the two samples.
-
-    **Arguments**: x, v (n,) samples and slopes, a `polynomial` for each step, and the place where the step starts on it.
+    **Arguments**: x, v (n,) samples and slopes, a `polynomial` for each step, and the place on it at which the step starts.
     """
     rise, begin, end, origin = x[1:] - x[:-1], v[:-1], v[1:], jnp.asarray(start, x.dtype)
     slope = _derivative(polynomial)
     curvature = _derivative(slope)
     turns = begin * end < 0.0
-    # From the zero of the slope of the cubic between the two samples, two Newton steps reach rounding.
+    # Two Newton steps, from the extremum of the cubic between the two samples, leave only rounding errors.
     bend = 3.0 * rise - 2.0 * begin - end
     root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))
     divisor = bend + jnp.where(begin > 0.0, -root, root)
@@ -129,16 +128,16 @@ def _extrema_between(x: Array, v: Array, polynomial: list[Array], start: np.ndar
         curved = _at(curvature, origin + share)
         change = _at(slope, origin + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
         share = jnp.clip(share - change, 0.0, 1.0)
-    # Without a barrier the compiler computes the polynomials anew for each use of their values.
+    # Without a barrier the compiler recomputes the polynomials for each use of their values.
     return jax.lax.optimization_barrier((share, jnp.where(turns, _at(polynomial, origin + share), x[:-1])))
 
 
 def _polynomial(x: Sequence[Array] | Array, v: Sequence[Array] | Array) -> list[Array]:
     """Return the 8 coefficients, lowest power first, of the polynomial through four values and slopes.
 
-    They are those at -3/2, -1/2, 1/2 and 3/2.
+    The values and slopes are those at -3/2, -1/2, 1/2 and 3/2.
     """
-    # Relative to the mean value of the inner samples, so that a common offset causes no rounding.
+    # Values are relative to the mean of the inner samples, so that a common offset causes no rounding error.
     inner = x[1] + x[2]
     even = x[0] + x[3] - inner, v[2] - v[1], v[3] - v[0]
     odd = x[2] - x[1], x[3] - x[0], v[1] + v[2], v[0] + v[3]
@@ -148,7 +147,7 @@ def _polynomial(x: Sequence[Array] | Array, v: Sequence[Array] | Array) -> list[
 
 
 def _products(matrix: np.ndarray, vector: Sequence[Array]) -> list[Array]:
-    """Return a product, written out because a matrix product would be computed apart from the operations beside it."""
+    """Return the product as unrolled sums. The compiler cannot fuse a matrix product with other operations."""
     return [functools.reduce(operator.add, [float(m) * y for m, y in zip(row, vector, strict=True)]) for row in matrix]
 
 

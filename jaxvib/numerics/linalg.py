@@ -26,7 +26,7 @@ _Entry: TypeAlias = Array | float
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """Return a matrix times a vector: for small matrices as a sum, since a product in a time loop prevents fusion."""
+    """Return a matrix times a vector: for small matrices as a sum, because a product in a time loop prevents fusion."""
     if min(matrix.shape) <= _MAX_UNROLLED_EQUATIONS:
         return jnp.sum(matrix * vector[None, :], axis=-1)
     return jnp.matmul(matrix, vector, precision="highest")
@@ -120,7 +120,7 @@ def hermitian_modes(square: Array) -> tuple[Array, Array]:
     The vectors of equal eigenvalues, which are not unique, have derivative 0 relative to each other instead of NaN.
     """
     if square.shape[-1] > 3 or jnp.iscomplexobj(square):
-        values, vectors = jnp.linalg.eigh(square)  # a plain tuple, since a derivative rule cannot return a named pair
+        values, vectors = jnp.linalg.eigh(square)  # a plain tuple, because a derivative rule cannot return a named pair
         return values, vectors
     return _small_modes(square)
 

@@ -49,7 +49,7 @@ _FORMS = _forms()
 
 
 def steps_for(radians: Array) -> Array:
-    """Number of steps for the given radians of the fastest oscillation; decay of any rate needs no more."""
+    """Number of steps for the given phase of the fastest oscillation, rad. Decay of any rate does not need more steps."""
     return jnp.ceil(radians / _PHASE).astype(int)
 
 

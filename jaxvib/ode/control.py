@@ -76,7 +76,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         return optimistix.rms_norm
 
     def wrap(self, direction: IntScalarLike) -> PIController:
-        """Return the controller itself, since time runs forward only."""
+        """Return the controller itself, because time runs forward only."""
         return self
 
     def init(

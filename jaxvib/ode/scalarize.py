@@ -78,7 +78,7 @@ def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array])
     Sines and cosines are those of `jaxvib.numerics.sincos`. Products with zeros that are constants of the program are omitted.
 
     **Raises** `NotScalarizable` if an operation of the program has no rule on scalars, here or at a call of the returned
-    function. There is no rule for functions with a custom derivative (`jax.custom_jvp`), since the derivative would be lost.
+    function. There is no rule for functions with a custom derivative (`jax.custom_jvp`), because the derivative would be lost.
 
     >>> import jax.numpy as jnp, numpy as np
     >>> on_scalars = scalarize(lambda x: x[0] * jnp.ones(2) + x, jnp.zeros(2))
@@ -131,8 +131,8 @@ def scalar_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
 def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
     """Return `scalar_program`, or None for a program that has no such form.
 
-    There is none if an operation has no rule on scalars, if there are too many operations, or if this version of JAX does not
-    give access to its programs.
+    There is no such form if an operation has no rule on scalars, if there are too many operations, or if this version of JAX
+    does not give access to its programs.
     """
     if not HAS_JAXPRS:
         return None

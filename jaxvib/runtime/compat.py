@@ -98,7 +98,7 @@ Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
 def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
     """Return the single operation of a function of arguments like `like`, with new variables."""
     shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (x.aval for x in like)]
-    # A new lambda, since JAX returns the cached program with the same variables if the function is the same.
+    # A new lambda, because JAX returns the cached program with the same variables if the function is the same.
     (equation,) = jax.make_jaxpr(lambda *x: function(*x))(*shapes).jaxpr.eqns
     return equation
 
@@ -159,7 +159,7 @@ def _includes_file(filename: str) -> bool:
 def backend_started() -> bool:
     """Return True if JAX has started a backend, after which compiler flags have no effect; False if that is unknown.
 
-    A private attribute is necessary, since the public functions of JAX start a backend.
+    A private attribute is necessary, because the public functions of JAX start a backend.
     """
     return bool(getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", None))
 

@@ -82,8 +82,8 @@ def take_a_device() -> None:
 def _place() -> int:
     """Return the index of this process among the workers on this machine that see the same accelerators.
 
-    A process holds an index by the lock of a file. The system releases the lock when the process ends for any reason, and the
-    worker that replaces it gets its index and thereby its accelerator.
+    A process reserves an index by locking a file. The system releases the lock when the process ends for any reason; the
+    worker that replaces it then gets the same index and accelerator.
     """
     import fcntl  # does not exist on Windows, where JAX has no accelerators
 

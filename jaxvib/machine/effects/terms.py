@@ -42,7 +42,7 @@ class GravityField:
 @final
 @dataclass(frozen=True)
 class LoadPotential:
-    """Potential energy of each load as a function of its own position.
+    """Potential energy of each load as a function of the position of this load.
 
     The energy is a single-valued function of the position. Its mean torque over a turn is therefore 0.
 

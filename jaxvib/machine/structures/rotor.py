@@ -136,8 +136,8 @@ def rotor(
         A theta'' + C w psi' + b2 y' + b3 theta' + c2 y + c3 theta = moments
         c1 = k1 + k2,    c2 = k1 L1 + k2 L2,    c3 = k1 L1^2 + k2 L2^2
 
-    The same holds for z and psi, see `Rotor`, and for b1, b2, b3. w is the rotor speed; L1 and L2 are the positions of the
-    supports with their signs.
+    The equations of z and psi (see `Rotor`) and the expressions of b1, b2, b3 are analogous. w is the rotor speed; L1 and L2
+    are the positions of the supports with their signs.
 
     **Arguments** (SI, or strings with a unit)
 

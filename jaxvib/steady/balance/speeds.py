@@ -36,7 +36,7 @@ _GRID_POINTS = 24
 class CriterionStatus(eqx.Enumeration):
     """Outcome of the criterion for a machine. The value of each member is the message shown to the user."""
 
-    judged = "stability was decided at every rotor speed"
+    decided = "stability was decided at every rotor speed"
     free = "no support resists one of the motions of the machine: its lowest resonance is 0, and it can drift"
     not_finite = "the speeds could not be computed: a parameter of the scene is not allowed or exceeds the precision"
 
@@ -70,7 +70,7 @@ class CharacteristicSpeeds(Result):
         Every machine has a first resonance, with damping and without, and finite shapes; other speeds may be absent.
         """
         there = jnp.isfinite(self.resonances[0]) & jnp.isfinite(self.damped_resonances[0]) & jnp.all(jnp.isfinite(self.shapes))
-        status = CriterionStatus.where(self.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.judged)
+        status = CriterionStatus.where(self.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.decided)
         return CriterionStatus.where(there, status, CriterionStatus.not_finite)
 
     def labelled(self, *, damped: bool = False) -> list[tuple[str, float]]:
@@ -183,14 +183,14 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
     gyroscopic = model.mount.gyroscopic
     if gyroscopic is None:
         square, inverse = relative_to(model.mass, carrier.stiffness)
-        values, vectors, held = _free_and_fixed_modes(square, inverse @ direction)
-        resonances, additional = root_or_zero(values), root_or_zero(held)
+        values, vectors, fixed = _free_and_fixed_modes(square, inverse @ direction)
+        resonances, additional = root_or_zero(values), root_or_zero(fixed)
         shapes = inverse.T @ vectors
     else:
-        # The metric is K, since M_S - i G is not positive definite for a large polar moment, and a resonance is missing.
+        # The metric is K, because M_S - i G is not positive definite for a large polar moment, and a resonance is missing.
         square, inverse = relative_to(carrier.stiffness, model.mass - 1j * gyroscopic)
-        values, vectors, held = _free_and_fixed_modes(square, inverse @ direction)
-        resonances, additional = _inverse_root(values)[::-1], _inverse_root(held)[::-1]
+        values, vectors, fixed = _free_and_fixed_modes(square, inverse @ direction)
+        resonances, additional = _inverse_root(values)[::-1], _inverse_root(fixed)[::-1]
         shapes = inverse.T @ vectors[:, ::-1] * jnp.where(jnp.isnan(resonances), 0.0, resonances)[None, :]
     changes = _sign_changes(model, direction, resonances, additional, shapes)
     found = CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
@@ -240,10 +240,10 @@ def _free_and_fixed_modes(square: Array, c: Array) -> tuple[Array, Array, Array]
     mirror = c.at[0].add(phase * jnp.sqrt(jnp.sum((c * c.conj()).real)))
     length = jnp.sum((mirror * mirror.conj()).real)
     reflect = jnp.eye(c.shape[0], dtype=c.dtype) - 2.0 * jnp.outer(mirror, mirror.conj()) / length
-    held = (reflect @ square @ reflect).at[0, :].set(0.0).at[:, 0].set(0.0)
+    fixed = (reflect @ square @ reflect).at[0, :].set(0.0).at[:, 0].set(0.0)
     # One call for both problems; the direction of the port gets an eigenvalue above all others.
-    held = held.at[0, 0].set(2.0 * jnp.sqrt(jnp.sum(jnp.abs(jax.lax.stop_gradient(square)) ** 2)))
-    values, vectors = hermitian_modes(jnp.stack([square.astype(held.dtype), held]))
+    fixed = fixed.at[0, 0].set(2.0 * jnp.sqrt(jnp.sum(jnp.abs(jax.lax.stop_gradient(square)) ** 2)))
+    values, vectors = hermitian_modes(jnp.stack([square.astype(fixed.dtype), fixed]))
     return values[0], vectors[0], values[1, :-1]
 
 
@@ -258,7 +258,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     smooth = 1j * last**2 / participation * jnp.outer(b, b.conj())
 
     def functional(m: LinearModel, w: Array) -> Array:
-        # A small damping is added, since a mode without damping that never moves the port gives 0/0 at its resonance.
+        # A small damping is added, because a mode without damping that never moves the port gives 0/0 at its resonance.
         matrix = m.dynamic_stiffness(w) + 2j * w * trace * frozen.mass + smooth
         return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
 

@@ -111,7 +111,7 @@ class BalancedStates(Result):
         return balanced_intervals(self.scene, low, high, self._angles_of(arrangement), points=points, steps=steps)
 
     def _angles_of(self, arrangement: int) -> np.ndarray:
-        """Return the angles of an arrangement. **Raises** `ComputationError` if there is none."""
+        """Return the angles of an arrangement. **Raises** `ComputationError` if there is no arrangement."""
         if not len(self.angles):
             raise failure(self.status)
         if not 0 <= arrangement < len(self.angles):

@@ -236,7 +236,7 @@ def jam_modes(scene: Scene) -> JamModes:
     Resonances whose distance is smaller than their bandwidth have one common peak of the branch and one pair of modes, with
     the number of the resonance nearest to the peak; the status of the other modes is `absent`.
 
-    **Returns** `JamModes`; derivatives of every number with respect to every parameter of the scene are exact (implicit
+    **Returns** `JamModes`; derivatives of every field with respect to every parameter of the scene are exact (implicit
     function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
 
     **Raises** `InputError` for

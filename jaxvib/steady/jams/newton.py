@@ -66,7 +66,7 @@ def damped_newton(
 
     one = np.eye(start.shape[0], dtype=start.dtype)
     nothing = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(balance, start, given)[1])
-    # The first iteration only evaluates the residuals at the start, since the initial residual is infinite.
+    # The first iteration only evaluates the residuals at the start, because the initial residual is infinite.
     inf, tenth = jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0.1, start.dtype)
     begin = start, nothing, jnp.zeros_like(start), inf, jnp.asarray(one), tenth
     leaves, structure = jax.tree.flatten(begin)

@@ -281,8 +281,8 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
 
 
 @cached
-def _follow_pattern(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Array, ...]:
-    """Return phases at load speeds (n,), each computed from the previous ones, or from `phase` if `anew` (n,) is True."""
+def _follow_pattern(scene: Scene, phase: Array, omega: Array, restart: Array) -> tuple[Array, ...]:
+    """Return phases at load speeds (n,), each computed from the previous ones, or from `phase` if `restart` (n,) is True."""
     balance = assemble_torque_balance(scene)
 
     def step(last: Array, at: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
@@ -296,7 +296,7 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, anew: Array) -> tu
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 
-    return jax.lax.scan(step, phase, (omega, anew))[1]
+    return jax.lax.scan(step, phase, (omega, restart))[1]
 
 
 def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:

@@ -24,7 +24,7 @@ LOAD_SPEEDS = 240
 """Number of load speeds at which phases are searched, besides those near resonances."""
 
 _STEPS_PER_ROUND, _MAX_ROUNDS = 7, 6
-"""Newton steps in a round, after which converged phases are left out, and number of rounds."""
+"""Number of Newton steps in a round, at whose end converged phases are removed, and largest number of rounds."""
 
 _SPEEDS_PER_PROGRAM, _PHASES_PER_PROGRAM = 400, 2048
 """Numbers of load speeds and of sets of phases in one call of the program."""
@@ -142,19 +142,19 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
     if not good.any():
         return speeds[:1], phases[:1]
     row, size, angles = row[good], np.log(factor[good]), angles[good]
-    # The angles are in the interval from -1 to 2 pi - 1 rad, since many phases are at 0 and pi, far from its ends.
+    # The angles are in the interval from -1 to 2 pi - 1 rad, because many phases are at 0 and pi, far from its ends.
     inside = angles[:, 1:] - 2.0 * np.pi * np.floor((angles[:, 1:] + 1.0) / (2.0 * np.pi))
     once = distinct_rows(np.concatenate([row[:, None], np.rint(1e4 * size[:, None]), np.rint(1e3 * inside)], axis=1))[0]
     row, size, angles = row[once], size[once], angles[once]
     near = np.abs(size) < np.log(3.0)
 
-    held = np.tile(np.arange(row.size), 2)
-    beside = np.clip(np.concatenate([row - 1, row + 1]), 0, speeds.size - 1)
-    there, _, found = _follow_phases(balance, at_speeds, beside, angles[held])
-    passed = found & (size[held] * there < 0.0)
-    low, high, held = speeds[row[held[passed]]], speeds[beside[passed]], held[passed]
-    at, sign = angles[held], np.sign(size[held])
-    for _ in range(_CUT_COUNT if held.size else 0):
+    source = np.tile(np.arange(row.size), 2)
+    neighbour = np.clip(np.concatenate([row - 1, row + 1]), 0, speeds.size - 1)
+    there, _, found = _follow_phases(balance, at_speeds, neighbour, angles[source])
+    passed = found & (size[source] * there < 0.0)
+    low, high, source = speeds[row[source[passed]]], speeds[neighbour[passed]], source[passed]
+    at, sign = angles[source], np.sign(size[source])
+    for _ in range(_CUT_COUNT if source.size else 0):
         # All intermediate points are computed at once, which for few jams takes no longer than one of them.
         share = np.arange(1, _PARTS_PER_CUT) / _PARTS_PER_CUT
         between = low[:, None] + share * (high - low)[:, None]
@@ -162,7 +162,7 @@ def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, n
         there, turned, found = _follow_phases(balance, each, np.arange(between.size), np.repeat(at, _PARTS_PER_CUT - 1, axis=0))
         same = (found & (there * np.repeat(sign, _PARTS_PER_CUT - 1) > 0.0)).reshape(between.shape)
         cut = np.sum(np.logical_and.accumulate(same, axis=1), axis=1)
-        lane, ends = np.arange(held.size), np.concatenate([low[:, None], between, high[:, None]], axis=1)
+        lane, ends = np.arange(source.size), np.concatenate([low[:, None], between, high[:, None]], axis=1)
         turned = np.concatenate([at[:, None], turned.reshape(*between.shape, -1)], axis=1)
         low, high, at = ends[lane, cut], ends[lane, cut + 1], turned[lane, cut]
     every = np.concatenate([angles[near], at])
@@ -232,8 +232,8 @@ def _solve_phases(balance: TorqueBalance, at: AtSpeed, row: np.ndarray, phase: n
         found = in_chunks(_PHASES_PER_PROGRAM, _newton_round, row[left], phase[left], shared=(balance, at))
         factor[left], phase[left], residual[left] = found
         # Three quarters of the digits must have converged: near a double solution, a residual with half of the digits is
-        # possible for phases far from both. At the end half of the digits is accepted, since solutions that form a curve reach
-        # no smaller residual.
+        # possible for phases far from both. At the end half of the digits is accepted, because solutions that form a curve
+        # reach no smaller residual.
         left = left[~(residual[left] < eps**0.75)]
         if left.size == 0:
             break

@@ -374,7 +374,7 @@ def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSo
     """Return the smallest mean torque over a period, N m, with which a load pushes the next one; the loads lie side by side.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The criterion is
-    the mean, since no vibration of a jam presses the loads together at every instant.
+    the mean, because no vibration of a jam presses the loads together at every instant.
     """
     loads = model.loads
     if loads.ball_radius is None or loads.count == 1:
@@ -404,7 +404,7 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
         np.asarray(orders, harmonics.real.dtype),
     )
     angles = k * (starts[:, None] + width * places)[..., None]
-    # Real and imaginary parts are in one real array, since products of complex numbers take four times as long.
+    # Real and imaginary parts are in one real array, because products of complex numbers take four times as long.
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
     both, none = jnp.concatenate([harmonics.real, harmonics.imag]), np.zeros((k.size, k.size), k.dtype)
     slope, fixed = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)

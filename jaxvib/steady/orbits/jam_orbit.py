@@ -73,7 +73,7 @@ def jam_orbit(
     - `omega`: load speed of the motion, rad/s or text; the rotor speed is a result, and that of the scene is not used
     - `near`: load speed, rad/s or text, from which a motion at the scene's rotor speed is searched for
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-9 (the default; in
-      single precision 1e-3). A smaller value costs little, since the error falls exponentially with the number of harmonics
+      single precision 1e-3). A smaller value costs little, because the error falls exponentially with the number of harmonics
     - `points`: a fixed number of collocation points (on half a period without gravity, otherwise on a period) in place of an
       accuracy; typical: 12 to 32. The time grows at least with the square of this number. Under `jit` and `vmap` the values
       that decide on this number are not known; the default is then 16 (33), and the status shows if it is too small
@@ -111,7 +111,7 @@ def jam_orbit(
 
 
 def _solve_accurately(plan: OrbitPlan) -> Orbit:
-    """Return the first orbit that is accurate enough, or the best one, since more points only add rounding near a fold."""
+    """Return the first orbit that is accurate enough, or the best one, because more points only add rounding near a fold."""
     best, least = None, math.inf
     for points in plan.points:
         orbit = _solve(plan, points)

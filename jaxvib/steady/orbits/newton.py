@@ -63,7 +63,7 @@ def newton(
         stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, done=stalled, stalled=stalled)
         return jax.tree.map(lambda a, b: jnp.where(norm < now.norm, a, b), then, stay)
 
-    # The first iteration only evaluates the residuals at the start, since the initial norm is infinite.
+    # The first iteration only evaluates the residuals at the start, because the initial norm is infinite.
     begin = _NewtonState(jnp.asarray(-1), start, jnp.inf * one, one, change, one, no, no)
     end = jax.lax.while_loop(lambda now: (now.steps < _MAX_NEWTON_STEPS) & ~now.done, step, begin)
     return move(end.unknowns, jnp.where(end.done & ~end.stalled, end.change, 0.0), end.length)

@@ -325,7 +325,7 @@ def _implicit_transition(
     steps: int | Array,
 ) -> tuple[Array, ...]:
     """Return the transition matrices of `_explicit_transition`, by implicit steps."""
-    # One solve for all equations, since its program is as large as the rest of the step.
+    # One solve for all equations, because its program is as large as the rest of the step.
     total, orbits, dtype = sum(sizes), equations.omega.shape[0], equations.omega.dtype
 
     def step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -357,7 +357,7 @@ def _integrate(
 ) -> tuple[Array, ...]:
     """Return the state after `steps` steps from `begin`, each with the coefficients at its `nodes`."""
     places = jnp.asarray(nodes, dtype=equations.omega.dtype)
-    # exp(i k theta) is updated by a product in each step, since sines and cosines at every node took a quarter of the time.
+    # exp(i k theta) is updated by a product in each step, because sines and cosines at every node took a quarter of the time.
     every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
     at_nodes, turning = _derivatives(every, 3, harmonics.deviation) * _wave(every, places * h), _wave(every, h[None])
 
@@ -409,8 +409,8 @@ def _small_solve(weight: Array, right: Array) -> Array:
 
 
 def _eigenvalues(matrices: Array) -> Array:
-    """Return eigenvalues (P, n) of matrices (P, n, n), one matrix after the other, since batched library calls may deadlock if
-    several programs run in parallel (jaxlib 0.10)."""
+    """Return eigenvalues (P, n) of matrices (P, n, n), one matrix after the other, because batched library calls may deadlock
+    if several programs run in parallel (jaxlib 0.10)."""
     return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
 
 

@@ -76,7 +76,7 @@ class RegimeSearchStatus(eqx.Enumeration):
 
 
 class AbstractSynchronousRegime(Result):
-    """Synchronous regimes, one or several; NaN if there is none.
+    """Synchronous regimes, one or several; values are NaN if there is no regime.
 
         angle of mass k in the fixed frame: direction_k (Omega t + phases_k),       q = Re(displacement exp(i Omega t))
 

@@ -346,7 +346,7 @@ def test_the_criterion_is_for_several_loads_that_nothing_pulls():
         asked(1)
     with pytest.raises(jv.InputError, match=r"effects\.gravity acts on each load separately.*\(term LoadPotential\)"):
         asked(2, jv.Gravity())
-    assert asked(2, jv.LoadContact(1e5)).status_name == "judged"
+    assert asked(2, jv.LoadContact(1e5)).status_name == "decided"
 
 
 @pytest.mark.parametrize("place", [lambda s: s.machine.mass, lambda s: s.machine.stiffness])
@@ -361,7 +361,7 @@ def test_numbers_that_are_not_finite_are_not_judged(place):
 
     good = place(scene)
     statuses = [status_name(jax.jit(judged)(x)) for x in (good, -good, good * jnp.inf)]
-    assert statuses == ["judged", "not_finite", "not_finite"]
+    assert statuses == ["decided", "not_finite", "not_finite"]
 
 
 @pytest.mark.parametrize("steps", [-1, 0, 1, 2.5])

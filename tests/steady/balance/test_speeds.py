@@ -17,11 +17,11 @@ def test_modes_are_those_of_the_full_and_the_pinned_matrix(port):
     random = np.random.default_rng(0)
     a = random.normal(size=(4, 4)) + (1j * random.normal(size=(4, 4)) if np.iscomplexobj(np.asarray(port)) else 0.0)
     square, c = a @ a.conj().T, np.asarray(port)
-    values, vectors, held = _free_and_fixed_modes(jnp.asarray(square), jnp.asarray(c))
+    values, vectors, fixed = _free_and_fixed_modes(jnp.asarray(square), jnp.asarray(c))
     np.testing.assert_allclose(values, np.linalg.eigvalsh(square), rtol=1e-10)
     np.testing.assert_allclose(square @ np.asarray(vectors), np.asarray(vectors) * np.asarray(values), atol=1e-9)
     basis = scipy.linalg.null_space(c.conj()[None])
-    np.testing.assert_allclose(held, np.linalg.eigvalsh(basis.conj().T @ square @ basis), rtol=1e-9)
+    np.testing.assert_allclose(fixed, np.linalg.eigvalsh(basis.conj().T @ square @ basis), rtol=1e-9)
 
 
 def test_roots_of_nothing_are_nan():
