@@ -1,4 +1,4 @@
-"""Charts of a recording, and of a record and the model fitted to it."""
+"""Charts of recordings, and of records and the models fitted to them."""
 
 from __future__ import annotations
 
@@ -74,3 +74,30 @@ def _extremes(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     high = np.max(parts, axis=1, where=np.isfinite(parts), initial=-np.inf)
     pairs = np.stack([low, high], axis=1).ravel()
     return np.repeat(time[:count:size], 2), np.where(np.isfinite(pairs), pairs, np.nan)
+
+
+def fit_chart(
+    time: np.ndarray, readings: np.ndarray, fitted: np.ndarray, noise: np.ndarray, names: Sequence[str], *, ax: Onto = None
+) -> Drawn:
+    """Draw the readings of channels and their fit over time, and the residuals relative to their noise in a second panel.
+
+    `time` (n,) is in s, `readings` and `fitted` (n, C) are in SI units, `noise` (C,) is that of the channels `names`.
+
+    >>> import numpy as np
+    >>> len(fit_chart(np.arange(3.0), np.zeros((3, 1)), np.ones((3, 1)), np.ones(1), ["frame"]).axes)
+    2
+    """
+    figure, (top, bottom) = panels(2, size=(9.0, 2.8), share_x=True, ax=ax)
+    for k, name in enumerate(names):
+        color = COLORS[k % len(COLORS)]
+        top.plot(time, readings[:, k], ".", color=color, ms=1.5, alpha=0.5)
+        top.plot(time, fitted[:, k], color=color, lw=0.8, label=name)
+        bottom.plot(time, (readings[:, k] - fitted[:, k]) / max(float(noise[k]), 1e-300), ".", color=color, ms=1.5)
+    legend_above(top)
+    top.set_ylabel("reading, SI units")
+    for sign in (-2.0, 2.0):
+        bottom.axhline(sign, color=GUIDE, lw=0.9, ls=":", label="twice the noise" if sign > 0.0 else None)
+    legend_above(bottom)
+    bottom.set_ylabel("(reading - fit) / noise")
+    bottom.set_xlabel("time, s")
+    return figure if ax is None else ax

@@ -14,7 +14,7 @@ from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
     from jaxvib.machine.files import Tables
-    from jaxvib.study.bearing.decrement import Estimate
+    from jaxvib.results.estimate import Estimate
 
 Command = TypeVar("Command", bound=Callable)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError
+from jaxvib.results.estimate import Estimate, interval
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
@@ -27,19 +28,6 @@ _LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
 _MAX_AMPLITUDE = np.pi / 2.0
 """Amplitude, rad, beyond which the error of the arcs fitted to the turning points is unknown. With 25 samples a second and
 weak friction this error changed mu1 by 0.4 to 0.9 percent, up to three times the interval that follows from the noise."""
-
-
-class Estimate(NamedTuple):
-    """Measured number with its uncertainty.
-
-    **Attributes**: its `value`; its standard `error` from the record's noise; `low` and `high`: its confidence interval of
-    95 %, which includes the error of the instruments.
-    """
-
-    value: float
-    error: float
-    low: float
-    high: float
 
 
 class TurningPoints(NamedTuple):
@@ -302,10 +290,3 @@ def _slope(amplitude: np.ndarray) -> np.ndarray:
     safe = np.maximum(m, 1e-6)
     exact = np.sin(amplitude) / (4.0 * (ellipe(safe) / ellipk(safe) - 1.0 + safe))
     return np.where(m < 1e-6, 2.0 / amplitude - 5.0 * amplitude / 48.0, exact)
-
-
-def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
-    """Return an estimate with its interval; its half-width is the root of the sum of the squares of the errors of noise and
-    instruments."""
-    half = float(np.hypot(quantile * error, instrument * value))
-    return Estimate(value, error, value - half, value + half)

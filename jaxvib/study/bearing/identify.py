@@ -14,13 +14,12 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.results.estimate import Estimate, interval, shown, student_quantile
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.study.bearing.decrement import (
     Decrement,
-    Estimate,
     TurningPoints,
-    interval,
     ten_periods,
     turning_points,
 )
@@ -56,7 +55,7 @@ class IdentifyStatus(eqx.Enumeration):
 class Identified(Result):
     """Friction of a bearing, with its uncertainty.
 
-    Returned by `identify`.
+    Returned by `identify` for a `BearingPendulum`.
 
     **Attributes**
 
@@ -121,13 +120,7 @@ class Identified(Result):
         return record_chart(self.record.time, self.record.angle, self.fitted, self.noise, ax=ax)
 
 
-def shown(estimate: Estimate) -> str:
-    """Return an estimate as text: value and half-width of its 95 % interval."""
-    return f"{estimate.value:.5g} ± {(estimate.high - estimate.low) / 2.0:.2g}"
-
-
-@validated
-def identify(
+def identify_bearing(
     pendulum: BearingPendulum, record: Record, *, dry: bool = False, instrument: float = 0.0, throw: bool = True
 ) -> Identified:
     """Return mu1, or mu1 and mu2, of a bearing from a whole recorded swing.
@@ -153,21 +146,8 @@ def identify(
 
     **Returns** `Identified`. **Raises** `InputError` for a record that cannot be fitted, `ComputationError` "not_converged".
 
-    >>> import numpy as np, jaxvib as jv
-    >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
-    >>> t = np.arange(0.0, 15.0, 0.04)
-    >>> run = jv.swing(rod, t, angle="25 deg", viscous=1.5e-3)
-    >>> noisy = run.angle + 0.002 * np.random.default_rng(0).normal(size=t.size)
-    >>> found = jv.identify(rod, jv.Record(t, noisy))
-    >>> found.viscous.low < 1.5e-3 < found.viscous.high, found.viscous.error < 1e-5
-    (True, True)
-
     Source: Artyunin, Sumenkov 2019, who read mu1 off two amplitudes; the fit to the whole record is ours.
     """
-    if not isinstance(record, Record):
-        raise InputError("record", f"is {type(record).__name__}; it must be a Record(time, angle) or come from read_record")
-    if not isinstance(pendulum, BearingPendulum):
-        raise InputError("pendulum", f"is {quoted(pendulum)}; it must be a BearingPendulum(mass=..., length=...)")
     if dry and pendulum.bearing is None:
         raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
     if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
@@ -315,14 +295,3 @@ def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: 
     explained = float(np.sum((basis.T @ left) ** 2))
     statistic = explained / known / ((float(np.sum(left**2)) - explained) / free)
     return statistic, float(fdtrc(known, free, statistic))
-
-
-def student_quantile(freedom: int) -> float:
-    """Return the 97.5 % quantile of Student's t by its series in 1/freedom; the error is below 1e-4 from 10 degrees of freedom.
-
-    >>> round(student_quantile(10), 3), round(student_quantile(1000), 3)
-    (2.228, 1.962)
-    """
-    z = 1.959963985
-    terms = (z**3 + z, (5 * z**5 + 16 * z**3 + 3 * z) / 24, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 96)
-    return z + sum(term / (4.0 * freedom ** (k + 1)) for k, term in enumerate(terms))

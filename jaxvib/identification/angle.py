@@ -1,0 +1,167 @@
+"""Angle of a rotor over time from the channels of a run: the pulses of a tachometer, an angle, a speed, or the drive's schedule.
+
+Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots, whose number has the smallest Bayesian
+information criterion. Its second derivative, which the force of an unbalance needs, is smooth. Marks of a wheel that are
+unevenly spaced have one unknown offset each.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.identification.run import Channel, MeasuredRun
+from jaxvib.machine.drive import Drive
+from jaxvib.machine.scene import Exciter, Scene
+
+_DEGREE = 5
+_MIN_PULSES = 12
+"""Number of pulses below which the angle between them is unknown."""
+
+_MAX_INTERVALS = 512
+"""Largest number of intervals of a spline."""
+
+_COARSE = 0.1
+"""Relative change of the speed between two pulses above which the angle between them is uncertain."""
+
+
+class RotorAngle(NamedTuple):
+    """Angle of a rotor over time.
+
+    **Attributes**
+
+    - `spline` of the angle over time; None if the angle follows from the `drive`
+    - `drive`: drive of prescribed speed, None with a spline
+    - `span`, s, in which the angle is known
+    - `marked`: True if the zero of the angle is a mark on the rotor, the same in all runs
+    - `error`, rad: largest standard error of the angle in the span
+    - `notes`: sentences for the reader
+    """
+
+    spline: object | None
+    drive: Drive | None
+    span: tuple[float, float]
+    marked: bool
+    error: float
+    notes: tuple[str, ...]
+
+    def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the angle (rad), the speed (rad/s) and the acceleration (rad/s^2) at times of any shape."""
+        if self.drive is not None:
+            drive, flat = self.drive, np.ravel(time)
+            functions = (lambda t: drive.rotor_angle(t, None), lambda t: drive.rotor_speed(t, None), drive.rotor_acceleration)
+            angle, speed, acceleration = (np.asarray(jax.vmap(f)(flat), dtype=float).reshape(time.shape) for f in functions)
+            return angle, speed, acceleration
+        spline = self.spline
+        return tuple(spline(time, nu) for nu in range(3))  # pyright: ignore[reportReturnType, reportOptionalCall, reportCallIssue]
+
+
+def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
+    """Return the angle of the rotor of each exciter in a run, in its direction of rotation.
+
+    Channels of pulses, angle or speed describe the rotor of the only exciter. Without them the drives must prescribe the angle.
+
+    **Raises** `InputError` for a motor without such a channel, and for too few pulses.
+    """
+    channels = run.of_kind("pulses", "angle", "speed")
+    if channels and len(scene.exciters) > 1:
+        raise InputError(
+            run.source,
+            f"has the {channels[0].kind} of one rotor, but the scene has {len(scene.exciters)} exciters; "
+            "identify needs a scene with one exciter for such a channel, or drives of prescribed speed without it",
+        )
+    if channels:
+        return [_measured(run, min(channels, key=lambda each: ("pulses", "angle", "speed").index(each.kind)))]
+    return [_prescribed(scene, k, exciter, run) for k, exciter in enumerate(scene.exciters)]
+
+
+def _prescribed(scene: Scene, k: int, exciter: Exciter, run: MeasuredRun) -> RotorAngle:
+    if not exciter.drive.ideal:
+        raise InputError(
+            run.source,
+            f"has no channel of the rotor's angle, and {scene.place_of(k)}drive is {exciter.drive.kind!r}, whose speed depends "
+            "on the machine; add a channel of kind pulses, angle or speed",
+        )
+    return RotorAngle(None, exciter.drive, (-math.inf, math.inf), False, 0.0, ())
+
+
+def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
+    time, value = np.asarray(run.times[channel.name], float), np.asarray(run.values[channel.name], float)
+    time, value = time[np.isfinite(value)], value[np.isfinite(value)]
+    where = f"{run.source}: channel {channel.name!r}"
+    if time.size < _MIN_PULSES:
+        raise InputError(where, f"has {time.size} {channel.kind}; at least {_MIN_PULSES} are needed, record more turns")
+    time = time - channel.delay
+    if channel.kind == "speed":
+        spline, error = fit_spline(time, np.abs(value))
+        rough = spline.antiderivative()
+        # The error of an integral of independent errors of the speed.
+        return RotorAngle(rough, None, (time[0], time[-1]), False, error * math.sqrt((time[-1] - time[0]) * _step(time)), ())
+    marks = value.astype(int) % channel.per_turn if channel.kind == "pulses" and channel.per_turn > 1 else None
+    angle = 2.0 * np.pi * value / channel.per_turn if channel.kind == "pulses" else value * np.sign(value[-1] - value[0])
+    spline, error = fit_spline(time, angle, marks)
+    notes = []
+    if channel.kind == "pulses":
+        speed = spline(0.5 * (time[1:] + time[:-1]), 1)
+        change = float(np.max(np.abs(np.diff(speed)) / np.maximum(np.abs(speed[1:]), 1e-9)))
+        if change > _COARSE:
+            notes.append(
+                f"{where}: the speed changes by up to {change:.0%} from one pulse to the next, and the angle between them is "
+                "uncertain; use more pulses per turn"
+            )
+    return RotorAngle(spline, None, (time[0], time[-1]), True, error, tuple(notes))
+
+
+def _step(time: np.ndarray) -> float:
+    return float(np.median(np.diff(time)))
+
+
+def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None):
+    """Return a spline of degree 5 through noisy values, and its largest standard error.
+
+    **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): the number of a value's mark, each with an unknown
+    offset (0 on average).
+
+    >>> t = np.linspace(0.0, 2.0, 200)
+    >>> spline, error = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
+    >>> bool(abs(spline(1.0, 2) - 60.0) < 0.1), bool(2e-4 < error < 2e-3)
+    (True, True)
+    """
+    from scipy.interpolate import BSpline  # slow to import
+
+    n, best = time.size, None
+    offsets = np.zeros((n, 0))
+    if marks is not None:
+        kinds = int(marks.max()) + 1
+        offsets = np.eye(kinds)[marks][:, 1:] - np.eye(kinds)[marks][:, :1]
+    intervals = 1
+    while intervals <= min(_MAX_INTERVALS, n // 4):
+        inner = np.linspace(time[0], time[-1], intervals + 1)
+        knots = np.concatenate([[time[0]] * _DEGREE, inner, [time[-1]] * _DEGREE])
+        basis = BSpline.design_matrix(time, knots, _DEGREE)
+        count = basis.shape[1] + offsets.shape[1]
+        square = np.zeros((count, count))
+        size = basis.shape[1]
+        square[:size, :size] = (basis.T @ basis).toarray()
+        square[:size, size:] = basis.T @ offsets
+        square[size:, :size] = square[:size, size:].T
+        square[size:, size:] = offsets.T @ offsets
+        right = np.concatenate([basis.T @ value, offsets.T @ value])
+        square[np.diag_indices(count)] += 1e-12 * np.trace(square) / count  # intervals without a value
+        inverse = np.linalg.inv(square)
+        found = inverse @ right
+        found += inverse @ (right - square @ found)
+        left = value - basis @ found[:size] - offsets @ found[size:]
+        variance = float(left @ left) / max(n - count, 1)
+        criterion = n * math.log(max(float(left @ left) / n, 1e-26)) + count * math.log(n)
+        if best is None or criterion < best[0]:
+            at = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * intervals + 1), knots, _DEGREE)
+            spread = np.max(np.einsum("ij,jk,ik->i", at.toarray(), inverse[:size, :size], at.toarray()))
+            best = criterion, BSpline(knots, found[:size], _DEGREE), math.sqrt(variance * float(spread))
+        intervals = max(intervals + 1, int(1.4 * intervals))
+    assert best is not None
+    return best[1], best[2]

@@ -1,0 +1,177 @@
+"""Information of the records about the numbers of a scene: covariance, and directions that the records do not determine.
+
+The numbers are compared on a logarithmic scale (numbers of either sign: relative to their size). A direction is a combination of
+relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix, in which all other unknowns are eliminated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxvib.identification.fit import Fitted
+
+UNDETERMINED = 1.0
+"""Relative standard error of a direction above which it counts as undetermined: a factor of e."""
+
+_SHARE = 0.05
+"""Share of a number in an undetermined direction above which the number itself counts as undetermined."""
+
+_COMMON = 0.95
+"""Part of the common factor within the undetermined directions above which it counts as undetermined itself."""
+
+_ADVICE = "give one of them in kg or N as known, or record a run with a known mass added"
+
+
+class Direction(NamedTuple):
+    """Combination of numbers that the records do not determine.
+
+    **Attributes**: its `sentence`; `names` of the numbers, and their relative changes `weights`, a vector of length 1; its relative
+    standard `error`.
+    """
+
+    sentence: str
+    names: tuple[str, ...]
+    weights: tuple[float, ...]
+    error: float
+
+
+class Information(NamedTuple):
+    """Information about the numbers of a scene (k,), and about the gains.
+
+    **Attributes**
+
+    - `names` (k,) of the numbers, `values` SI, `scale` (k,): change of the number per unit of its coordinate; `logarithmic` (k,)
+    - `covariance` (k, k) of the coordinates in the determined directions
+    - `undetermined`: directions (k, u); `errors` (u,) of them
+    - `determined` (k,): False for numbers that take part in an undetermined direction
+    - `by_gain`: directions (k, g) that only the known errors of the sensors' gains determine, and their errors
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    scale: np.ndarray
+    logarithmic: np.ndarray
+    covariance: np.ndarray
+    undetermined: np.ndarray
+    errors: np.ndarray
+    determined: np.ndarray
+    by_gain: np.ndarray
+    by_gain_errors: np.ndarray
+
+
+def information_of(fitted: Fitted) -> Information:
+    """Return the information of a fit about the numbers of its scene; see `Information`."""
+    problem = fitted.problem
+    unknowns, p = problem.unknowns, fitted.x.size
+    moved = len(unknowns.numbers)
+    data, prior, sizes = in_polar_unbalances(fitted)
+    free = [k for k, known in enumerate(problem.unbalances) if known is None or known.error > 1.001e-4 * known.value]
+    own = np.array([*range(moved), *(p + 2 * k for k in free)], int)
+    names = (*(number.name for number in unknowns.numbers), *(f"exciters[{k}].unbalance" for k in free))
+    values = np.concatenate([np.asarray(unknowns.values(fitted.x)), sizes[free]])
+    logarithmic = np.concatenate([np.asarray(unknowns.positive), np.ones(len(free), bool)])
+    scale = np.concatenate([np.where(unknowns.positive, values[:moved], unknowns.scale), sizes[free]])
+    without_gains = prior.copy()
+    gains = np.arange(moved, moved + len(unknowns.gains))
+    without_gains[gains, gains] = 0.0
+
+    whole, loose = (eliminate(data + known, own) for known in (prior, without_gains))
+    errors, axes = _errors(whole)
+    lost = errors > UNDETERMINED
+    covariance = (axes[:, ~lost] * errors[~lost] ** 2) @ axes[:, ~lost].T
+    undetermined = axes[:, lost]
+    determined = ~np.any(np.abs(undetermined) > _SHARE, axis=1)
+    loose_errors, loose_axes = _errors(loose)
+    by_gain = loose_axes[:, loose_errors > UNDETERMINED]
+    # Directions that nothing determines are left out of those that the gains determine.
+    by_gain = by_gain - undetermined @ (undetermined.T @ by_gain)
+    basis, sizes_of, _ = np.linalg.svd(by_gain, full_matrices=False) if by_gain.size else (by_gain, np.zeros(0), None)
+    by_gain = basis[:, : int(np.sum(sizes_of > 0.5))]
+    by_gain_errors = np.sqrt(np.einsum("ku,kl,lu->u", by_gain, covariance, by_gain))
+    return Information(
+        names, values, scale, logarithmic, covariance, undetermined, errors[lost], determined, by_gain, by_gain_errors
+    )
+
+
+def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the information of data and of known values with each unbalance as (logarithm of its size, angle), and the sizes."""
+    p, exciters = fitted.x.size, len(fitted.problem.unbalances)
+    turn, sizes = np.eye(p + fitted.linear.size), np.zeros(exciters)
+    for k in range(exciters):
+        a, b = fitted.linear[2 * k : 2 * k + 2]
+        sizes[k] = float(np.hypot(a, b))
+        turn[p + 2 * k : p + 2 * k + 2, p + 2 * k : p + 2 * k + 2] = [[a, -b], [b, a]]
+    return turn.T @ fitted.information @ turn, turn.T @ fitted.prior @ turn, sizes
+
+
+def eliminate(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return the information about the unknowns `own` if all others are free."""
+    rest = np.setdiff1d(np.arange(matrix.shape[0]), own)
+    rest = rest[np.diagonal(matrix)[rest] > 0.0]
+    if not rest.size:
+        return matrix[np.ix_(own, own)]
+    size = np.sqrt(np.diagonal(matrix)[rest])
+    inner = matrix[np.ix_(rest, rest)] / np.outer(size, size)
+    values, vectors = np.linalg.eigh(inner)
+    kept = values > 1e-12 * values[-1]
+    coupling = (matrix[np.ix_(own, rest)] / size) @ vectors[:, kept] / np.sqrt(values[kept])
+    return matrix[np.ix_(own, own)] - coupling @ coupling.T
+
+
+def _errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the standard errors (k,) of the principal directions (k, k), the best determined last."""
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    floor = 1e-14 * max(float(values[-1]), 1e-300) if values.size else 0.0
+    return 1.0 / np.sqrt(np.maximum(values, floor)), vectors
+
+
+def directions_of(found: Information) -> tuple[tuple[Direction, ...], tuple[Direction, ...]]:
+    """Return the undetermined directions, and those that only the gains of the sensors determine, with their sentences."""
+    lost = _sentences(found, found.undetermined, found.errors, " changes no reading by more than its noise", _ADVICE)
+    gains = []
+    for direction in _sentences(found, found.by_gain, found.by_gain_errors, "", ""):
+        words = direction.sentence.rstrip(": ")
+        gains.append(
+            direction._replace(
+                sentence=f"{words} is known from the gains of the sensors only, to {direction.error:.1%}, and an error of a gain "
+                f"leaves no trace in the residuals; calibrate the sensors, or {_ADVICE}"
+            )
+        )
+    return tuple(lost), tuple(gains)
+
+
+def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect: str, advice: str) -> list[Direction]:
+    common = np.array([_in_common_factor(name) for name in found.names], float)
+    sentences = []
+    if axes.size and np.any(common):
+        common /= np.linalg.norm(common)
+        inside = axes @ (axes.T @ common)
+        if np.linalg.norm(inside) > _COMMON:
+            kinds = _kinds(found.names)
+            words = f"multiplying all {kinds} by one number{effect}: {advice}"
+            sentences.append(Direction(words, found.names, tuple(common), float(np.max(errors))))
+            axes = axes - np.outer(common, common @ axes)
+            basis, size, _ = np.linalg.svd(axes, full_matrices=False)
+            axes = basis[:, size > 0.5]
+            errors = np.full(axes.shape[1], float(np.max(errors)))
+    for axis, error in zip(axes.T, errors, strict=True):
+        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+        largest = [k for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > 0.2]
+        parts = ", ".join(f"{found.names[k]} by {axis[k]:+.2g}" for k in largest)
+        ways = "give one of these numbers as known, add a sensor at another place, or record a run through all resonances"
+        words = f"changing {parts} (relative to one another){effect}: {ways if advice else ''}"
+        sentences.append(Direction(words, found.names, tuple(axis), float(error)))
+    return sentences
+
+
+def _in_common_factor(name: str) -> bool:
+    """Return True for numbers in units of mass or force: masses, inertias, stiffnesses, dampings, unbalances."""
+    return any(word in name for word in ("mass", "inertia", "stiffness", "damping", "unbalance"))
+
+
+def _kinds(names: tuple[str, ...]) -> str:
+    words = {"mass": "masses", "inertia": "inertias", "stiffness": "stiffnesses", "damping": "dampings", "unbalance": "unbalances"}
+    there = [plural for word, plural in words.items() if any(word in name.rpartition(".")[2] for name in names)]
+    return there[0] if len(there) == 1 else ", ".join(there[:-1]) + " and " + there[-1]

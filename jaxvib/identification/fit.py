@@ -1,0 +1,239 @@
+"""Least-squares fit of a machine to recorded runs by the method of Levenberg and Marquardt with projected linear unknowns.
+
+At every trial the linear unknowns (first states, unbalances, offsets) are those of least squares. Only the other unknowns are
+damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals filtered to white noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.identification.problem import Problem, with_noise
+from jaxvib.identification.response import linear_equations, model_readings, normal_equations
+from jaxvib.numerics.noise import autoregression
+
+_MAX_ITERATIONS = 60
+_LONGEST_STEP = 0.7
+"""Largest change of the logarithm of an unknown in one step."""
+
+_CONVERGED = 1e-2
+"""Length of the next undamped step, in standard errors, below which the fit has converged."""
+
+_RIDGE = 1e-13
+"""Relative addition to the diagonal of normal equations, which keeps undetermined combinations of unknowns in place."""
+
+
+class Fitted(NamedTuple):
+    """Result of a fit.
+
+    **Attributes** (p unknowns x, L linear unknowns: the components (a, b) of each unbalance, then state and offsets of each run)
+
+    - `x` (p,), `linear` (L,), and the `problem` with its filters and weights
+    - `information` (p + L, p + L) of the data alone, `prior` (p + L, p + L) of known values
+    - `cost`: sum of the squared weighted residuals and deviations from known values; `samples` that count
+    - `residuals` (n, C) of each run, readings minus model, NaN for samples that do not count
+    - `noise` (C,) of each run: standard deviation of the residuals
+    - `converged`
+    """
+
+    x: np.ndarray
+    linear: np.ndarray
+    problem: Problem
+    information: np.ndarray
+    prior: np.ndarray
+    cost: float
+    samples: int
+    residuals: tuple[np.ndarray, ...]
+    noise: tuple[np.ndarray, ...]
+    converged: bool
+
+
+class _Trial(NamedTuple):
+    """Unknowns `x` with the best linear unknowns, their cost, and the parts of the linear unknowns in each run."""
+
+    x: np.ndarray
+    linear: np.ndarray
+    cost: float
+
+
+def _places(problem: Problem) -> list[np.ndarray]:
+    """Return, for each run, the places of its linear unknowns (state, unbalances, offsets) among all linear unknowns."""
+    exciters = len(problem.unbalances)
+    places, after = [], 2 * exciters
+    for samples in problem.runs:
+        offsets = len(samples.channels)
+        states = 2 * len(problem.scene.machine.structure().coordinates) + sum(c.high_pass > 0.0 for c in samples.channels)
+        own = np.arange(after, after + states + offsets)
+        places.append(np.concatenate([own[:states], np.arange(2 * exciters), own[states:]]))
+        after += states + offsets
+    return places
+
+
+def _linear_count(problem: Problem) -> int:
+    return int(max(place.max() for place in _places(problem))) + 1
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the solution of scaled normal equations."""
+    size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
+    scaled = matrix / np.outer(size, size) + _RIDGE * np.eye(len(size))
+    return np.linalg.solve(scaled, right / size) / size
+
+
+def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the information (L, L), the gradient (L,) and the cost of known unbalances at the linear unknowns."""
+    information, gradient, cost = np.zeros((linear.size, linear.size)), np.zeros(linear.size), 0.0
+    for k, known in enumerate(problem.unbalances):
+        if known is None:
+            continue
+        pair = linear[2 * k : 2 * k + 2]
+        size = float(np.hypot(*pair))
+        row = np.zeros(linear.size)
+        row[2 * k : 2 * k + 2] = pair / max(size, 1e-300)
+        left = (known.value - size) / known.error
+        information += np.outer(row, row) / known.error**2
+        gradient += row * left / known.error
+        cost += left**2
+    return information, gradient, cost
+
+
+def _project(problem: Problem, x: np.ndarray) -> _Trial:
+    """Return the best linear unknowns at `x`, and their cost."""
+    total = np.zeros((_linear_count(problem) + 1,) * 2)
+    for samples, place in zip(problem.runs, _places(problem), strict=True):
+        part = np.asarray(linear_equations(problem.unknowns, samples, problem.scene, jnp.asarray(x)))
+        where = np.append(place, total.shape[0] - 1)
+        total[np.ix_(where, where)] += part
+    matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
+    if not np.all(np.isfinite(total)):
+        return _Trial(x, np.zeros(len(right)), np.inf)
+    linear = _solve(matrix, right)
+    for k, known in enumerate(problem.unbalances):
+        pair = linear[2 * k : 2 * k + 2]
+        if known is not None:
+            linear[2 * k : 2 * k + 2] = pair * known.value / max(float(np.hypot(*pair)), 1e-300)
+    prior_cost = 0.0
+    if any(problem.unbalances):
+        for _ in range(8):
+            information, gradient, prior_cost = unbalance_prior(problem, linear)
+            linear = linear + _solve(matrix + information, right - matrix @ linear + gradient)
+        prior_cost = unbalance_prior(problem, linear)[2]
+    data = square - 2.0 * linear @ right + linear @ matrix @ linear
+    away = float(np.sum(problem.precisions * (x - problem.means) ** 2))
+    return _Trial(x, linear, max(float(data), 0.0) + away + prior_cost)
+
+
+def _equations(problem: Problem, trial: _Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the information of the data, that of known values, both (p + L, p + L), and the gradient (p + L,)."""
+    p, size = trial.x.size, trial.x.size + trial.linear.size
+    total = np.zeros((size + 1, size + 1))
+    for samples, place in zip(problem.runs, _places(problem), strict=True):
+        linear = jnp.asarray(trial.linear[place])
+        part = np.asarray(normal_equations(problem.unknowns, samples, problem.scene, jnp.asarray(trial.x), linear))
+        where = np.concatenate([np.arange(p), p + place, [size]])
+        total[np.ix_(where, where)] += part
+    prior, gradient = np.zeros((size, size)), total[:-1, -1].copy()
+    prior[np.arange(p), np.arange(p)] = problem.precisions
+    gradient[:p] -= problem.precisions * (trial.x - problem.means)
+    information, slope, _ = unbalance_prior(problem, trial.linear)
+    prior[p:, p:] += information
+    gradient[p:] += slope
+    return total[:-1, :-1], prior, gradient
+
+
+def _minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
+    """Return the minimum near `x`, the information of data and of known values there, and True if it was reached."""
+    best, damping = _project(problem, x), 1e-2
+    for _ in range(_MAX_ITERATIONS):
+        information, prior, gradient = _equations(problem, best)
+        matrix, p = information + prior, best.x.size
+        if not np.all(np.isfinite(matrix)):
+            return best, information, prior, False
+        undamped = _solve(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
+        if gradient @ undamped < _CONVERGED**2:
+            return best, information, prior, True
+        while True:
+            damped = matrix.copy()
+            damped[np.arange(p), np.arange(p)] += damping * (np.diagonal(matrix)[:p] + 1e-12 * np.max(np.diagonal(matrix)[:p]))
+            step = _solve(damped, gradient)[:p]
+            step *= min(1.0, _LONGEST_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-300))
+            trial = _project(problem, best.x + step)
+            if trial.cost < best.cost:
+                best, damping = trial, max(0.1 * damping, 1e-9)
+                break
+            damping *= 8.0
+            if damping > 1e8:
+                return best, information, prior, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
+    return best, *_equations(problem, best)[:2], False
+
+
+def residuals_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
+    """Return readings minus model (n, C) of each run, NaN for samples that do not count."""
+    found = []
+    for samples, place, raw, mask in zip(problem.runs, _places(problem), problem.raw, problem.masks, strict=True):
+        model = model_readings(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
+        shown = np.stack(
+            [
+                _delayed(np.asarray(model)[:, k], channel.delay / float(samples.step))
+                for k, channel in enumerate(samples.channels)
+            ],
+            axis=1,
+        )
+        found.append(np.where(mask, raw - shown, np.nan))
+    return found
+
+
+def _delayed(values: np.ndarray, delay: float) -> np.ndarray:
+    """Return values that are later by a number of steps."""
+    if delay == 0.0:
+        return values
+    from scipy.interpolate import make_interp_spline  # slow to import
+
+    place = np.arange(values.size, dtype=float)
+    return make_interp_spline(place, values, 5)(np.maximum(place - delay, 0.0))
+
+
+def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
+    """Return the fit of a problem: the best one of those from the unknowns `starts`.
+
+    The first pass weighs each channel by its own size, the next by their residuals, the last with filters to white noise.
+    """
+    white = [[np.ones(1) for _ in samples.channels] for samples in problem.runs]
+    deviations = [
+        np.array([np.std(raw[mask[:, k], k]) + 1e-300 if np.any(mask[:, k]) else 1.0 for k in range(raw.shape[1])])
+        for raw, mask in zip(problem.raw, problem.masks, strict=True)
+    ]
+    filters, is_filtered = white, False
+    for round_ in range(8):
+        problem = with_noise(problem, filters, deviations)
+        trial, information, prior, converged = min((_minimize(problem, x) for x in starts), key=lambda each: each[0].cost)
+        starts = [trial.x]
+        left = residuals_of(problem, trial.x, trial.linear)
+        models = [[autoregression(each[:, k]) for k in range(each.shape[1])] for each in left]
+        before = deviations
+        filters = [[taps for taps, _ in each] for each in models] if round_ >= 2 else white
+        is_filtered = round_ >= 3
+        deviations = [
+            np.array([deviation if round_ >= 2 else np.nanstd(each[:, k]) for k, (_, deviation) in enumerate(of_run)])
+            for each, of_run in zip(left, models, strict=True)
+        ]
+        deviations = [np.maximum(each, 1e-12 * old) for each, old in zip(deviations, before, strict=True)]
+        change = max(float(np.max(np.abs(new / old - 1.0))) for new, old in zip(deviations, before, strict=True))
+        if is_filtered and change < 0.01:
+            break
+    return Fitted(
+        x=trial.x,
+        linear=trial.linear,
+        problem=problem,
+        information=information,
+        prior=prior,
+        cost=trial.cost,
+        samples=int(sum(np.count_nonzero(np.asarray(samples.weights)) for samples in problem.runs)),
+        residuals=tuple(left),
+        noise=tuple(np.nanstd(each, axis=0) for each in left),
+        converged=converged,
+    )

@@ -1,0 +1,282 @@
+"""Identification of a machine from recorded runs, and of the friction of a bearing from a recorded swing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.identification.checks import FitStatus, status_of
+from jaxvib.identification.directions import Direction, Information, directions_of, eliminate, in_polar_unbalances, information_of
+from jaxvib.identification.fit import Fitted, fit_from
+from jaxvib.identification.problem import Problem, build_problem, natural
+from jaxvib.identification.run import MeasuredRun
+from jaxvib.identification.start import track_orders
+from jaxvib.machine.numbers.named import find_number, put_numbers
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
+from jaxvib.results.estimate import Estimate
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.study.bearing.identify import Identified, identify_bearing
+from jaxvib.study.bearing.record import Record
+from jaxvib.study.bearing.swing import BearingPendulum
+from jaxvib.units import Number
+
+if TYPE_CHECKING:
+    from jaxvib.draw.style import Drawn, Onto
+
+QUANTILE = 1.959964
+"""97.5 % quantile of the normal distribution."""
+
+
+class MachineFit(Result):
+    """Machine fitted to recorded runs.
+
+    Returned by `identify`.
+
+    **Attributes** (k numbers of the scene, m damped modes, g gains)
+
+    - `status`: a `FitStatus`
+    - `notes`: sentences with further advice for the reader
+    - `scene` with the fitted numbers
+    - `names` (k,), `units` (k,) and `estimates` (k,) of the numbers; the interval of an undetermined number is unbounded
+    - `covariance` (k, k) of the relative errors of the numbers in the determined directions
+    - `undetermined`: a `Direction` for each combination of numbers that the records do not determine
+    - `by_gain`: a `Direction` for each one that is known from the gains of the sensors only
+    - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the damped modes
+    - `gain_names` (g,) and `gains` (g,) of the channels
+    - `phase`, rad: angle of the unbalance of each exciter ahead of the zero of the rotor's angle
+    - `channels`: names of the compared channels of each run
+    - `noise`: standard deviation of the residuals of each run's channels, SI
+    - `chance` of residuals as far from noise as these
+    - `time`, s, `readings` and `fitted`, SI: arrays for each run, NaN for samples that do not count
+    """
+
+    status: FitStatus
+    notes: tuple[str, ...]
+    scene: Scene = eqx.field(metadata=SCENE)
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    estimates: tuple[Estimate, ...] = eqx.field(metadata=in_unit("", "number"))
+    covariance: np.ndarray = eqx.field(metadata=in_unit("", "number", "number_2"))
+    undetermined: tuple[Direction, ...]
+    by_gain: tuple[Direction, ...]
+    frequency: tuple[Estimate, ...] = eqx.field(metadata=in_unit("rad/s", "mode"))
+    damping_ratio: tuple[Estimate, ...] = eqx.field(metadata=in_unit("", "mode"))
+    gain_names: tuple[str, ...]
+    gains: tuple[Estimate, ...] = eqx.field(metadata=in_unit("", "gain"))
+    phase: np.ndarray = eqx.field(metadata=in_unit("rad", "exciter"))
+    channels: tuple[tuple[str, ...], ...]
+    noise: tuple[np.ndarray, ...]
+    chance: float = eqx.field(metadata=in_unit(""))
+    time: tuple[np.ndarray, ...]
+    readings: tuple[np.ndarray, ...]
+    fitted: tuple[np.ndarray, ...]
+
+    def estimate(self, name: str) -> Estimate:
+        """Return the estimate of the number `name`. **Raises** `InputError` for a number that was not unknown."""
+        if name not in self.names:
+            raise InputError("name", f"is {quoted(name)}; the unknown numbers were: {', '.join(self.names)}")
+        return self.estimates[self.names.index(name)]
+
+    def summary(self) -> str:
+        """Return the numbers with their intervals, and the sentences about them, as text."""
+        lines = [self.message]
+        for name, unit, each in zip(self.names, self.units, self.estimates, strict=True):
+            lines.append(f"{name}: {_with_interval(each)} {unit}".rstrip())
+        for k, (w, ratio) in enumerate(zip(self.frequency, self.damping_ratio, strict=True)):
+            lines.append(f"mode {k + 1}: {_with_interval(w)} rad/s, damping ratio {_with_interval(ratio)}")
+        for name, each in zip(self.gain_names, self.gains, strict=True):
+            lines.append(f"gain of channel {name}: {_with_interval(each)}")
+        for names, noise in zip(self.channels, self.noise, strict=True):
+            lines.append("noise: " + ", ".join(f"{name} {each:.3g}" for name, each in zip(names, noise, strict=True)))
+        lines += [f"not determined: {each.sentence}" for each in self.undetermined]
+        lines += [each.sentence for each in self.by_gain]
+        return "\n".join([*lines, *self.notes])
+
+    @validated
+    def plot(self, *, ax: Onto = None) -> Drawn:
+        """Plot the readings of the first run with the fit, and the residuals of its channels, onto two axes `ax` if given.
+
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
+        from jaxvib.draw.record import fit_chart  # slow import
+
+        return fit_chart(self.time[0], self.readings[0], self.fitted[0], self.noise[0], self.channels[0], ax=ax)
+
+
+def _with_interval(each: Estimate) -> str:
+    if not math.isfinite(each.error):
+        return f"not determined ({each.value:.4g} in the fit)"
+    return f"{each.value:.6g} ({each.low:.6g} to {each.high:.6g})"
+
+
+@validated
+def identify(
+    subject: Scene | BearingPendulum,
+    records: MeasuredRun | Sequence[MeasuredRun] | Record,
+    *,
+    unknown: Sequence[str] = (),
+    known: Mapping[str, Number] | None = None,
+    dry: bool = False,
+    instrument: float = 0.0,
+    throw: bool = True,
+) -> MachineFit | Identified:
+    """Return the numbers of a machine from recorded runs, or the friction of a pendulum's bearing from a recorded swing.
+
+        M q'' + C q' + K q = -S B^T p''(theta(t)),      readings = gain (motion of the sensors) + offset + noise
+
+    For a scene, the rotor's angle theta follows from the run (kind pulses, angle or speed) or from a drive of prescribed speed.
+
+    - Least squares over the whole record, transients included; the equations are integrated exactly at the samples
+    - The unknown numbers, the gains of the sensors (known to `gain_error`), the angle of the unbalance, the offsets and the motion
+      at the first sample are free
+    - The noise of each channel may be coloured: residuals are filtered to white noise by an autoregressive model, and the
+      intervals are those of the Fisher information with the noise found
+    - The supports must be linear, and the exciters carry unbalances only
+
+    For a `BearingPendulum`, see `jaxvib.study.bearing.identify.identify_bearing`:
+
+        record(t_i) = offset + f(t_i) + noise,      J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
+
+    **Arguments**
+
+    - `subject`: a `Scene` whose numbers are first values, or a `BearingPendulum`
+    - `records`: for a scene a `MeasuredRun` or a list of them; typical: 10 to 60 s at 10 to 50 samples per period. For a
+      pendulum a `Record`
+    - `unknown`: names of numbers of the scene or of arrays of them, such as "machine.stiffness"
+    - `known`: values of numbers with their standard errors, such as {"machine.mass[1]": "95 kg +- 1 %"}; without an error the
+      value is exact. Numbers that are neither unknown nor here have the values of the scene exactly
+    - `dry`, `instrument`: of a pendulum only. `dry`: True to find mu2 as well. `instrument`: relative uncertainty of J; typical:
+      0.01 to 0.03 (default 0)
+    - `throw`: raise if no fit is found
+
+    **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,
+    `ComputationError` "not_converged".
+
+    >>> import numpy as np, jaxvib as jv
+    >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
+    >>> t = np.arange(0.0, 15.0, 0.04)
+    >>> run = jv.swing(rod, t, angle="25 deg", viscous=1.5e-3)
+    >>> noisy = run.angle + 0.002 * np.random.default_rng(0).normal(size=t.size)
+    >>> found = jv.identify(rod, jv.Record(t, noisy))
+    >>> found.viscous.low < 1.5e-3 < found.viscous.high, found.viscous.error < 1e-5
+    (True, True)
+
+    Source: this package; for pendulums Artyunin, Sumenkov 2019.
+    """
+    if isinstance(subject, BearingPendulum):
+        if unknown or known:
+            raise InputError("unknown", "is for a Scene; the unknowns of a BearingPendulum are fixed, see dry")
+        if not isinstance(records, Record):
+            raise InputError("record", f"is {type(records).__name__}; it must be a Record(time, angle) or come from read_record")
+        return identify_bearing(subject, records, dry=dry, instrument=instrument, throw=throw)
+    if dry or instrument:
+        raise InputError("dry" if dry else "instrument", "is for a BearingPendulum; leave it out for a Scene")
+    runs = [records] if isinstance(records, MeasuredRun) else records
+    if isinstance(runs, Record) or not runs or not all(isinstance(run, MeasuredRun) for run in runs):
+        raise InputError("records", f"is {quoted(records)}; it must be a list of runs of read_run or MeasuredRun.from_arrays")
+    scene = validate_scene(subject)
+    problem = build_problem(scene, runs, unknown, known or {})
+    fitted = fit_from(problem, [np.zeros(problem.unknowns.count), track_orders(problem)])
+    found = _interpret(scene, fitted)
+    if throw and bool(found.status == FitStatus.not_converged):
+        raise ComputationError("not_converged", found.message)
+    return found
+
+
+def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
+    """Return a fit with intervals, directions, a status and notes."""
+    problem, known = fitted.problem, information_of(fitted)
+    status, chance, notes = status_of(fitted, known)
+    undetermined, by_gain = directions_of(known)
+    exciters = len(problem.unbalances)
+    frequency, damping = _modes(problem, fitted, known)
+    return MachineFit(
+        status=status,
+        notes=(*problem.notes, *notes),
+        scene=fitted_scene(problem, fitted.x, fitted.linear),
+        names=known.names,
+        units=tuple(find_number(scene, name, "unknown").unit for name in known.names),
+        estimates=tuple(map(_estimate, known.values, known.scale, known.logarithmic, _spreads(known), known.determined)),
+        covariance=known.covariance,
+        undetermined=undetermined,
+        by_gain=by_gain,
+        frequency=frequency,
+        damping_ratio=damping,
+        gain_names=problem.unknowns.gains,
+        gains=_gains(fitted),
+        phase=np.array([math.atan2(*fitted.linear[2 * k : 2 * k + 2][::-1]) for k in range(exciters)]),
+        channels=tuple(tuple(channel.name for channel in samples.channels) for samples in problem.runs),
+        noise=fitted.noise,
+        chance=chance,
+        time=tuple(time[: len(time)] for time in problem.times),
+        readings=tuple(np.where(mask, raw, np.nan) for raw, mask in zip(problem.raw, problem.masks, strict=True)),
+        fitted=tuple(
+            np.where(mask, raw, np.nan) - left for raw, mask, left in zip(problem.raw, problem.masks, fitted.residuals, strict=True)
+        ),
+    )
+
+
+def fitted_scene(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Scene:
+    """Return the scene with the fitted numbers and unbalances."""
+    scene: Any = problem.unknowns.scene(problem.scene, np.asarray(x))
+    for k, known in enumerate(problem.unbalances):
+        if known is None or known.error > 1.001e-4 * known.value:
+            number = find_number(scene, f"exciters[{k}].unbalance", "unknown")
+            scene = put_numbers(scene, (number,), np.hypot(*linear[2 * k : 2 * k + 2])[None])
+    return validate_scene(scene)
+
+
+def _spreads(known: Information) -> np.ndarray:
+    return np.sqrt(np.maximum(np.diagonal(known.covariance), 0.0))
+
+
+def _estimate(value: float, scale: float, logarithmic: bool, spread: float, determined: bool) -> Estimate:
+    """Return an estimate from the standard error of its coordinate."""
+    value, error = float(value), float(scale * spread)
+    if not determined:
+        return Estimate(value, math.inf, 0.0 if logarithmic else -math.inf, math.inf)
+    if logarithmic:
+        return Estimate(value, error, value * math.exp(-QUANTILE * spread), value * math.exp(QUANTILE * spread))
+    return Estimate(value, error, value - QUANTILE * error, value + QUANTILE * error)
+
+
+def _gains(fitted: Fitted) -> tuple[Estimate, ...]:
+    unknowns = fitted.problem.unknowns
+    moved = len(unknowns.numbers)
+    own = np.arange(moved, moved + len(unknowns.gains))
+    data, prior, _ = in_polar_unbalances(fitted)
+    covariance = np.linalg.inv(eliminate(data + prior, own)) if own.size else np.zeros((0, 0))
+    pairs = zip(fitted.x[own], np.sqrt(np.diagonal(covariance)), strict=True)
+    return tuple(_estimate(math.exp(x), math.exp(x), True, float(spread), True) for x, spread in pairs)
+
+
+def _modes(problem: Problem, fitted: Fitted, known: Information) -> tuple[tuple[Estimate, ...], tuple[Estimate, ...]]:
+    """Return the natural frequencies and damping ratios with their intervals, by central differences."""
+    moved = len(problem.unknowns.numbers)
+    values = np.stack(natural(problem.unknowns.scene(problem.scene, fitted.x)))
+    slopes = np.zeros((*values.shape, len(known.names)))
+    for k in range(moved):
+        step = np.zeros(fitted.x.size)
+        step[k] = 1e-5
+        high, low = (np.stack(natural(problem.unknowns.scene(problem.scene, fitted.x + s * step))) for s in (1.0, -1.0))
+        if high.shape == low.shape == values.shape:
+            slopes[:, :, k] = (high - low) / 2e-5
+    spread = np.sqrt(np.maximum(np.einsum("amk,kl,aml->am", slopes, known.covariance, slopes), 0.0))
+    lost = np.abs(np.einsum("amk,ku->amu", slopes, known.undetermined)) * np.minimum(known.errors, 1e3)
+    determined = np.all(lost < 0.1 * np.maximum(np.abs(values), 1e-300)[:, :, None], axis=2)
+    return tuple(
+        tuple(
+            _estimate(value, value, True, each / value, bool(sure))
+            for value, each, sure in zip(values[a], spread[a], determined[a], strict=True)
+        )
+        for a in (0, 1)
+    )  # pyright: ignore[reportReturnType]

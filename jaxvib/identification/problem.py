@@ -1,0 +1,340 @@
+"""Least-squares problem of an identification: unknowns, known values, and the samples of all runs on even grids."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.linear import linear_model
+from jaxvib.errors import InputError, quoted
+from jaxvib.identification.angle import RotorAngle, rotor_angles
+from jaxvib.identification.response import GAUSS_POINTS, STRETCH, Samples, Unknowns, rows_of_channel, state_count
+from jaxvib.identification.run import Channel, MeasuredRun
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import GravityField
+from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
+from jaxvib.machine.scene import Scene
+from jaxvib.units import Number
+
+MOTIONS = ("acceleration", "velocity", "displacement", "force")
+"""Kinds of channels that are compared with the model."""
+
+_UNEVEN = 0.02
+"""Largest deviation of a sample from the even grid, in steps."""
+
+_EXACT = 1e-4
+"""Relative standard deviation of an unbalance that counts as known exactly."""
+
+_DELAY_MARGIN = 2
+"""Samples before the delayed one in the interpolation of six samples."""
+
+
+class Known(NamedTuple):
+    """Known number: its `value`, SI, and its standard `error`, SI, 0 if it is exact."""
+
+    value: float
+    error: float
+
+
+class Problem(NamedTuple):
+    """Least-squares problem of an identification.
+
+    **Attributes** (p unknowns x, E exciters)
+
+    - `scene` with the known values; `unknowns`, see `Unknowns`
+    - `runs`: the samples of each run; `masks` (n, C): True for samples that count; `raw` (n, C): readings without a filter;
+      `times` (n,), s; `angles` of the rotors (n, E), rad
+    - `means` and `precisions` (p,): known values of x, and 1/error^2, 0 for a free number
+    - `unbalances`: for each exciter its known value, None if it is free
+    - `notes`: sentences for the reader
+    """
+
+    scene: Scene
+    unknowns: Unknowns
+    runs: tuple[Samples, ...]
+    masks: tuple[np.ndarray, ...]
+    raw: tuple[np.ndarray, ...]
+    times: tuple[np.ndarray, ...]
+    angles: tuple[np.ndarray, ...]
+    means: np.ndarray
+    precisions: np.ndarray
+    unbalances: tuple[Known | None, ...]
+    notes: tuple[str, ...]
+
+
+def read_known(text: Number, number: NamedNumber, field: str) -> Known:
+    """Return a known value with its standard error: "95 kg", "95 kg +- 1 %" or "95 kg +- 0.5 kg".
+
+    The number behind the sign is the standard error.
+    """
+    parts = re.split(r"\+-|\+/-|±", text) if isinstance(text, str) else [text]
+    value = number.value(parts[0].strip() if isinstance(parts[0], str) else parts[0], field)
+    if len(parts) == 1:
+        return Known(value, 0.0)
+    if len(parts) > 2:
+        raise InputError(field, f"is {quoted(text)}; write for example '95 kg +- 1 %'")
+    error = parts[1].strip()
+    if error.endswith("%"):
+        try:
+            return Known(value, abs(value) * float(error[:-1]) / 100.0)
+        except ValueError as problem:
+            raise InputError(field, f"is {quoted(text)}; write for example '95 kg +- 1 %'") from problem
+    return Known(value, abs(number._replace(spec=number.spec._replace(bounds=type(number.spec.bounds)())).value(error, field)))
+
+
+def build_problem(
+    scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[str], known: Mapping[str, Number]
+) -> Problem:
+    """Return the least-squares problem of an identification.
+
+    **Raises** `InputError` for unknowns that the scene does not have, for scenes with loads, motors without a tachometer or
+    supports that are not linear, and for runs without a usable channel.
+    """
+    _require_linear(scene)
+    if isinstance(unknown, str) or not unknown:
+        raise InputError("unknown", f"is {quoted(unknown)}; it must be a list of names, such as ['machine.stiffness']")
+    numbers = _singles(scene, unknown)
+    found: dict[str, tuple[NamedNumber, Known]] = {}
+    for name, text in known.items():
+        for number in _singles(scene, [name], "known"):
+            found[number.name] = number, read_known(text, number, f"known[{name!r}]")
+    fixed = [(number, each) for number, each in found.values() if each.error == 0.0]
+    if fixed:
+        scene = put_numbers(scene, [number for number, _ in fixed], np.array([each.value for _, each in fixed]))
+    exact = {number.name for number, _ in fixed}
+    free = {number.name: number for number in numbers if number.name not in exact}
+    free |= {name: number for name, (number, each) in found.items() if each.error > 0.0}
+    for name, number in free.items():
+        if number.path[0] == "exciters" and "drive" in number.path:
+            raise InputError(f"unknown.{name}", "is a number of the drive, which the recorded angle does not determine; leave it out")
+    moved = [number for number in free.values() if number.path[-1] != "unbalance"]
+    unbalances = tuple(_known_unbalance(scene, k, free, found) for k in range(len(scene.exciters)))
+
+    values = np.array([float(number.read(scene)[0]) for number in moved])
+    positive = np.array([number.spec.bounds.low == 0.0 and value > 0.0 for number, value in zip(moved, values, strict=True)], bool)
+    scale = np.where(values != 0.0, np.abs(values), [number.spec.typical or 1.0 for number in moved])
+    means, errors = np.zeros(len(moved)), np.full(len(moved), np.inf)
+    for k, number in enumerate(moved):
+        if number.name in found and found[number.name][1].error > 0.0:
+            each = found[number.name][1]
+            means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
+            errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
+
+    notes = [note for run in runs for note in run.notes]
+    angles = [rotor_angles(_changed(scene, run), run) for run in runs]
+    notes += [note for each in angles for angle in each for note in angle.notes]
+    marked = [all(angle.marked for angle in each) for each in angles]
+    gains = {c.name: c.gain_error for run in runs for c in run.of_kind(*MOTIONS) if c.gain_error > 0.0}
+    turns = [k for k, is_marked in enumerate(marked) if k and not (is_marked and marked[0])]
+    if len(scene.exciters) > 1 and turns:
+        turns = []  # each drive's schedule fixes its angle in every run
+    unknowns = Unknowns(
+        tuple(moved), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns)
+    )
+    prepared = [
+        _samples(scene, run, angle, turns.index(k) if k in turns else None)
+        for k, (run, angle) in enumerate(zip(runs, angles, strict=True))
+    ]
+    errors = np.concatenate([errors, list(gains.values()), np.full(len(turns), np.inf)])
+    return Problem(
+        scene,
+        unknowns,
+        *(tuple(each[k] for each in prepared) for k in range(5)),
+        means=np.concatenate([means, np.zeros(len(gains) + len(turns))]),
+        precisions=1.0 / errors**2,
+        unbalances=unbalances,
+        notes=tuple(dict.fromkeys(notes)),
+    )
+
+
+def _require_linear(scene: Scene) -> None:
+    for k, exciter in enumerate(scene.exciters):
+        if exciter.loads is not None or exciter.unbalance is None:
+            raise InputError(
+                f"scene.exciters[{k}]",
+                "has loads that move on the rotor; identify needs exciters with an unbalance only, "
+                "Exciter(drive=..., unbalance=...)",
+            )
+    for effect in scene.all_effects:
+        if not has_term([effect], GravityField):
+            raise InputError(
+                f"effects.{effect.kind}", "makes the machine nonlinear; identify needs linear supports, remove the effect"
+            )
+    if any(scene.machine.mounting(exciter.place).gyroscopic is not None for exciter in scene.exciters):
+        raise InputError(
+            "scene.machine", f"is of kind {scene.machine.kind!r} with gyroscopic forces, which identify does not include"
+        )
+    if any(scene.machine.mounting(exciter.place).turn is not None and not exciter.drive.ideal for exciter in scene.exciters):
+        pass  # the recorded angle is that of the rotor in the fixed frame; the reaction torque of the motor is neglected
+
+
+def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
+    """Return the single numbers of names of numbers and arrays; zeros of arrays, which are absent parts, are left out."""
+    found: dict[str, NamedNumber] = {}
+    for name in names:
+        for part in present_numbers(scene, find_number(scene, name, field), field):
+            found |= {each.name: each for each in part.single(scene)}
+    return list(found.values())
+
+
+def _known_unbalance(
+    scene: Scene, k: int, free: Mapping[str, NamedNumber], found: Mapping[str, tuple[NamedNumber, Known]]
+) -> Known | None:
+    number = find_number(scene, f"exciters[{k}].unbalance", "unknown")
+    if number.name in found and found[number.name][1].error > 0.0:
+        return found[number.name][1]
+    value = float(number.read(scene)[0])
+    return None if number.name in free else Known(value, _EXACT * value)
+
+
+def _changes(scene: Scene, run: MeasuredRun) -> tuple[list[NamedNumber], list[str], list[float]]:
+    """Return the changed numbers of a run, the actions and their amounts in SI."""
+    numbers, actions, amounts = [], [], []
+    for name, change in run.change.items():
+        for number in _singles(scene, [name], "change"):
+            unbounded = number._replace(spec=number.spec._replace(bounds=type(number.spec.bounds)()))
+            amount = change.amount if change.action == "scale" else unbounded.value(change.amount, f"change[{name!r}]")
+            numbers.append(number)
+            actions.append(change.action)
+            amounts.append(float(amount))
+    return numbers, actions, amounts
+
+
+def _changed(scene: Scene, run: MeasuredRun) -> Scene:
+    numbers, actions, amounts = _changes(scene, run)
+    for number, action, amount in zip(numbers, actions, amounts, strict=True):
+        now = np.asarray(number.read(scene))
+        new = {"add": now + amount, "scale": now * amount, "set": np.full_like(now, amount)}[action]
+        scene = put_numbers(scene, (number,), new)
+    return scene
+
+
+def _samples(
+    scene: Scene, run: MeasuredRun, angles: Sequence[RotorAngle], turn: int | None
+) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the samples of a run, the mask, the readings, the times and the angles of the rotors."""
+    channels = run.of_kind(*MOTIONS)
+    if not channels:
+        raise InputError(run.source, f"has no channel of a motion; add a channel of kind {', '.join(MOTIONS)}")
+    for channel in channels:
+        rows_of_channel(scene, channel)  # raises for a place that the machine does not have
+    step = min(1.0 / run.rate(channel.name) for channel in channels)
+    begin = max([min(float(run.times[c.name][0]) for c in channels), *(angle.span[0] for angle in angles)])
+    end = min([max(float(run.times[c.name][-1]) for c in channels), *(angle.span[1] for angle in angles)])
+    origin = float(run.times[channels[0].name][0])
+    first = math.ceil((begin - origin) / step - _UNEVEN)
+    count = math.floor((end - origin) / step + _UNEVEN) - first + 1
+    if count < 4 * (state_count(scene, channels) + 2):
+        raise InputError(
+            run.source, f"has {max(count, 0)} samples while the angle of the rotor is known; record more, or check the times"
+        )
+    length = -(-count // STRETCH) * STRETCH
+    time = origin + step * (first + np.arange(length))
+    raw, mask = np.zeros((length, len(channels))), np.zeros((length, len(channels)), bool)
+    for k, channel in enumerate(channels):
+        values, clipped = run.values[channel.name], run.clipped[channel.name]
+        place = (run.times[channel.name] - origin) / step - first
+        index = np.rint(place).astype(int)
+        if np.max(np.abs(place - index)) > _UNEVEN:
+            raise InputError(
+                f"{run.source}: channel {channel.name!r}",
+                f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
+            )
+        counts = np.isfinite(values) & ~clipped & (index >= 0) & (index < count)
+        raw[index[counts], k], mask[index[counts], k] = values[counts], True
+    force, turned = np.zeros((length, 4, 2 * len(angles))), np.zeros((length, len(angles)))
+    nodes = time[:count, None] + step * np.array([0.0, *GAUSS_POINTS])
+    nodes[-1] = np.minimum(nodes[-1], nodes[-1, 0])  # the last step begins at the last sample, and its force is not used
+    for k, (angle, exciter) in enumerate(zip(angles, scene.exciters, strict=True)):
+        theta, rate, acceleration = angle.at(nodes)
+        rotating = (rate**2 - 1j * exciter.direction * acceleration) * np.exp(1j * exciter.direction * theta)
+        force[:count, :, 2 * k], force[:count, :, 2 * k + 1] = rotating.real, rotating.imag
+        turned[:count, k] = theta[:, 0]
+    numbers, actions, amounts = _changes(scene, run)
+    samples = Samples(
+        force=jnp.asarray(force.reshape(-1, STRETCH, *force.shape[1:])),
+        readings=jnp.zeros((length // STRETCH, STRETCH, len(channels))),
+        weights=jnp.zeros((length // STRETCH, STRETCH, len(channels))),
+        taps=jnp.ones((1, len(channels))),
+        step=jnp.asarray(step),
+        amounts=jnp.asarray(np.array(amounts)),
+        channels=channels,
+        changed=tuple(numbers),
+        actions=tuple(actions),
+        turn=turn,
+    )
+    return samples, mask, raw, time, turned
+
+
+def with_noise(problem: Problem, filters: Sequence[Sequence[np.ndarray]], noise: Sequence[np.ndarray]) -> Problem:
+    """Return the problem with readings and models filtered to white noise.
+
+    **Arguments**: for each run and channel, the `filters` (1, a_1, ...), and the standard deviation of the white noise.
+    """
+    runs = []
+    for samples, mask, raw, own, deviations in zip(problem.runs, problem.masks, problem.raw, filters, noise, strict=True):
+        delayed = any(channel.delay != 0.0 for channel in samples.channels)
+        data, model = [], []
+        for channel, taps in zip(samples.channels, own, strict=True):
+            shift, lag = (np.ones(1), np.ones(1)) if not delayed else _delay_taps(channel.delay / float(samples.step))
+            data.append(np.convolve(taps, shift))
+            model.append(np.convolve(taps, lag))
+        longest = max(map(len, [*data, *model]))
+        readings, weights = np.zeros_like(raw), np.zeros(raw.shape)
+        for k, (taps, deviation) in enumerate(zip(data, deviations, strict=True)):
+            readings[:, k] = np.convolve(raw[:, k], taps)[: raw.shape[0]]
+            valid = mask[:, k].copy()
+            for j in np.flatnonzero(taps):
+                if j:
+                    valid[j:] &= mask[:-j, k]
+            valid[: longest - 1] = False
+            weights[:, k] = valid / deviation
+        padded = np.stack([np.pad(taps, (0, longest - len(taps))) for taps in model], axis=1)
+        shape = samples.readings.shape
+        runs.append(
+            dataclasses.replace(
+                samples,
+                readings=jnp.asarray(readings.reshape(shape)),
+                weights=jnp.asarray(weights.reshape(shape)),
+                taps=jnp.asarray(padded),
+            )
+        )
+    return problem._replace(runs=tuple(runs))
+
+
+def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the filters of the readings and of the model for a delay of the readings in steps: interpolation of degree 5.
+
+    Both are later by two steps, because the interpolation needs samples on both sides.
+    """
+    late = delay + _DELAY_MARGIN
+    base = math.floor(late) - 2
+    if base < 0:
+        raise InputError("delay", f"is {delay:g} steps; the readings cannot be ahead of the motion")
+    nodes = np.arange(base, base + 6)
+    weights = np.array([np.prod([(late - b) / (a - b) for b in nodes if b != a]) for a in nodes])
+    return np.eye(_DELAY_MARGIN + 1)[-1], np.concatenate([np.zeros(base), weights])
+
+
+def natural(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the natural frequencies (k,) rad/s and damping ratios (k,) of the damped modes with complex eigenvalues."""
+    model = linear_model(scene)
+    mass, damping, stiffness = (np.asarray(each) for each in (model.mass, model.carrier.damping, model.carrier.stiffness))
+    nd = mass.shape[0]
+    flow = np.block([[np.zeros((nd, nd)), np.eye(nd)], [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)]])
+    poles = np.linalg.eigvals(flow)
+    poles = poles[poles.imag > 0.0]
+    poles = poles[np.argsort(np.abs(poles))]
+    return np.abs(poles), -poles.real / np.abs(poles)
+
+
+def is_inexact(leaf: object) -> bool:
+    """Return True for an array of floating-point numbers."""
+    return eqx.is_inexact_array(leaf)

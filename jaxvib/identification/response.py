@@ -1,0 +1,354 @@
+"""Response of a linear machine to rotors of known angle, at the samples of a record, and its normal equations.
+
+The state is x = (s q, q') with a fixed frequency s. With the sampling step h, p = (cos theta, sin theta) and
+
+    x' = A x + B F(t),      F = -p''                (two numbers for each exciter, per unit of its unbalance)
+
+the state at the samples is exact for the machine; three Gauss points per step integrate the force of the rotor:
+
+    x_{k+1} = exp(A h) x_k + sum_j w_j h exp(A (h - c_j h)) B F(t_k + c_j h)
+
+The steps are computed in blocks: all blocks of a stretch of the record at once from zero, then the starts of the blocks from
+one another, then their contributions. Readings are linear in the unknowns of `LINEAR` order: the state at the first sample,
+the two components (a, b) of each unbalance, and the offsets. Derivatives by all other unknowns are forward derivatives of the
+same steps. The normal equations of a whole record are summed over stretches, which bounds the memory.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.model import assemble
+from jaxvib.identification.run import Channel
+from jaxvib.machine.numbers.named import NamedNumber, put_numbers
+from jaxvib.machine.scene import Scene
+from jaxvib.runtime.programs import cached
+
+GAUSS_POINTS = 0.5 + np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15)
+"""Places of the force within a step, relative to the step."""
+
+_GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+
+STRETCH = 4096
+"""Number of samples whose derivatives are in memory at once."""
+
+_BLOCK = 64
+"""Number of steps of a block."""
+
+
+class Unknowns(eqx.Module):
+    """Unknowns other than linear ones, as deviations x from their first values.
+
+        value = first exp(x) for positive numbers,      value = first + scale x otherwise
+
+    **Attributes**: `numbers` of the scene; `first` and `scale` (n,) of each single number, `positive` (n,); `gains`: names of
+    the channels whose gains are unknown, exp(x) each, behind the numbers; `turns`: number of runs whose rotor angle has an
+    unknown zero, rad, behind the gains.
+    """
+
+    numbers: tuple[NamedNumber, ...] = eqx.field(static=True)
+    first: Array
+    scale: Array
+    positive: Array
+    gains: tuple[str, ...] = eqx.field(static=True)
+    turns: int = eqx.field(static=True)
+
+    @property
+    def count(self) -> int:
+        """Number of all unknowns."""
+        return self.first.shape[0] + len(self.gains) + self.turns
+
+    def values(self, x: Array) -> Array:
+        """Return the values (n,) of the scene's numbers, SI."""
+        part = x[: self.first.shape[0]]
+        return jnp.where(self.positive, self.first * jnp.exp(part), self.first + self.scale * part)
+
+    def scene(self, scene: Scene, x: Array) -> Scene:
+        """Return the scene with the values of its unknown numbers."""
+        return put_numbers(scene, self.numbers, self.values(x)) if self.numbers else scene
+
+    def gain(self, x: Array, name: str) -> Array | float:
+        """Return the gain of a channel."""
+        return jnp.exp(x[self.first.shape[0] + self.gains.index(name)]) if name in self.gains else 1.0
+
+
+class Samples(eqx.Module):
+    """Samples of a run on an even grid, in stretches, as a program needs them.
+
+    **Attributes** (N stretches of n samples, C channels, E exciters)
+
+    - `force` (N, n, 4, 2 E): F of each exciter, (across, up), at the sample and at the three Gauss points after it
+    - `readings` (N, n, C): readings after the filter `data_filter` of `whitened`
+    - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
+    - `taps` (m + 1, C): filter of the model's readings
+    - `step` h, s
+    - `amounts`: what the run adds to, sets or multiplies the numbers `changed` of the scene by
+    - `channels` that are compared, `changed` and `actions`, `turn`: index of the run's unknown zero of the angle, or None
+    """
+
+    force: Array
+    readings: Array
+    weights: Array
+    taps: Array
+    step: Array
+    amounts: Array
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    changed: tuple[NamedNumber, ...] = eqx.field(static=True)
+    actions: tuple[str, ...] = eqx.field(static=True)
+    turn: int | None = eqx.field(static=True)
+
+    def scene(self, scene: Scene) -> Scene:
+        """Return the scene as it was in this run."""
+        for number, action, amount in zip(self.changed, self.actions, self.amounts, strict=True):
+            now = number.read(scene)
+            new = {"add": now + amount, "scale": now * amount, "set": jnp.full_like(now, amount)}[action]
+            scene = put_numbers(scene, (number,), new)
+        return scene
+
+
+class _Steps(NamedTuple):
+    """Matrices of the steps: `power` exp(A h) (ns, ns), `inputs` (3, ns, E, 2, 2) for the components (a, b) of each unbalance
+    and the two entries of F, `outputs` (C, ns) and `through` (C, E, 2, 2): readings from the state and from F."""
+
+    power: Array
+    inputs: Array
+    outputs: Array
+    through: Array
+
+
+def state_count(scene: Scene, channels: tuple[Channel, ...]) -> int:
+    """Return the number of states: coordinates, their rates, and one for each channel with a high-pass filter."""
+    nd = len(scene.machine.structure().coordinates)
+    return 2 * nd + sum(channel.high_pass > 0.0 for channel in channels)
+
+
+def rows_of_channel(scene: Scene, channel: Channel) -> Array:
+    """Return the row (nd,) by which the point of a channel moves in its direction."""
+    place = scene.exciters[0].place if channel.at is None else channel.at
+    place = jnp.asarray(place) if isinstance(place, tuple) else place
+    axes, rows = scene.machine.mounting().axes, scene.machine.rows_at(place, f"channel {channel.name!r}: at")
+    return sum((channel.direction[axis] * rows[k] for k, axis in enumerate(axes)), jnp.zeros(rows.shape[1]))
+
+
+def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array | float) -> _Steps:
+    """Return the matrices of the steps of a scene; `turn` is added to the angle of the rotors, rad."""
+    model = assemble(scene)
+    mass, damping, stiffness = model.carrier.mass, model.carrier.damping, model.carrier.stiffness
+    nd = mass.shape[0]
+    forces = []
+    for mount in model.mounts:
+        across, up = (
+            mount.rotor_rows()[mount.axes.index(axis)] if axis in mount.axes else jnp.zeros(nd) for axis in (0, 1)
+        )
+        # The component b of the unbalance is a quarter of a turn ahead of a.
+        forces.append(jnp.stack([jnp.stack([across, up], axis=-1), jnp.stack([up, -across], axis=-1)], axis=1))
+    force = jnp.stack(forces, axis=1)  # (nd, E, 2, 2)
+    c, s = jnp.cos(turn), jnp.sin(turn)
+    force = jnp.einsum("neaf,ab->nebf", force, jnp.asarray([[c, -s], [s, c]]))
+    scale = jax.lax.stop_gradient(jnp.sqrt(jnp.max(jnp.diagonal(stiffness) / jnp.diagonal(mass))))
+    solved = jnp.linalg.solve(mass, jnp.concatenate([stiffness / scale, damping, force.reshape(nd, -1)], axis=1))
+    elastic, viscous, pushed = solved[:, :nd], solved[:, nd : 2 * nd], solved[:, 2 * nd :].reshape(force.shape)
+    zero = jnp.zeros((nd, nd))
+    flow = jnp.block([[zero, scale * jnp.eye(nd)], [-elastic, -viscous]])
+    entry = jnp.concatenate([jnp.zeros_like(pushed), pushed])
+
+    outputs, through, corners = [], [], []
+    for channel in channels:
+        direct = jnp.zeros(pushed.shape[1:])
+        if channel.kind == "force":
+            directions = model.carrier.foundation_directions
+            weights = jnp.asarray([channel.direction[0 if each == "across" else 1] for each in directions])
+            row = jnp.concatenate(
+                [weights @ model.carrier.foundation_stiffness / scale, weights @ model.carrier.foundation_damping]
+            )
+        else:
+            moves = rows_of_channel(scene, channel)
+            still = jnp.zeros(nd)
+            if channel.kind == "acceleration":
+                row, direct = moves @ flow[nd:], jnp.tensordot(moves, pushed, axes=1)
+            else:
+                row = jnp.concatenate([moves / scale, still] if channel.kind == "displacement" else [still, moves])
+        outputs.append(row)
+        through.append(direct)
+        corners.append(2.0 * np.pi * channel.high_pass)
+    row, direct = jnp.stack(outputs), jnp.stack(through)
+    slow = [k for k, corner in enumerate(corners) if corner > 0.0]
+    if slow:  # the state z' = corner (reading - z) of a high-pass filter is taken away from the reading
+        corner, n = np.array([corners[k] for k in slow]), len(slow)
+        flow = jnp.block(
+            [[flow, jnp.zeros((2 * nd, n))], [corner[:, None] * row[np.array(slow)], jnp.diag(jnp.asarray(-corner))]]
+        )
+        entry = jnp.concatenate([entry, corner[:, None, None, None] * direct[np.array(slow)]])
+        minus = np.zeros((len(channels), n))
+        minus[slow, np.arange(n)] = -1.0
+        row = jnp.concatenate([row, minus], axis=1)
+    times = jnp.asarray([1.0, *(1.0 - GAUSS_POINTS)]) * step
+    powers = jax.vmap(lambda t: jax.scipy.linalg.expm(flow * t, max_squarings=32))(times)
+    inputs = jnp.einsum("j,jnm,mebf->jnebf", jnp.asarray(_GAUSS_WEIGHTS) * step, powers[1:], entry)
+    return _Steps(powers[0], inputs, row, direct)
+
+
+def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
+    """Return the states (n, ns, m) at the starts of n steps x' = power x + forcing, and the state at the end.
+
+    **Arguments**: `forcing` (n, ns, m), `start` (ns, m); n is a multiple of the length of a block.
+    """
+    n, ns, m = forcing.shape
+    blocks = jnp.moveaxis(forcing.reshape(n // _BLOCK, _BLOCK, ns, m), 1, 0)
+
+    def within(x: Array, w: Array) -> tuple[Array, Array]:
+        return jnp.einsum("ij,bjm->bim", power, x) + w, x
+
+    ends, local = jax.lax.scan(within, jnp.zeros((n // _BLOCK, ns, m)), blocks)
+
+    def multiplied(p: Array, _: None) -> tuple[Array, Array]:
+        return power @ p, p
+
+    whole, powers = jax.lax.scan(multiplied, jnp.eye(ns), None, length=_BLOCK)
+
+    def between(x: Array, end: Array) -> tuple[Array, Array]:
+        return whole @ x + end, x
+
+    last, starts = jax.lax.scan(between, start, ends)
+    states = local + jnp.einsum("kij,bjm->kbim", powers, starts)
+    return jnp.moveaxis(states, 0, 1).reshape(n, ns, m), last
+
+
+def _readings(steps: _Steps, force: Array, start: Array) -> tuple[Array, Array]:
+    """Return the readings (n, C, ns + 2 E) per unit of the state at the first sample and of each component of the unbalances,
+    without offsets, from `start` (ns, ns + 2 E), and the states at the end."""
+    ns = steps.power.shape[0]
+    n, exciters = force.shape[0], steps.inputs.shape[2]
+    parts = force.reshape(n, 4, exciters, 2)
+    pushed = jnp.einsum("jsebf,njef->nseb", steps.inputs, parts[:, 1:]).reshape(n, ns, 2 * exciters)
+    forcing = jnp.concatenate([jnp.zeros((n, ns, ns)), pushed], axis=2)
+    states, end = _march(steps.power, forcing, start)
+    direct = jnp.einsum("cebf,nef->nceb", steps.through, parts[:, 0]).reshape(n, -1, 2 * exciters)
+    readings = jnp.einsum("cs,nsm->ncm", steps.outputs, states)
+    return readings.at[:, :, ns:].add(direct), end
+
+
+def _response(steps: _Steps, force: Array, start: Array, unbalance: Array) -> tuple[Array, Array]:
+    """Return the readings (n, C) for `unbalance` (E, 2) from the state `start` (ns,), and the state at the end."""
+    n, exciters = force.shape[0], steps.inputs.shape[2]
+    parts = force.reshape(n, 4, exciters, 2)
+    inputs = jnp.einsum("jsebf,eb->jsef", steps.inputs, unbalance)
+    forcing = jnp.einsum("jsef,njef->ns", inputs, parts[:, 1:])
+    states, end = _march(steps.power, forcing[:, :, None], start[:, None])
+    direct = jnp.einsum("cebf,eb,nef->nc", steps.through, unbalance, parts[:, 0])
+    return states[:, :, 0] @ steps.outputs.T + direct, end[:, 0]
+
+
+def _filtered(taps: Array, before: Array, values: Array) -> tuple[Array, Array]:
+    """Return the readings (n, C, k) after the filter `taps` (m + 1, C), and the last m readings for the next stretch."""
+    m, n = taps.shape[0] - 1, values.shape[0]
+    every = jnp.concatenate([before, values])
+    out = sum(taps[j][None, :, None] * every[m - j : m - j + n] for j in range(m + 1))
+    return out, every[n:]
+
+
+def _built(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Steps:
+    """Return the steps of a run, with the gains of its channels, at the unknowns `x`."""
+    own = samples.scene(unknowns.scene(scene, x))
+    turn = 0.0 if samples.turn is None else x[x.shape[0] - unknowns.turns + samples.turn]
+    steps = _steps(own, samples.channels, samples.step, turn)
+    gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
+    return steps._replace(outputs=gains[:, None] * steps.outputs, through=gains[:, None, None, None] * steps.through)
+
+
+def _linear_columns(steps: _Steps, samples: Samples):
+    """Return the first carry and the function of a stretch that gives its linear columns (n, C, ns + 2 E + C)."""
+    ns, exciters, count = steps.power.shape[0], steps.inputs.shape[2], len(samples.channels)
+    own, m = ns + 2 * exciters, samples.taps.shape[0] - 1
+    first = jnp.concatenate([jnp.eye(ns), jnp.zeros((ns, 2 * exciters))], axis=1), jnp.zeros((m, count, own))
+    level = jnp.sum(samples.taps, axis=0)  # an offset that has always been there
+
+    def columns(carry: tuple[Array, Array], force: Array) -> tuple[tuple[Array, Array], Array]:
+        state, before = carry
+        raw, end = _readings(steps, force, state)
+        out, after = _filtered(samples.taps, before, raw)
+        offsets = jnp.broadcast_to(jnp.diag(level), (force.shape[0], count, count))
+        return (end, after), jnp.concatenate([out, offsets], axis=2)
+
+    return first, columns
+
+
+@cached
+def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> Array:
+    """Return the products Z^T Z of the weighted columns Z = (linear unknowns of the run, readings) at the unknowns `x`."""
+    first, columns = _linear_columns(_built(unknowns, samples, scene, x), samples)
+
+    def stretch(carry, part):
+        (state, total), (force, readings, weights) = carry, part
+        state, found = columns(state, force)
+        z = (jnp.concatenate([found, readings[:, :, None]], axis=2) * weights[:, :, None]).reshape(-1, found.shape[2] + 1)
+        return (state, total + z.T @ z), None
+
+    size = first[0].shape[1] + len(samples.channels) + 1
+    (_, total), _ = jax.lax.scan(
+        stretch, (first, jnp.zeros((size, size))), (samples.force, samples.readings, samples.weights)
+    )
+    return total
+
+
+@cached
+def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
+    """Return Z^T Z of Z = (derivatives by x, linear unknowns of the run, readings minus model).
+
+    **Arguments**: `linear`: state at the first sample, components of the unbalances, offsets.
+    """
+    steps = _built(unknowns, samples, scene, x)
+    first, columns = _linear_columns(steps, samples)
+    state, unbalance, _ = _split(steps, linear)
+    unit = jnp.eye(x.shape[0])
+
+    def tangent(direction: Array) -> _Steps:
+        return jax.jvp(lambda at: _built(unknowns, samples, scene, at), (x,), (direction,))[1]
+
+    changes = jax.vmap(tangent)(unit)
+
+    def stretch(carry, part):
+        (linear_state, (at, moved, before), total), (force, readings, weights) = carry, part
+        linear_state, found = columns(linear_state, force)
+
+        def along(change: _Steps, start: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+            return jax.jvp(lambda steps, start: _response(steps, force, start, unbalance), (steps, at), (change, start))
+
+        (_, ends), (slopes, turned) = jax.vmap(along)(changes, moved)
+        slopes, after = _filtered(samples.taps, before, jnp.moveaxis(slopes, 0, 2))
+        left = readings - found @ linear
+        z = jnp.concatenate([slopes, found, left[:, :, None]], axis=2) * weights[:, :, None]
+        z = z.reshape(-1, z.shape[2])
+        return (linear_state, (ends[0], turned, after), total + z.T @ z), None
+
+    count, size = x.shape[0], x.shape[0] + linear.shape[0] + 1
+    before = jnp.zeros((samples.taps.shape[0] - 1, len(samples.channels), count))
+    start = (first, (state, jnp.zeros((count, state.shape[0])), before), jnp.zeros((size, size)))
+    (_, _, total), _ = jax.lax.scan(stretch, start, (samples.force, samples.readings, samples.weights))
+    return total
+
+
+@cached
+def model_readings(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array) -> Array:
+    """Return the readings (N n, C) of the model with its offsets, without the filter."""
+    steps = _built(unknowns, samples, scene, x)
+    state, unbalance, offsets = _split(steps, linear)
+
+    def stretch(state: Array, force: Array) -> tuple[Array, Array]:
+        readings, state = _response(steps, force, state, unbalance)
+        return state, readings
+
+    _, found = jax.lax.scan(stretch, state, samples.force)
+    return found.reshape(-1, found.shape[2]) + offsets
+
+
+def _split(steps: _Steps, linear: Array) -> tuple[Array, Array, Array]:
+    ns, exciters = steps.power.shape[0], steps.inputs.shape[2]
+    ends = ns + 2 * exciters
+    return linear[:ns], linear[ns:ends].reshape(exciters, 2), linear[ends:]

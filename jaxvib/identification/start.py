@@ -1,0 +1,121 @@
+"""First values of an identification: steady amplitudes of the machine fitted to the amplitudes of the record, turn by turn.
+
+The machine has no time to reach these amplitudes in a run-up, but their peaks lie near those of the record from any first
+values. The fit of the whole record continues from here.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import Array
+
+from jaxvib.equations.linear import linear_model, turning
+from jaxvib.identification.problem import Problem
+from jaxvib.identification.response import Samples, Unknowns, rows_of_channel
+from jaxvib.machine.scene import Scene
+from jaxvib.runtime.programs import cached
+
+_WINDOWS = 128
+"""Number of stretches of a run, of whole turns, that have one amplitude each."""
+
+_TIE = 0.05
+"""Weight of the logarithm of a change of an unknown, per amplitude."""
+
+
+def amplitudes(readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the speeds (W,), rad/s, the amplitudes (W, C) of the readings at the rotor's angle, and their weights (W, C).
+
+    Each stretch of whole turns is fitted by c + a cos(angle) + b sin(angle). The weight compares the amplitude with the rest.
+
+    >>> angle = np.linspace(0.0, 300.0, 20000)
+    >>> speed, size, weight = amplitudes(2.0 * np.cos(angle)[:, None], np.ones((20000, 1), bool), angle, 1e-3)
+    >>> bool(np.allclose(size, 2.0)), bool(np.all(weight > 0.99)), len(speed) == _WINDOWS
+    (True, True, False)
+    """
+    turns = np.abs(angle - angle[0]) / (2.0 * np.pi)
+    each = max(1.0, np.ceil(turns[-1] / _WINDOWS))
+    cuts = np.searchsorted(turns, np.arange(0.0, turns[-1], each))
+    speeds, sizes, weights = [], [], []
+    for begin, end in zip(cuts[:-1], cuts[1:], strict=True):
+        if end - begin < 8:
+            continue
+        part = slice(begin, end)
+        basis = np.stack([np.ones(end - begin), np.cos(angle[part]), np.sin(angle[part])], axis=1)
+        size, weight = [], []
+        for values, counts in zip(readings[part].T, mask[part].T, strict=True):
+            if np.count_nonzero(counts) < 8:
+                size.append(0.0)
+                weight.append(0.0)
+                continue
+            found, *_ = np.linalg.lstsq(basis[counts], values[counts], rcond=None)
+            rest = float(np.var(values[counts] - basis[counts] @ found)) / np.count_nonzero(counts)
+            size.append(float(np.hypot(found[1], found[2])))
+            weight.append(size[-1] ** 2 / (size[-1] ** 2 + 10.0 * rest + 1e-300))
+        speeds.append((angle[end - 1] - angle[begin]) / (step * (end - 1 - begin)))
+        sizes.append(size)
+        weights.append(weight)
+    return np.abs(np.array(speeds)), np.array(sizes), np.array(weights)
+
+
+def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds: Array) -> Array:
+    """Return the amplitudes (W, C) of the steady readings per unit of the unbalance."""
+    own = samples.scene(unknowns.scene(scene, x))
+    model = linear_model(own)
+    mount, exciter = model.mounts[0], own.exciters[0]
+    direction = mount.rotor_rows().T @ turning(mount, exciter.direction)
+    rows = []
+    for channel in samples.channels:
+        if channel.kind == "force":
+            directions = model.carrier.foundation_directions
+            weights = jnp.asarray([channel.direction[0 if each == "across" else 1] for each in directions])
+            rows.append(weights @ model.carrier.foundation_stiffness)
+        else:
+            rows.append(rows_of_channel(own, channel))
+    powers = np.array([{"acceleration": 2.0, "velocity": 1.0}.get(channel.kind, 0.0) for channel in samples.channels])
+
+    def at(w: Array) -> Array:
+        return jnp.abs(jnp.stack(rows) @ jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)) * w**powers
+
+    return jax.vmap(at)(speeds)
+
+
+@cached
+def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tuple[tuple[Array, Array, Array], ...]) -> Array:
+    """Return the unknowns whose steady amplitudes resemble those of the runs, up to one factor for each run."""
+
+    def residual(x: Array, _: None) -> Array:
+        parts = [_TIE * x]
+        for samples, (speeds, sizes, weights) in zip(runs, data, strict=True):
+            away = jnp.log(jnp.maximum(sizes, 1e-300)) - jnp.log(_steady(unknowns, samples, scene, x, speeds))
+            mean = jnp.sum(weights * away) / jnp.sum(weights)
+            parts.append((jnp.sqrt(weights) * jnp.where(weights > 0.0, away - mean, 0.0)).ravel())
+        return jnp.concatenate(parts)
+
+    solver = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-4)
+    start = jnp.zeros(unknowns.count)
+    return optx.least_squares(residual, solver, start, options={"jac": "fwd"}, max_steps=64, throw=False).value
+
+
+def track_orders(problem: Problem) -> np.ndarray:
+    """Return first values of the unknowns from the amplitudes of the runs; those of the scene if the rotor does not speed up."""
+    zero = np.zeros(problem.unknowns.count)
+    if len(problem.unbalances) > 1 or not len(problem.unknowns.first):
+        return zero
+    data = []
+    for samples, raw, mask, angle in zip(problem.runs, problem.raw, problem.masks, problem.angles, strict=True):
+        count = int(np.max(np.flatnonzero(np.any(mask, axis=1)), initial=-1)) + 1
+        speeds, sizes, weights = amplitudes(raw[:count], mask[:count], angle[:count, 0], float(samples.step))
+        if len(speeds) < 8:
+            return zero
+        size = 4 * -(-len(speeds) // 4)  # runs of nearly equal length share a program
+        data.append(
+            tuple(
+                jnp.asarray(np.concatenate([each, np.repeat(pad, size - len(speeds), axis=0)]))
+                for each, pad in ((speeds, speeds[-1:]), (sizes, sizes[-1:]), (weights, 0.0 * weights[-1:]))
+            )
+        )
+    found = np.asarray(_track(problem.unknowns, problem.runs, problem.scene, tuple(data)))
+    return np.clip(found, -2.0, 2.0) if np.all(np.isfinite(found)) else zero
