@@ -115,11 +115,14 @@ from jaxvib.study.audit.audit import Audit, AuditStatus, audit
 
 # Friction of a bearing
 from jaxvib.study.bearing.decrement import ten_periods
-from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
+from jaxvib.study.bearing.identify import Identified, IdentifyStatus
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
 
-# Recorded runs of a machine
+# Recorded runs of a machine, and its identification
+from jaxvib.identification.checks import FitStatus
+from jaxvib.identification.directions import Direction
+from jaxvib.identification.identify import MachineFit, identify
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.exchange.recordings.read import read_recording, read_run
@@ -321,8 +324,11 @@ __all__ = [
     "identify",
     "Identified",
     "IdentifyStatus",
-    # Recorded runs of a machine
+    # Recorded runs of a machine, and its identification
     "Channel",
+    "Direction",
+    "FitStatus",
+    "MachineFit",
     "MeasuredRun",
     "read_run",
     "read_recording",

@@ -120,6 +120,13 @@ def cached(make):
     return one
 
 
+def machine_fit():
+    scene = jv.Scene(MACHINE, exciters=[jv.Exciter(drive=jv.RunUp(60.0, acceleration=6.0), unbalance=0.05)])
+    t, frame = np.arange(0.0, 10.0, 0.005), jv.Channel("frame", "acceleration", at=1)
+    run = jv.MeasuredRun.from_arrays([frame], t, {"frame": np.random.default_rng(0).normal(size=t.size)})
+    return jv.identify(scene, run, unknown=["machine.stiffness", "machine.damping"], throw=False)
+
+
 RESULTS = {
     "Run": cached(lambda: jv.simulate(SCENE, 2.0, start="jam", mode=1, samples=32)),
     "Regime": lambda: RESULTS["Run"]().regime,
@@ -151,6 +158,7 @@ RESULTS = {
     "CriticalSpeeds": lambda: jv.critical_speeds(ROTOR),
     "Swing": swung,
     "Identified": cached(identified),
+    "MachineFit": cached(machine_fit),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "RunUps": run_ups,
     "Capture": lambda: _summarize_captures(
@@ -177,7 +185,7 @@ RESULTS = {
 
 # fmt: off
 SEVERAL_PANELS = ["Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-                  "BalancedStates", "Swing", "Identified", "RunUps", "Audit", "SynchronousRegimes",
+                  "BalancedStates", "Swing", "Identified", "MachineFit", "RunUps", "Audit", "SynchronousRegimes",
                   "SynchronousOrbit"]
 # fmt: on
 

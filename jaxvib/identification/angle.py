@@ -1,4 +1,4 @@
-"""Angle of a rotor over time from the channels of a run: the pulses of a tachometer, an angle, a speed, or the drive's schedule.
+"""Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or the schedule of the drive.
 
 Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots, whose number has the smallest Bayesian
 information criterion. Its second derivative, which the force of an unbalance needs, is smooth. Marks of a wheel that are
@@ -8,14 +8,15 @@ unevenly spaced have one unknown offset each.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxvib.errors import InputError
-from jaxvib.identification.run import Channel, MeasuredRun
-from jaxvib.machine.drive import Drive
+from jaxvib.identification.records.channel import Channel
+from jaxvib.identification.run import MeasuredRun
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.scene import Exciter, Scene
 
 _DEGREE = 5
@@ -42,7 +43,7 @@ class RotorAngle(NamedTuple):
     - `notes`: sentences for the reader
     """
 
-    spline: object | None
+    spline: Any
     drive: Drive | None
     span: tuple[float, float]
     marked: bool
@@ -52,12 +53,13 @@ class RotorAngle(NamedTuple):
     def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the angle (rad), the speed (rad/s) and the acceleration (rad/s^2) at times of any shape."""
         if self.drive is not None:
-            drive, flat = self.drive, np.ravel(time)
+            drive: Any = self.drive
+            flat = np.ravel(time)
             functions = (lambda t: drive.rotor_angle(t, None), lambda t: drive.rotor_speed(t, None), drive.rotor_acceleration)
             angle, speed, acceleration = (np.asarray(jax.vmap(f)(flat), dtype=float).reshape(time.shape) for f in functions)
             return angle, speed, acceleration
         spline = self.spline
-        return tuple(spline(time, nu) for nu in range(3))  # pyright: ignore[reportReturnType, reportOptionalCall, reportCallIssue]
+        return spline(time), spline(time, 1), spline(time, 2)
 
 
 def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
@@ -107,7 +109,8 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     notes = []
     if channel.kind == "pulses":
         speed = spline(0.5 * (time[1:] + time[:-1]), 1)
-        change = float(np.max(np.abs(np.diff(speed)) / np.maximum(np.abs(speed[1:]), 1e-9)))
+        fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite nothing
+        change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=fast, initial=0.0))
         if change > _COARSE:
             notes.append(
                 f"{where}: the speed changes by up to {change:.0%} from one pulse to the next, and the angle between them is "
@@ -120,7 +123,7 @@ def _step(time: np.ndarray) -> float:
     return float(np.median(np.diff(time)))
 
 
-def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None):
+def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None) -> tuple[Any, float]:
     """Return a spline of degree 5 through noisy values, and its largest standard error.
 
     **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): the number of a value's mark, each with an unknown
@@ -133,11 +136,10 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
     """
     from scipy.interpolate import BSpline  # slow to import
 
-    n, best = time.size, None
-    offsets = np.zeros((n, 0))
-    if marks is not None:
-        kinds = int(marks.max()) + 1
-        offsets = np.eye(kinds)[marks][:, 1:] - np.eye(kinds)[marks][:, :1]
+    n = time.size
+    best: tuple[float, Any, float] = (math.inf, None, math.inf)
+    kinds = np.eye(1 if marks is None else int(np.max(marks)) + 1)[0 * np.arange(n) if marks is None else marks]
+    offsets = kinds[:, 1:] - kinds[:, :1]
     intervals = 1
     while intervals <= min(_MAX_INTERVALS, n // 4):
         inner = np.linspace(time[0], time[-1], intervals + 1)
@@ -158,10 +160,9 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
         left = value - basis @ found[:size] - offsets @ found[size:]
         variance = float(left @ left) / max(n - count, 1)
         criterion = n * math.log(max(float(left @ left) / n, 1e-26)) + count * math.log(n)
-        if best is None or criterion < best[0]:
+        if criterion < best[0]:
             at = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * intervals + 1), knots, _DEGREE)
             spread = np.max(np.einsum("ij,jk,ik->i", at.toarray(), inverse[:size, :size], at.toarray()))
             best = criterion, BSpline(knots, found[:size], _DEGREE), math.sqrt(variance * float(spread))
         intervals = max(intervals + 1, int(1.4 * intervals))
-    assert best is not None
     return best[1], best[2]

@@ -67,11 +67,11 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
 def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found: int) -> float:
     """Return the probability of residuals as far from noise as these, if they are noise.
 
-    They are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each stretch of the
-    record, by an F test.
+    They are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each stretch of
+    the record, by an F test.
 
-    **Arguments**: `left` (n,), NaN for samples that do not count; `taps` of the filter; `angle` (n,) rad; `found`: number of fitted
-    unknowns.
+    **Arguments**: `left` (n,), NaN for samples that do not count; `taps` of the filter; `angle` (n,) rad; `found`: number of
+    fitted unknowns.
 
     >>> angle, rng = np.linspace(0.0, 500.0, 4000), np.random.default_rng(0)
     >>> noise = rng.normal(size=4000)

@@ -1,7 +1,8 @@
 """Information of the records about the numbers of a scene: covariance, and directions that the records do not determine.
 
-The numbers are compared on a logarithmic scale (numbers of either sign: relative to their size). A direction is a combination of
-relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix, in which all other unknowns are eliminated.
+The numbers are compared on a logarithmic scale (numbers of either sign: relative to their size). A direction is a combination
+of relative changes; its standard error is 1/sqrt(eigenvalue) of the information matrix, in which all other unknowns are
+eliminated.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ _ADVICE = "give one of them in kg or N as known, or record a run with a known ma
 
 
 class Direction(NamedTuple):
-    """Combination of numbers that the records do not determine.
+    """Combination of numbers that the records do not determine. Returned by `identify` in a `MachineFit`.
 
-    **Attributes**: its `sentence`; `names` of the numbers, and their relative changes `weights`, a vector of length 1; its relative
-    standard `error`.
+    **Attributes**: its `sentence`; `names` of the numbers, and their relative changes `weights`, a vector of length 1; its
+    relative standard `error`.
     """
 
     sentence: str
@@ -42,7 +43,8 @@ class Information(NamedTuple):
 
     **Attributes**
 
-    - `names` (k,) of the numbers, `values` SI, `scale` (k,): change of the number per unit of its coordinate; `logarithmic` (k,)
+    - `names` (k,) of the numbers; `values` (k,), SI; `scale` (k,), change of a number per unit of its coordinate; `logarithmic`
+      (k,)
     - `covariance` (k, k) of the coordinates in the determined directions
     - `undetermined`: directions (k, u); `errors` (u,) of them
     - `determined` (k,): False for numbers that take part in an undetermined direction
@@ -96,7 +98,7 @@ def information_of(fitted: Fitted) -> Information:
 
 
 def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the information of data and of known values with each unbalance as (logarithm of its size, angle), and the sizes."""
+    """Return the information of data and of known values, with (logarithm of the size, angle) of each unbalance; the sizes."""
     p, exciters = fitted.x.size, len(fitted.problem.unbalances)
     turn, sizes = np.eye(p + fitted.linear.size), np.zeros(exciters)
     for k in range(exciters):
@@ -135,8 +137,8 @@ def directions_of(found: Information) -> tuple[tuple[Direction, ...], tuple[Dire
         words = direction.sentence.rstrip(": ")
         gains.append(
             direction._replace(
-                sentence=f"{words} is known from the gains of the sensors only, to {direction.error:.1%}, and an error of a gain "
-                f"leaves no trace in the residuals; calibrate the sensors, or {_ADVICE}"
+                sentence=f"{words} is known from the gains of the sensors only, to {direction.error:.1%}, and an error of a "
+                f"gain leaves no trace in the residuals; calibrate the sensors, or {_ADVICE}"
             )
         )
     return tuple(lost), tuple(gains)
@@ -151,18 +153,20 @@ def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect:
         if np.linalg.norm(inside) > _COMMON:
             kinds = _kinds(found.names)
             words = f"multiplying all {kinds} by one number{effect}: {advice}"
-            sentences.append(Direction(words, found.names, tuple(common), float(np.max(errors))))
+            weights = (axes.T @ common) * errors
+            sentences.append(Direction(words, found.names, tuple(map(float, common)), float(np.linalg.norm(weights))))
+            spread = axes * errors
             axes = axes - np.outer(common, common @ axes)
             basis, size, _ = np.linalg.svd(axes, full_matrices=False)
             axes = basis[:, size > 0.5]
-            errors = np.full(axes.shape[1], float(np.max(errors)))
+            errors = np.linalg.norm(axes.T @ spread, axis=1)
     for axis, error in zip(axes.T, errors, strict=True):
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         largest = [k for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > 0.2]
         parts = ", ".join(f"{found.names[k]} by {axis[k]:+.2g}" for k in largest)
         ways = "give one of these numbers as known, add a sensor at another place, or record a run through all resonances"
         words = f"changing {parts} (relative to one another){effect}: {ways if advice else ''}"
-        sentences.append(Direction(words, found.names, tuple(axis), float(error)))
+        sentences.append(Direction(words, found.names, tuple(map(float, axis)), float(error)))
     return sentences
 
 
@@ -172,6 +176,12 @@ def _in_common_factor(name: str) -> bool:
 
 
 def _kinds(names: tuple[str, ...]) -> str:
-    words = {"mass": "masses", "inertia": "inertias", "stiffness": "stiffnesses", "damping": "dampings", "unbalance": "unbalances"}
+    words = {
+        "mass": "masses",
+        "inertia": "inertias",
+        "stiffness": "stiffnesses",
+        "damping": "dampings",
+        "unbalance": "unbalances",
+    }
     there = [plural for word, plural in words.items() if any(word in name.rpartition(".")[2] for name in names)]
     return there[0] if len(there) == 1 else ", ".join(there[:-1]) + " and " + there[-1]

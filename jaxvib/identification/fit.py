@@ -16,12 +16,16 @@ from jaxvib.identification.problem import Problem, with_noise
 from jaxvib.identification.response import linear_equations, model_readings, normal_equations
 from jaxvib.numerics.noise import autoregression
 
-_MAX_ITERATIONS = 60
+_MAX_ITERATIONS = 40
 _LONGEST_STEP = 0.7
 """Largest change of the logarithm of an unknown in one step."""
 
 _CONVERGED = 1e-2
 """Length of the next undamped step, in standard errors, below which the fit has converged."""
+
+_MAX_PASSES = 6
+_STEADY_NOISE = 0.01
+"""Relative change of the noise of a channel below which its filter is final."""
 
 _RIDGE = 1e-13
 """Relative addition to the diagonal of normal equations, which keeps undetermined combinations of unknowns in place."""
@@ -30,11 +34,10 @@ _RIDGE = 1e-13
 class Fitted(NamedTuple):
     """Result of a fit.
 
-    **Attributes** (p unknowns x, L linear unknowns: the components (a, b) of each unbalance, then state and offsets of each run)
+    **Attributes** (p unknowns x, L linear unknowns: components (a, b) of each unbalance, then state and offsets of each run)
 
     - `x` (p,), `linear` (L,), and the `problem` with its filters and weights
     - `information` (p + L, p + L) of the data alone, `prior` (p + L, p + L) of known values
-    - `cost`: sum of the squared weighted residuals and deviations from known values; `samples` that count
     - `residuals` (n, C) of each run, readings minus model, NaN for samples that do not count
     - `noise` (C,) of each run: standard deviation of the residuals
     - `converged`
@@ -45,8 +48,6 @@ class Fitted(NamedTuple):
     problem: Problem
     information: np.ndarray
     prior: np.ndarray
-    cost: float
-    samples: int
     residuals: tuple[np.ndarray, ...]
     noise: tuple[np.ndarray, ...]
     converged: bool
@@ -166,7 +167,7 @@ def _minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.n
                 best, damping = trial, max(0.1 * damping, 1e-9)
                 break
             damping *= 8.0
-            if damping > 1e8:
+            if damping > 1e6:
                 return best, information, prior, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
     return best, *_equations(problem, best)[:2], False
 
@@ -183,7 +184,7 @@ def residuals_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np
             ],
             axis=1,
         )
-        found.append(np.where(mask, raw - shown, np.nan))
+        found.append(np.where(mask, raw - shown[: len(raw)], np.nan))
     return found
 
 
@@ -203,37 +204,48 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     The first pass weighs each channel by its own size, the next by their residuals, the last with filters to white noise.
     """
     white = [[np.ones(1) for _ in samples.channels] for samples in problem.runs]
-    deviations = [
-        np.array([np.std(raw[mask[:, k], k]) + 1e-300 if np.any(mask[:, k]) else 1.0 for k in range(raw.shape[1])])
+    sizes = [
+        np.array([np.std(raw[mask[:, k], k]) if np.any(mask[:, k]) else 0.0 for k in range(raw.shape[1])])
         for raw, mask in zip(problem.raw, problem.masks, strict=True)
     ]
-    filters, is_filtered = white, False
-    for round_ in range(8):
-        problem = with_noise(problem, filters, deviations)
-        trial, information, prior, converged = min((_minimize(problem, x) for x in starts), key=lambda each: each[0].cost)
-        starts = [trial.x]
-        left = residuals_of(problem, trial.x, trial.linear)
-        models = [[autoregression(each[:, k]) for k in range(each.shape[1])] for each in left]
-        before = deviations
-        filters = [[taps for taps, _ in each] for each in models] if round_ >= 2 else white
-        is_filtered = round_ >= 3
-        deviations = [
-            np.array([deviation if round_ >= 2 else np.nanstd(each[:, k]) for k, (_, deviation) in enumerate(of_run)])
-            for each, of_run in zip(left, models, strict=True)
-        ]
-        deviations = [np.maximum(each, 1e-12 * old) for each, old in zip(deviations, before, strict=True)]
-        change = max(float(np.max(np.abs(new / old - 1.0))) for new, old in zip(deviations, before, strict=True))
-        if is_filtered and change < 0.01:
+    deviations = [np.where(each > 0.0, each, 1.0) for each in sizes]
+    found = _pass(problem, white, deviations, starts)
+    if _largest_change([each / size for each, size in zip(found.noise, deviations, strict=True)]) < 0.3:
+        return found._replace(converged=False)  # the model does not resemble the records, and their noise is unknown
+    found = _pass(problem, white, found.noise, [found.x])
+    for _ in range(_MAX_PASSES):
+        if not found.converged:
             break
+        models = [[autoregression(each[:, k]) for k in range(each.shape[1])] for each in found.residuals]
+        new = [np.array([deviation for _, deviation in of_run]) for of_run in models]
+        change = _largest_change([after / before for after, before in zip(new, deviations, strict=True)])
+        if change < _STEADY_NOISE:
+            break
+        deviations = new
+        found = _pass(problem, [[taps for taps, _ in of_run] for of_run in models], deviations, [found.x])
+    return found
+
+
+def _largest_change(ratios: Sequence[np.ndarray]) -> float:
+    return max(float(np.max(np.abs(each - 1.0))) for each in ratios)
+
+
+def _pass(
+    problem: Problem, filters: Sequence[Sequence[np.ndarray]], deviations: Sequence[np.ndarray], starts: Sequence[np.ndarray]
+) -> Fitted:
+    """Return the fit with these filters to white noise and its standard deviations, the best one of those from `starts`."""
+    problem = with_noise(problem, filters, deviations)
+    minima = [_minimize(problem, x) for x in starts]
+    trial, information, prior, converged = min(minima, key=lambda each: each[0].cost)
+    left = residuals_of(problem, trial.x, trial.linear)
+    noise = [np.nanstd(each, axis=0) for each in left]
     return Fitted(
         x=trial.x,
         linear=trial.linear,
         problem=problem,
         information=information,
         prior=prior,
-        cost=trial.cost,
-        samples=int(sum(np.count_nonzero(np.asarray(samples.weights)) for samples in problem.runs)),
         residuals=tuple(left),
-        noise=tuple(np.nanstd(each, axis=0) for each in left),
+        noise=tuple(np.maximum(each, 1e-12 * old) for each, old in zip(noise, deviations, strict=True)),
         converged=converged,
     )

@@ -12,7 +12,14 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.identification.checks import FitStatus, status_of
-from jaxvib.identification.directions import Direction, Information, directions_of, eliminate, in_polar_unbalances, information_of
+from jaxvib.identification.directions import (
+    Direction,
+    Information,
+    directions_of,
+    eliminate,
+    in_polar_unbalances,
+    information_of,
+)
 from jaxvib.identification.fit import Fitted, fit_from
 from jaxvib.identification.problem import Problem, build_problem, natural
 from jaxvib.identification.run import MeasuredRun
@@ -136,8 +143,8 @@ def identify(
     For a scene, the rotor's angle theta follows from the run (kind pulses, angle or speed) or from a drive of prescribed speed.
 
     - Least squares over the whole record, transients included; the equations are integrated exactly at the samples
-    - The unknown numbers, the gains of the sensors (known to `gain_error`), the angle of the unbalance, the offsets and the motion
-      at the first sample are free
+    - The unknown numbers, the gains of the sensors (known to `gain_error`), the angle of the unbalance, the offsets and the
+      motion at the first sample are free
     - The noise of each channel may be coloured: residuals are filtered to white noise by an autoregressive model, and the
       intervals are those of the Fisher information with the noise found
     - The supports must be linear, and the exciters carry unbalances only
@@ -154,8 +161,8 @@ def identify(
     - `unknown`: names of numbers of the scene or of arrays of them, such as "machine.stiffness"
     - `known`: values of numbers with their standard errors, such as {"machine.mass[1]": "95 kg +- 1 %"}; without an error the
       value is exact. Numbers that are neither unknown nor here have the values of the scene exactly
-    - `dry`, `instrument`: of a pendulum only. `dry`: True to find mu2 as well. `instrument`: relative uncertainty of J; typical:
-      0.01 to 0.03 (default 0)
+    - `dry`, `instrument`: of a pendulum only. `dry`: True to find mu2 as well. `instrument`: relative uncertainty of J;
+      typical: 0.01 to 0.03 (default 0)
     - `throw`: raise if no fit is found
 
     **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,
@@ -176,7 +183,9 @@ def identify(
         if unknown or known:
             raise InputError("unknown", "is for a Scene; the unknowns of a BearingPendulum are fixed, see dry")
         if not isinstance(records, Record):
-            raise InputError("record", f"is {type(records).__name__}; it must be a Record(time, angle) or come from read_record")
+            raise InputError(
+                "record", f"is {type(records).__name__}; it must be a Record(time, angle) or come from read_record"
+            )
         return identify_bearing(subject, records, dry=dry, instrument=instrument, throw=throw)
     if dry or instrument:
         raise InputError("dry" if dry else "instrument", "is for a BearingPendulum; leave it out for a Scene")
@@ -217,11 +226,9 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         channels=tuple(tuple(channel.name for channel in samples.channels) for samples in problem.runs),
         noise=fitted.noise,
         chance=chance,
-        time=tuple(time[: len(time)] for time in problem.times),
+        time=problem.times,
         readings=tuple(np.where(mask, raw, np.nan) for raw, mask in zip(problem.raw, problem.masks, strict=True)),
-        fitted=tuple(
-            np.where(mask, raw, np.nan) - left for raw, mask, left in zip(problem.raw, problem.masks, fitted.residuals, strict=True)
-        ),
+        fitted=tuple(raw - left for raw, left in zip(problem.raw, fitted.residuals, strict=True)),
     )
 
 

@@ -8,7 +8,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,12 +15,12 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
 from jaxvib.identification.response import GAUSS_POINTS, STRETCH, Samples, Unknowns, rows_of_channel, state_count
-from jaxvib.identification.run import Channel, MeasuredRun
+from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import GravityField
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
-from jaxvib.units import Number
+from jaxvib.units import Bounds, Number
 
 MOTIONS = ("acceleration", "velocity", "displacement", "force")
 """Kinds of channels that are compared with the model."""
@@ -31,6 +30,9 @@ _UNEVEN = 0.02
 
 _EXACT = 1e-4
 """Relative standard deviation of an unbalance that counts as known exactly."""
+
+_FILTER_LENGTHS = (1, 9, 49, 129, 513)
+"""Lengths to which filters are extended, so that a few programs serve all of them."""
 
 _DELAY_MARGIN = 2
 """Samples before the delayed one in the interpolation of six samples."""
@@ -49,7 +51,8 @@ class Problem(NamedTuple):
     **Attributes** (p unknowns x, E exciters)
 
     - `scene` with the known values; `unknowns`, see `Unknowns`
-    - `runs`: the samples of each run; `masks` (n, C): True for samples that count; `raw` (n, C): readings without a filter;
+    - `runs`: the samples of each run, padded to whole stretches
+    - of each run, without the padding: `masks` (n, C), True for samples that count; `raw` (n, C), readings without a filter;
       `times` (n,), s; `angles` of the rotors (n, E), rad
     - `means` and `precisions` (p,): known values of x, and 1/error^2, 0 for a free number
     - `unbalances`: for each exciter its known value, None if it is free
@@ -74,10 +77,10 @@ def read_known(text: Number, number: NamedNumber, field: str) -> Known:
 
     The number behind the sign is the standard error.
     """
-    parts = re.split(r"\+-|\+/-|±", text) if isinstance(text, str) else [text]
-    value = number.value(parts[0].strip() if isinstance(parts[0], str) else parts[0], field)
-    if len(parts) == 1:
-        return Known(value, 0.0)
+    parts = re.split(r"\+-|\+/-|±", text) if isinstance(text, str) else []
+    if not isinstance(text, str) or len(parts) < 2:
+        return Known(number.value(text, field), 0.0)
+    value = number.value(parts[0].strip(), field)
     if len(parts) > 2:
         raise InputError(field, f"is {quoted(text)}; write for example '95 kg +- 1 %'")
     error = parts[1].strip()
@@ -86,12 +89,15 @@ def read_known(text: Number, number: NamedNumber, field: str) -> Known:
             return Known(value, abs(value) * float(error[:-1]) / 100.0)
         except ValueError as problem:
             raise InputError(field, f"is {quoted(text)}; write for example '95 kg +- 1 %'") from problem
-    return Known(value, abs(number._replace(spec=number.spec._replace(bounds=type(number.spec.bounds)())).value(error, field)))
+    return Known(value, abs(_unbounded(number).value(error, field)))
 
 
-def build_problem(
-    scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[str], known: Mapping[str, Number]
-) -> Problem:
+def _unbounded(number: NamedNumber) -> NamedNumber:
+    """Return the number without bounds, to read a difference of its values."""
+    return number._replace(spec=number.spec._replace(bounds=Bounds()))
+
+
+def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[str], known: Mapping[str, Number]) -> Problem:
     """Return the least-squares problem of an identification.
 
     **Raises** `InputError` for unknowns that the scene does not have, for scenes with loads, motors without a tachometer or
@@ -113,12 +119,16 @@ def build_problem(
     free |= {name: number for name, (number, each) in found.items() if each.error > 0.0}
     for name, number in free.items():
         if number.path[0] == "exciters" and "drive" in number.path:
-            raise InputError(f"unknown.{name}", "is a number of the drive, which the recorded angle does not determine; leave it out")
+            raise InputError(
+                f"unknown.{name}", "is a number of the drive, which the recorded angle does not determine; leave it out"
+            )
     moved = [number for number in free.values() if number.path[-1] != "unbalance"]
     unbalances = tuple(_known_unbalance(scene, k, free, found) for k in range(len(scene.exciters)))
 
     values = np.array([float(number.read(scene)[0]) for number in moved])
-    positive = np.array([number.spec.bounds.low == 0.0 and value > 0.0 for number, value in zip(moved, values, strict=True)], bool)
+    positive = np.array(
+        [number.spec.bounds.low == 0.0 and value > 0.0 for number, value in zip(moved, values, strict=True)], bool
+    )
     scale = np.where(values != 0.0, np.abs(values), [number.spec.typical or 1.0 for number in moved])
     means, errors = np.zeros(len(moved)), np.full(len(moved), np.inf)
     for k, number in enumerate(moved):
@@ -135,18 +145,19 @@ def build_problem(
     turns = [k for k, is_marked in enumerate(marked) if k and not (is_marked and marked[0])]
     if len(scene.exciters) > 1 and turns:
         turns = []  # each drive's schedule fixes its angle in every run
-    unknowns = Unknowns(
-        tuple(moved), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns)
-    )
-    prepared = [
-        _samples(scene, run, angle, turns.index(k) if k in turns else None)
-        for k, (run, angle) in enumerate(zip(runs, angles, strict=True))
-    ]
+    unknowns = Unknowns(tuple(moved), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns))
+    cases = enumerate(zip(runs, angles, strict=True))
+    prepared = [_samples(scene, run, angle, turns.index(k) if k in turns else None) for k, (run, angle) in cases]
+    samples, masks, raw, times, turned = zip(*prepared, strict=True)
     errors = np.concatenate([errors, list(gains.values()), np.full(len(turns), np.inf)])
     return Problem(
         scene,
         unknowns,
-        *(tuple(each[k] for each in prepared) for k in range(5)),
+        samples,
+        masks,
+        raw,
+        times,
+        turned,
         means=np.concatenate([means, np.zeros(len(gains) + len(turns))]),
         precisions=1.0 / errors**2,
         unbalances=unbalances,
@@ -171,8 +182,6 @@ def _require_linear(scene: Scene) -> None:
         raise InputError(
             "scene.machine", f"is of kind {scene.machine.kind!r} with gyroscopic forces, which identify does not include"
         )
-    if any(scene.machine.mounting(exciter.place).turn is not None and not exciter.drive.ideal for exciter in scene.exciters):
-        pass  # the recorded angle is that of the rotor in the fixed frame; the reaction torque of the motor is neglected
 
 
 def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
@@ -199,8 +208,7 @@ def _changes(scene: Scene, run: MeasuredRun) -> tuple[list[NamedNumber], list[st
     numbers, actions, amounts = [], [], []
     for name, change in run.change.items():
         for number in _singles(scene, [name], "change"):
-            unbounded = number._replace(spec=number.spec._replace(bounds=type(number.spec.bounds)()))
-            amount = change.amount if change.action == "scale" else unbounded.value(change.amount, f"change[{name!r}]")
+            amount = change.amount if change.action == "scale" else _unbounded(number).value(change.amount, f"change[{name!r}]")
             numbers.append(number)
             actions.append(change.action)
             amounts.append(float(amount))
@@ -270,7 +278,7 @@ def _samples(
         actions=tuple(actions),
         turn=turn,
     )
-    return samples, mask, raw, time, turned
+    return samples, mask[:count], raw[:count], time[:count], turned[:count]
 
 
 def with_noise(problem: Problem, filters: Sequence[Sequence[np.ndarray]], noise: Sequence[np.ndarray]) -> Problem:
@@ -286,18 +294,18 @@ def with_noise(problem: Problem, filters: Sequence[Sequence[np.ndarray]], noise:
             shift, lag = (np.ones(1), np.ones(1)) if not delayed else _delay_taps(channel.delay / float(samples.step))
             data.append(np.convolve(taps, shift))
             model.append(np.convolve(taps, lag))
-        longest = max(map(len, [*data, *model]))
-        readings, weights = np.zeros_like(raw), np.zeros(raw.shape)
+        longest = next(n for n in _FILTER_LENGTHS if n >= max(map(len, [*data, *model])))
+        shape, n = samples.readings.shape, raw.shape[0]
+        readings, weights = np.zeros((shape[0] * shape[1], raw.shape[1])), np.zeros((shape[0] * shape[1], raw.shape[1]))
         for k, (taps, deviation) in enumerate(zip(data, deviations, strict=True)):
-            readings[:, k] = np.convolve(raw[:, k], taps)[: raw.shape[0]]
+            readings[:n, k] = np.convolve(raw[:, k], taps)[:n]
             valid = mask[:, k].copy()
             for j in np.flatnonzero(taps):
                 if j:
                     valid[j:] &= mask[:-j, k]
-            valid[: longest - 1] = False
-            weights[:, k] = valid / deviation
+            valid[: max(len(data[k]), len(model[k])) - 1] = False
+            weights[:n, k] = valid / deviation
         padded = np.stack([np.pad(taps, (0, longest - len(taps))) for taps in model], axis=1)
-        shape = samples.readings.shape
         runs.append(
             dataclasses.replace(
                 samples,
@@ -333,8 +341,3 @@ def natural(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     poles = poles[poles.imag > 0.0]
     poles = poles[np.argsort(np.abs(poles))]
     return np.abs(poles), -poles.real / np.abs(poles)
-
-
-def is_inexact(leaf: object) -> bool:
-    """Return True for an array of floating-point numbers."""
-    return eqx.is_inexact_array(leaf)

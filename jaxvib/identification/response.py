@@ -25,7 +25,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.model import assemble
-from jaxvib.identification.run import Channel
+from jaxvib.identification.records.channel import Channel
 from jaxvib.machine.numbers.named import NamedNumber, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
@@ -64,12 +64,12 @@ class Unknowns(eqx.Module):
         """Number of all unknowns."""
         return self.first.shape[0] + len(self.gains) + self.turns
 
-    def values(self, x: Array) -> Array:
+    def values(self, x: Array | np.ndarray) -> Array:
         """Return the values (n,) of the scene's numbers, SI."""
         part = x[: self.first.shape[0]]
         return jnp.where(self.positive, self.first * jnp.exp(part), self.first + self.scale * part)
 
-    def scene(self, scene: Scene, x: Array) -> Scene:
+    def scene(self, scene: Scene, x: Array | np.ndarray) -> Scene:
         """Return the scene with the values of its unknown numbers."""
         return put_numbers(scene, self.numbers, self.values(x)) if self.numbers else scene
 
@@ -143,9 +143,7 @@ def _steps(scene: Scene, channels: tuple[Channel, ...], step: Array, turn: Array
     nd = mass.shape[0]
     forces = []
     for mount in model.mounts:
-        across, up = (
-            mount.rotor_rows()[mount.axes.index(axis)] if axis in mount.axes else jnp.zeros(nd) for axis in (0, 1)
-        )
+        across, up = (mount.rotor_rows()[mount.axes.index(axis)] if axis in mount.axes else jnp.zeros(nd) for axis in (0, 1))
         # The component b of the unbalance is a quarter of a turn ahead of a.
         forces.append(jnp.stack([jnp.stack([across, up], axis=-1), jnp.stack([up, -across], axis=-1)], axis=1))
     force = jnp.stack(forces, axis=1)  # (nd, E, 2, 2)
@@ -249,7 +247,8 @@ def _filtered(taps: Array, before: Array, values: Array) -> tuple[Array, Array]:
     """Return the readings (n, C, k) after the filter `taps` (m + 1, C), and the last m readings for the next stretch."""
     m, n = taps.shape[0] - 1, values.shape[0]
     every = jnp.concatenate([before, values])
-    out = sum(taps[j][None, :, None] * every[m - j : m - j + n] for j in range(m + 1))
+    parts = [taps[j][None, :, None] * every[m - j : m - j + n] for j in range(m + 1)]
+    out = sum(parts[1:], parts[0])
     return out, every[n:]
 
 
@@ -291,9 +290,7 @@ def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
         return (state, total + z.T @ z), None
 
     size = first[0].shape[1] + len(samples.channels) + 1
-    (_, total), _ = jax.lax.scan(
-        stretch, (first, jnp.zeros((size, size))), (samples.force, samples.readings, samples.weights)
-    )
+    (_, total), _ = jax.lax.scan(stretch, (first, jnp.zeros((size, size))), (samples.force, samples.readings, samples.weights))
     return total
 
 
@@ -345,7 +342,7 @@ def model_readings(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array,
         return state, readings
 
     _, found = jax.lax.scan(stretch, state, samples.force)
-    return found.reshape(-1, found.shape[2]) + offsets
+    return found.reshape(-1, found.shape[2]) + offsets[None]
 
 
 def _split(steps: _Steps, linear: Array) -> tuple[Array, Array, Array]:

@@ -6,6 +6,8 @@ values. The fit of the whole record continues from here.
 
 from __future__ import annotations
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +27,9 @@ _TIE = 0.05
 """Weight of the logarithm of a change of an unknown, per amplitude."""
 
 
-def amplitudes(readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def amplitudes(
+    readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the speeds (W,), rad/s, the amplitudes (W, C) of the readings at the rotor's angle, and their weights (W, C).
 
     Each stretch of whole turns is fitted by c + a cos(angle) + b sin(angle). The weight compares the amplitude with the rest.
@@ -39,7 +43,7 @@ def amplitudes(readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: 
     each = max(1.0, np.ceil(turns[-1] / _WINDOWS))
     cuts = np.searchsorted(turns, np.arange(0.0, turns[-1], each))
     speeds, sizes, weights = [], [], []
-    for begin, end in zip(cuts[:-1], cuts[1:], strict=True):
+    for begin, end in itertools.pairwise(cuts):
         if end - begin < 8:
             continue
         part = slice(begin, end)
@@ -77,7 +81,7 @@ def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds
     powers = np.array([{"acceleration": 2.0, "velocity": 1.0}.get(channel.kind, 0.0) for channel in samples.channels])
 
     def at(w: Array) -> Array:
-        return jnp.abs(jnp.stack(rows) @ jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)) * w**powers
+        return jnp.abs(jnp.stack(rows) @ jnp.linalg.solve(model.dynamic_stiffness(w), w**2 * direction)) * jnp.power(w, powers)
 
     return jax.vmap(at)(speeds)
 
@@ -100,7 +104,7 @@ def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tu
 
 
 def track_orders(problem: Problem) -> np.ndarray:
-    """Return first values of the unknowns from the amplitudes of the runs; those of the scene if the rotor does not speed up."""
+    """Return first values of the unknowns from the amplitudes of the runs; those of the scene if there are too few turns."""
     zero = np.zeros(problem.unknowns.count)
     if len(problem.unbalances) > 1 or not len(problem.unknowns.first):
         return zero

@@ -62,11 +62,13 @@ def colored_covariance(slopes: np.ndarray, residual: np.ndarray) -> np.ndarray:
 
     **Arguments**: `slopes` J (n, p), derivatives of the residuals by the parameters; `residual` (n,), evenly sampled.
 
-    >>> rng = np.random.default_rng(0)
-    >>> slopes, white = np.ones((4000, 1)), rng.normal(size=4000)
-    >>> colored = np.convolve(white, np.ones(10))[:4000]
-    >>> [round(float(colored_covariance(slopes, noise)[0, 0] * 4000), -1) for noise in (10.0 * white, colored)]
-    [100.0, 100.0]
+    >>> slopes, noise = np.ones((4000, 1)), np.random.default_rng(0).normal(size=4000)
+    >>> round(float(colored_covariance(slopes, noise)[0, 0] * 4000), 1)
+    1.0
+    >>> for k in range(1, 4000):
+    ...     noise[k] += 0.8 * noise[k - 1]
+    >>> round(float(colored_covariance(slopes, noise)[0, 0] * 4000))    # 1 / (1 - 0.8)^2
+    25
     """
     from scipy.signal import lfilter  # slow to import
 

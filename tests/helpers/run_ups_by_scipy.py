@@ -4,6 +4,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
+from jaxvib.identification.run import parse_change
 
 TRUTH = {
     "machine.mass[0]": 120.0,
@@ -74,4 +75,12 @@ def record(times, clean, noise, rng, gain_error=0.0, pulses=24, jitter=0.0, turn
     values = {**data, "tacho": numbers}
     clipped = {name: np.zeros(len(each), bool) for name, each in values.items()}
     channels = (*channels, jv.Channel("tacho", "pulses", per_turn=pulses))
-    return jv.MeasuredRun(channels, {"a1": times, "a2": times, "tacho": edges}, values, clipped, change or {}, (), "run")
+    return jv.MeasuredRun(
+        channels,
+        {"a1": times, "a2": times, "tacho": edges},
+        values,
+        clipped,
+        {name: parse_change(each, name) for name, each in (change or {}).items()},
+        (),
+        "run",
+    )

@@ -8,10 +8,10 @@ import pytest
 from swings import ROD, T, noisy, scipy_swing, scipy_swings
 
 import jaxvib as jv
+from jaxvib.results.estimate import student_quantile
 from jaxvib.runtime.compat import no_host_checks
 from jaxvib.study.bearing.decrement import turning_points
 from jaxvib.study.bearing.fit import first_guess, fit_swing, steps_for
-from jaxvib.results.estimate import student_quantile
 
 
 @pytest.mark.parametrize("degrees", [2.0, 20.0, 40.0, 80.0])

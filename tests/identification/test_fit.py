@@ -1,0 +1,185 @@
+"""Machines fitted to run-ups that SciPy integrates, with noise."""
+
+import functools
+
+import numpy as np
+import pytest
+from run_ups_by_scipy import TRUTH, accelerations, record, scene_of
+
+import jaxvib as jv
+
+T = 0.002 * np.arange(8000)
+NOISE = 0.05
+NAMES = ("machine.stiffness", "machine.damping", "machine.link_stiffness", "machine.link_damping", "exciters[0].unbalance")
+
+
+@functools.cache
+def clean(**changes):
+    return accelerations(T, [TRUTH | {name.replace("__", "."): value for name, value in changes.items()}])[0]
+
+
+def start(stiffness=1.0, damping=1.0, mass=1.0):
+    """Return the scene with first values away from the truth by factors."""
+    factors = {"stiffness": stiffness, "damping": damping, "mass": mass}
+    factor = {name: next((f for word, f in factors.items() if word in name), 1.0) for name in TRUTH}
+    return scene_of({name: value * factor[name] for name, value in TRUTH.items()})
+
+
+def run_of(seed=0, noise=NOISE, **options):
+    return record(T, clean(), noise, np.random.default_rng(seed), **options)
+
+
+def distances(fit):
+    """Return (fitted - true)/error of each determined number."""
+    return np.array(
+        [
+            (each.value - TRUTH[name]) / each.error
+            for name, each in zip(fit.names, fit.estimates, strict=True)
+            if np.isfinite(each.error)
+        ]
+    )
+
+
+@functools.cache
+def fitted():
+    return jv.identify(start(1.1, 1.5), run_of(), unknown=NAMES)
+
+
+def test_fit_finds_the_numbers_from_wrong_first_values():
+    fit = fitted()
+    assert fit.status_name == "found" and fit.undetermined == ()
+    assert np.max(np.abs(distances(fit))) < 4.0
+    assert abs(fit.phase[0] - 0.4) < 1e-3
+    np.testing.assert_allclose(fit.noise[0], NOISE, rtol=0.03)
+    assert fit.estimate("machine.link_stiffness[0]").error < 40.0
+    np.testing.assert_allclose(fit.scene.machine.stiffness, [5e4, 6e4], rtol=3e-3)
+
+
+def test_model_agrees_with_scipy_without_noise():
+    fit = jv.identify(start(1.02, 1.1), run_of(noise=1e-6), unknown=NAMES, throw=False)
+    values = np.array([each.value for each in fit.estimates])
+    np.testing.assert_allclose(values, [TRUTH[name] for name in fit.names], rtol=1e-5)
+
+
+def test_errors_are_those_of_the_cramer_rao_bound():
+    """The derivatives are differences of SciPy's run-ups; states at the first sample and offsets are free."""
+    fit, step = fitted(), 1e-4
+    cases = [TRUTH | {name: TRUTH[name] * (1.0 + s * step)} for name in fit.names for s in (1.0, -1.0)]
+    both = accelerations(T, cases).reshape(len(fit.names), 2, T.size, 2)
+    columns = [((high - low) / (2.0 * step)).ravel() for high, low in both]
+    turned = accelerations(T, [TRUTH], phase=0.4 + step) - accelerations(T, [TRUTH], phase=0.4 - step)
+    columns.append((turned[0] / (2.0 * step)).ravel())
+    m1, m2, k1, k2, c1, c2, k, c, _ = TRUTH.values()
+    flow = np.zeros((4, 4))
+    flow[:2, 2:] = np.eye(2)
+    flow[2:] = -np.array([[k1 + k, -k, c1 + c, -c], [-k, k2 + k, -c, c2 + c]]) / np.array([[m1], [m2]])
+    poles, shapes = np.linalg.eig(flow)
+    free = np.einsum("ij,tj,jk->tik", shapes, np.exp(T[:, None] * poles), np.linalg.inv(shapes))
+    columns += list(np.einsum("ai,tik->kta", flow[2:], free).real.reshape(4, -1))
+    columns += [np.tile([1.0, 0.0], T.size), np.tile([0.0, 1.0], T.size)]
+    slopes = np.stack(columns, axis=1) / NOISE
+    bound = np.sqrt(np.diagonal(np.linalg.inv(slopes.T @ slopes))[: len(fit.names)])
+    found = [each.error / each.value for each in fit.estimates]
+    np.testing.assert_allclose(found, bound, rtol=0.05)
+
+
+def test_intervals_hold_the_truth_in_repeated_records():
+    ratios = np.array([distances(jv.identify(start(), run_of(seed), unknown=NAMES)) for seed in range(1, 25)])
+    assert 0.9 < np.mean(np.abs(ratios) < 1.96) < 0.99
+    assert np.all(np.abs(np.mean(ratios, axis=0)) < 4.0 / np.sqrt(24.0))
+    assert 0.85 < np.std(ratios) < 1.15
+
+
+def test_common_factor_of_all_numbers_is_undetermined():
+    fit = jv.identify(start(1.05), run_of(), unknown=[*NAMES, "machine.mass"])
+    assert fit.status_name == "undetermined" and len(fit.undetermined) == 1
+    assert fit.undetermined[0].sentence.startswith("multiplying all masses, stiffnesses, dampings and unbalances by one number")
+    np.testing.assert_allclose(fit.undetermined[0].weights, 1.0 / 3.0)
+    assert all(np.isinf(each.high) and np.isinf(each.error) for each in fit.estimates)
+    model = jv.natural_frequencies(scene_of(TRUTH))
+    np.testing.assert_allclose([each.value for each in fit.frequency], model, rtol=1e-3)
+    assert all(each.error < 1e-3 * each.value for each in fit.frequency)
+
+
+def test_known_mass_that_is_added_determines_all_numbers():
+    heavier = record(
+        T, clean(**{"machine__mass[0]": 130.0}), NOISE, np.random.default_rng(1), change={"machine.mass[0]": "+10 kg"}
+    )
+    fit = jv.identify(start(1.05, mass=1.03), [run_of(), heavier], unknown=[*NAMES, "machine.mass"])
+    assert fit.status_name == "found"
+    assert np.max(np.abs(distances(fit))) < 4.0
+    assert fit.estimate("machine.mass[0]").error < 0.5
+
+
+def test_known_mass_with_an_error_widens_all_intervals():
+    fit = jv.identify(start(1.05), run_of(), unknown=[*NAMES, "machine.mass"], known={"machine.mass[1]": "95 kg +- 1 %"})
+    assert fit.status_name == "found"
+    errors = [each.error / each.value for each in fit.estimates]
+    assert all(0.0099 < error < 0.02 for error in errors)
+
+
+def test_gains_of_sensors_are_named_if_they_alone_determine():
+    run = run_of(3, gain_error=0.01)
+    fit = jv.identify(start(1.05), run, unknown=[*NAMES[:4], "machine.mass"])
+    assert fit.status_name == "found"
+    assert "multiplying all masses, stiffnesses and dampings by one number is known from the gains" in fit.by_gain[0].sentence
+    assert fit.estimate("machine.stiffness[0]").error / fit.estimate("machine.stiffness[0]").value > 0.02
+    assert np.max(np.abs(distances(fit))) < 4.0
+
+
+def test_wrong_direction_of_a_sensor_is_no_fit():
+    run = run_of()
+    upside_down = jv.Channel("a1", "acceleration", at=1, direction="down", gain_error=0.0)
+    wrong = jv.MeasuredRun(
+        (upside_down, *run.channels[1:]), run.times, run.values, run.clipped, run.change, run.notes, run.source
+    )
+    fit = jv.identify(start(), wrong, unknown=NAMES, throw=False)
+    assert fit.status_name in ("not_converged", "patterned")
+
+
+def test_contradicted_mass_is_said():
+    known = {"machine.mass[0]": "150 kg +- 1 %", "machine.mass[1]": "95 kg +- 1 %"}
+    fit = jv.identify(start(), run_of(), unknown=NAMES, known=known)
+    assert fit.status_name == "contradicted"
+    assert any("machine.mass[" in note and "standard errors away" in note for note in fit.notes)
+
+
+def test_results_are_saved_and_drawn(tmp_path):
+    fit = fitted()
+    again = jv.load(fit.save(tmp_path / "fit"))
+    assert again.summary() == fit.summary() and "mode 2" in fit.summary()
+    assert len(fit.plot().axes) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"unknown": []}, "unknown is \\[\\]; it must be a list of names"),
+        ({"unknown": ["machine.stifness"]}, "did you mean 'machine.stiffness'"),
+        ({"unknown": NAMES, "dry": True}, "dry is for a BearingPendulum"),
+        ({"unknown": NAMES, "known": {"machine.mass[0]": "95 N"}}, "machine.mass"),
+        ({"unknown": ["drive.inertia"]}, "is a number of the drive"),
+    ],
+)
+def test_wrong_arguments_end_in_one_sentence(arguments, words):
+    with pytest.raises(jv.InputError, match=words):
+        jv.identify(start(), run_of(), **arguments)
+
+
+def test_loads_on_the_rotor_are_refused():
+    scene = jv.Scene(start().machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+    with pytest.raises(jv.InputError, match="has loads that move on the rotor"):
+        jv.identify(scene, run_of(), unknown=["machine.stiffness"])
+
+
+def test_motor_needs_a_channel_of_the_rotor():
+    run = run_of()
+    without = jv.MeasuredRun(
+        run.channels[:2],
+        *({name: each for name, each in part.items() if name != "tacho"} for part in (run.times, run.values, run.clipped)),
+        run.change,
+        run.notes,
+        run.source,
+    )
+    with pytest.raises(jv.InputError, match="add a channel of kind pulses, angle or speed"):
+        jv.identify(start(), without, unknown=NAMES)
