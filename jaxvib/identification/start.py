@@ -14,7 +14,7 @@ import numpy as np
 import optimistix as optx
 from jax import Array
 
-from jaxvib.equations.linear import linear_model, turning
+from jaxvib.equations.linear import linear_model, rotating_direction
 from jaxvib.identification.problem import Problem
 from jaxvib.identification.response import Samples, Unknowns, rows_of_channel
 from jaxvib.machine.scene import Scene
@@ -69,7 +69,7 @@ def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds
     own = samples.scene(unknowns.scene(scene, x))
     model = linear_model(own)
     mount, exciter = model.mounts[0], own.exciters[0]
-    direction = mount.rotor_rows().T @ turning(mount, exciter.direction)
+    direction = mount.rotor_rows().T @ rotating_direction(mount, exciter.direction)
     rows = []
     for channel in samples.channels:
         if channel.kind == "force":
