@@ -26,7 +26,7 @@ _MIN_PULSES = 12
 _MAX_INTERVALS = 512
 """Largest number of intervals of a spline."""
 
-_COARSE = 0.1
+_MAX_SPEED_CHANGE = 0.1
 """Relative change of the speed between two pulses above which the angle between them is uncertain."""
 
 
@@ -111,7 +111,7 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
         speed = spline(0.5 * (time[1:] + time[:-1]), 1)
         fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite nothing
         change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=fast, initial=0.0))
-        if change > _COARSE:
+        if change > _MAX_SPEED_CHANGE:
             notes.append(
                 f"{where}: the speed changes by up to {change:.0%} from one pulse to the next, and the angle between them is "
                 "uncertain; use more pulses per turn"
@@ -144,7 +144,7 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
     while intervals <= min(_MAX_INTERVALS, n // 4):
         inner = np.linspace(time[0], time[-1], intervals + 1)
         knots = np.concatenate([[time[0]] * _DEGREE, inner, [time[-1]] * _DEGREE])
-        basis = BSpline.design_matrix(time, knots, _DEGREE)
+        basis: Any = BSpline.design_matrix(time, knots, _DEGREE)
         count = basis.shape[1] + offsets.shape[1]
         square = np.zeros((count, count))
         size = basis.shape[1]

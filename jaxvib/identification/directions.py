@@ -16,7 +16,7 @@ from jaxvib.identification.fit import Fitted
 UNDETERMINED = 1.0
 """Relative standard error of a direction above which it counts as undetermined: a factor of e."""
 
-_SHARE = 0.05
+_MIN_SHARE = 0.05
 """Share of a number in an undetermined direction above which the number itself counts as undetermined."""
 
 _COMMON = 0.95
@@ -84,7 +84,7 @@ def information_of(fitted: Fitted) -> Information:
     lost = errors > UNDETERMINED
     covariance = (axes[:, ~lost] * errors[~lost] ** 2) @ axes[:, ~lost].T
     undetermined = axes[:, lost]
-    determined = ~np.any(np.abs(undetermined) > _SHARE, axis=1)
+    determined = ~np.any(np.abs(undetermined) > _MIN_SHARE, axis=1)
     loose_errors, loose_axes = _errors(loose)
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
     # Directions that nothing determines are left out of those that the gains determine.
