@@ -55,6 +55,9 @@ from jaxvib.equations.forces import energy, foundation_force, normal_force, powe
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.motion.start import initial_state, with_spin
 
+# Measures of a vibration
+from jaxvib.steady.measures import VibrationMeasures, conveying_speed, vibration_measures, vibration_zone
+
 # Motion of points
 from jaxvib.motion.analysis.points import PointMotion
 from jaxvib.steady.points import Deck, Ellipse, ellipse_of
@@ -233,6 +236,11 @@ __all__ = [
     "power",
     "foundation_force",
     "normal_force",
+    # Measures of a vibration
+    "vibration_measures",
+    "VibrationMeasures",
+    "vibration_zone",
+    "conveying_speed",
     # Motion of points
     "ellipse_of",
     "Ellipse",

@@ -23,6 +23,7 @@ from optimize.quantities.jams import (
 from optimize.quantities.machine import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
 from optimize.quantities.motion import peak_force, settling_time
 from optimize.quantities.quantity import Demand, Quantity, largest, least
+from optimize.quantities.severity import acceleration, shaft_torque, stroke, support_load, transmissibility, velocity
 from optimize.space import DesignSpace, HeldQuantity, hold
 from optimize.synthesize import Outcome, Synthesis, synthesize
 
@@ -35,6 +36,7 @@ __all__ = [
     "Outcome",
     "Quantity",
     "Synthesis",
+    "acceleration",
     "amplitude",
     "expected",
     "fold_margin",
@@ -53,12 +55,17 @@ __all__ = [
     "product",
     "quantile",
     "settling_time",
+    "shaft_torque",
     "spring_cost",
     "static_deflection",
+    "stroke",
     "support_frequency_squared",
+    "support_load",
     "synthesize",
     "total",
     "total_mass",
+    "transmissibility",
     "under",
+    "velocity",
     "worst",
 ]

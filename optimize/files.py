@@ -11,7 +11,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import Tables, build_part, load_scene, misplaced_name, read_toml, suggest_name
 from jaxvib.units import count, number
-from optimize.quantities import jams, machine, motion
+from optimize.quantities import jams, machine, motion, severity
 from optimize.quantities.cases import expected, worst
 from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Synthesis
@@ -20,7 +20,7 @@ from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
 
 _QUANTITIES = {
-    name: getattr(module, name) for module in (jams, machine, motion) for name in module.__all__ if name != "between"
+    name: getattr(module, name) for module in (jams, machine, motion, severity) for name in module.__all__ if name != "between"
 }
 """Quantities of design files by name."""
 

@@ -44,6 +44,7 @@ def run_document(run: jv.Run) -> dict[str, object]:
     return {
         **measured_document(run, run.scene),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
+        **({} if run.trajectory is None else fields_of(run, "largest_displacement", "largest_force")),
         **fields_of(run, "coincident", "error", "evaluations", "seconds"),
     }
 

@@ -73,6 +73,8 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
         output.csv(csv, jv.branches(scene), "point")
     jams = [found.select(k) for k in found.mode_numbers()]
     growth = dict(zip(found.mode.tolist(), growth_of_free_loads(scene, found.omega).tolist(), strict=True))
+    staying = [jam for jam in jams if bool(jam.stable) and not growth[int(jam.mode)] > 0.0]
+    measures = {int(jam.mode): jax.device_get(jv.vibration_measures(scene, jam)) for jam in staying}
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
     document = {
         "rotor_speed": scene.drive.speed,
@@ -87,6 +89,7 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
             }
             for jam in jams
         ],
+        "measures": [_measures_document(jam, measures[int(jam.mode)]) for jam in jams if int(jam.mode) in measures],
         "folds": [{"omega": found.folds.omega[k], "rotor_speed": found.folds.rotor_speed[k]} for k in folds],
     }
 
@@ -120,12 +123,20 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
         ]
         if rows:
             lines.append("stays, no: after a small disturbance the loads (balls, rollers, pendulums) leave")
+        for mode, each in measures.items():
+            lines.append("\n".join([f"mode {mode}:", *(f"  {line}" for line in each.summary().splitlines())]))
         if folds:
             pairs = [[f"{scale * found.folds.omega[k]:.5g}", f"{scale * found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
         return "\n".join([*lines, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
+
+
+def _measures_document(jam: jv.Jam, measures: jv.VibrationMeasures) -> dict[str, object]:
+    """Return the measures of a jam, with its mode."""
+    named = ("stroke", "acceleration", "velocity", "exciter_force", "transmissibility", "isolation_efficiency")
+    return {**fields_of(jam, "mode"), **fields_of(measures, *named, "static_load", "dynamic_load", "torque", "power")}
 
 
 def _stays(jam: jv.Jam, growth: float) -> str:

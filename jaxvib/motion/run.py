@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.forces import normal_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.mount import on_body, read_place
@@ -30,6 +30,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.measures import acceleration_of, rms_velocity_of
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number
@@ -134,6 +135,20 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         """True if the run reached its end, settled or not."""
         return functools.reduce(operator.or_, (self.status == getattr(RunStatus, name) for name in ENDS))
 
+    @property
+    def largest_displacement(self) -> Array:
+        """Largest displacement of each coordinate from rest on the way, (nd,) m (rad for tilts), among the stored states."""
+        return jnp.max(jnp.abs(self._whole.state.displacement), axis=0)
+
+    @property
+    def largest_force(self) -> Array:
+        """Largest force on the foundation on the way, N, among the stored states; of two directions the resultant."""
+        return jnp.sqrt(jnp.max(jnp.sum(self._whole.foundation_force**2, axis=1)))
+
+    @property
+    def _whole(self) -> Trajectory:
+        return self.window if self.trajectory is None else self.trajectory
+
     def summary(self) -> str:
         """Return the outcome of the run as text; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
@@ -156,11 +171,30 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
                 f"{rotor} at {speed_text(rotors, 6)}",
                 f"  {self.extent(self.scene)}",
+                f"  {self._severity()}",
+                *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
                 *self._detachment(),
             ]
         )
+
+    def _severity(self) -> str:
+        """Return strokes, accelerations and velocities of the coordinates that are lengths, at the speed of the loads."""
+        structure, speed = self.scene.machine.structure(), abs(float(self.omega))
+        named = [
+            f"{name} {quantity_text(2.0 * float(a), 'm', 4)}, {float(acceleration_of(a, speed)):.3g} g, "
+            f"{1e3 * float(rms_velocity_of(a, speed)):.4g} mm/s"
+            for name, a, unit in zip(structure.coordinates, np.asarray(self.amplitude), structure.units, strict=True)
+            if unit == "m"
+        ]
+        return f"stroke, peak to peak, acceleration, RMS velocity: {'; '.join(named)}"
+
+    def _on_the_way(self) -> str:
+        structure = self.scene.machine.structure()
+        largest = zip(structure.coordinates, np.asarray(self.largest_displacement), structure.units, strict=True)
+        named = ", ".join(f"{name} {quantity_text(x, unit, 4)}" for name, x, unit in largest)
+        return f"largest on the way: {named}; foundation force {quantity_text(self.largest_force, 'N', 4)}"
 
     @property
     def _turning(self) -> str:

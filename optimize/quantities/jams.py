@@ -9,14 +9,12 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.coincident import friction_on_light_loads
-from jaxvib.equations.linear import jammed_loads, peak_force
+from jaxvib.equations.linear import peak_force
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.effects.base import has_term
-from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
+from jaxvib.steady.measures import shaft_torque
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity, Tier
@@ -32,10 +30,6 @@ __all__ = [
     "phase",
     "power",
 ]
-
-_SLIP = 1e-4
-"""Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both ways
-of computing it have a relative rounding error of 1e-12."""
 
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
@@ -57,7 +51,7 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
     raise InputError("of", f"is {quoted(of)}; give a platform or a pair of different platforms of 1 to {n}")
 
 
-def _make_quantity(
+def jam_quantity(
     name: str,
     unit: str,
     function: Callable[..., Array],
@@ -74,13 +68,13 @@ def _make_quantity(
     return BuiltinQuantity(name, unit, function, mode, of, tier, (mode, *settings), tiers, text, pieces_function)
 
 
-def _platform_text(of: Pair) -> str:
+def pair_text(of: Pair) -> str:
     if of is None:
         return ""
     return f" of platform {of}" if isinstance(of, int) else f" of platform {of[0]} against {of[1]}"
 
 
-def _pair(of: Pair | list[int]) -> Pair:
+def pair_of(of: Pair | list[int]) -> Pair:
     """Return a platform or a pair of platforms; a list from a design file becomes a pair. **Raises** `InputError` otherwise."""
     parts = of if isinstance(of, (list, tuple)) else (of,)
     whole = all(isinstance(part, (int, np.integer)) and not isinstance(part, bool) for part in parts)
@@ -109,11 +103,11 @@ def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity
     >>> amplitude(mode=3, of=1).unit
     'm'
     """
-    of = _pair(of)
-    return _make_quantity("amplitude", "m", _amplitude, mode, tier, f"amplitude{_platform_text(of)}", of=of, settings=(of,))
+    of = pair_of(of)
+    return jam_quantity("amplitude", "m", jam_amplitude, mode, tier, f"amplitude{pair_text(of)}", of=of, settings=(of,))
 
 
-def _amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
+def jam_amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
     chosen = between(evaluation.scene, of)
     if tier == "leading":
         jam = evaluation.jam(mode)
@@ -145,11 +139,11 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
     >>> (phase(mode=3) > "170 deg").words
     'phase between platforms 1 and 2, mode 3 at least 170 deg'
     """
-    pair = _pair(of)
+    pair = pair_of(of)
     if not isinstance(pair, tuple) or len(pair) != 2:
         raise InputError("of", f"is {quoted(of)}; a phase needs a pair of platforms such as (1, 2)")
     text = f"phase between platforms {pair[0]} and {pair[1]}"
-    return _make_quantity("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
+    return jam_quantity("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
 
 
 def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
@@ -183,16 +177,16 @@ def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "le
     'N'
     """
     if harmonic is None:
-        return _make_quantity(
-            "foundation_force", "N", _force, mode, tier, "foundation force", settings=(None,), pieces_function=_peaks
+        return jam_quantity(
+            "foundation_force", "N", jam_force, mode, tier, "foundation force", settings=(None,), pieces_function=_peaks
         )
     count(harmonic, "harmonic")
     text = f"harmonic {harmonic} of the foundation force"
     tier = "exact" if tier == "leading" else tier
-    return _make_quantity("force_harmonic", "N", _force, mode, tier, text, settings=(harmonic,), tiers=("exact",))
+    return jam_quantity("force_harmonic", "N", jam_force, mode, tier, text, settings=(harmonic,), tiers=("exact",))
 
 
-def _force(evaluation: Evaluation, tier: Tier, mode: int, harmonic: int | None) -> Array:
+def jam_force(evaluation: Evaluation, tier: Tier, mode: int, harmonic: int | None) -> Array:
     if tier == "leading":
         return evaluation.jam(mode).foundation_force
     if tier == "time":
@@ -222,26 +216,26 @@ def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -
     >>> force_per_amplitude(mode=3).unit
     'N/m'
     """
-    of = _pair(of)
-    text = f"force per amplitude{_platform_text(of)}"
-    return _make_quantity(
+    of = pair_of(of)
+    text = f"force per amplitude{pair_text(of)}"
+    return jam_quantity(
         "force_per_amplitude", "N/m", _ratio, mode, tier, text, of=of, settings=(of,), pieces_function=_peaks_per_amplitude
     )
 
 
 def _ratio(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
-    return _force(evaluation, tier, mode, None) / _amplitude(evaluation, tier, mode, of)
+    return jam_force(evaluation, tier, mode, None) / jam_amplitude(evaluation, tier, mode, of)
 
 
 def _peaks(evaluation: Evaluation, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
     """Return the peaks of the exact force within the period. If its first harmonic is small, several are nearly equal."""
     if tier != "exact" or sign < 0.0:
-        return sign * _force(evaluation, tier, mode, harmonic)[None]
+        return sign * jam_force(evaluation, tier, mode, harmonic)[None]
     return evaluation.orbit(mode).force_peaks()
 
 
 def _peaks_per_amplitude(evaluation: Evaluation, sign: float, tier: Tier, mode: int, of: Pair) -> Array:
-    return _peaks(evaluation, sign, tier, mode, None) / _amplitude(evaluation, tier, mode, of)
+    return _peaks(evaluation, sign, tier, mode, None) / jam_amplitude(evaluation, tier, mode, of)
 
 
 @validated
@@ -257,10 +251,10 @@ def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
     >>> jam_frequency(mode=3).unit
     'rad/s'
     """
-    return _make_quantity("jam_frequency", "rad/s", _frequency, mode, tier, "jam frequency")
+    return jam_quantity("jam_frequency", "rad/s", jam_speed, mode, tier, "jam frequency")
 
 
-def _frequency(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
+def jam_speed(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     if tier == "leading":
         return evaluation.jam(mode).omega
     return evaluation.orbit(mode).omega if tier == "exact" else evaluation.jam_run(mode).omega
@@ -282,7 +276,7 @@ def fold_margin(*, mode: int) -> Quantity:
     >>> (fold_margin(mode=3) > "60 rpm").words
     'distance to the fold, mode 3 at least 60 rpm'
     """
-    return _make_quantity(
+    return jam_quantity(
         "fold_margin", "rad/s", _margin, mode, "leading", "distance to the fold", tiers=("leading",), pieces_function=_margins
     )
 
@@ -311,7 +305,7 @@ def largest_multiplier(*, mode: int) -> Quantity:
     >>> (largest_multiplier(mode=3) < 0.99).words
     'largest multiplier, mode 3 at most 0.99'
     """
-    return _make_quantity("largest_multiplier", "", _multiplier, mode, "exact", "largest multiplier", tiers=("exact",))
+    return jam_quantity("largest_multiplier", "", _multiplier, mode, "exact", "largest multiplier", tiers=("exact",))
 
 
 def _multiplier(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
@@ -332,20 +326,11 @@ def power(*, mode: int, tier: Tier = "leading") -> Quantity:
     >>> power(mode=3).unit
     'W'
     """
-    return _make_quantity("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
+    return jam_quantity("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
 
 
 def _power(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     if tier == "exact":
         return evaluation.orbit(mode).power
-    scene, loads, jam = evaluation.scene, jammed_loads(evaluation.scene), evaluation.jam(mode)
-    n, omega = scene.drive.speed, jam.omega
-    torque = loads.drag_sum() * (n - omega)
-    if has_term(scene.all_effects, ContactFriction):
-        torque = torque + friction_on_light_loads(loads, scene.all_effects, omega, n)
-    # With strong drag n - Omega has few correct digits. The torque is then computed from the dissipation of the carrier, which
-    # has no such loss of digits.
-    close = n - omega < _SLIP * n
-    taken = evaluation.jammed.dissipated(omega * jnp.where(close, jam.displacement, 0.0))
-    torque = jnp.where(close, taken / omega, torque)
-    return n * torque
+    jam = evaluation.jam(mode)
+    return evaluation.scene.drive.speed * shaft_torque(evaluation.jammed, jam.omega, jam.displacement)

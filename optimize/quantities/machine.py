@@ -8,15 +8,13 @@ from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers.named import spec_of
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.structures.platforms import Platforms
+from jaxvib.steady.measures import require_platforms, static_deflections
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
@@ -24,17 +22,9 @@ from optimize.quantities.user_inputs import number_in
 
 __all__ = ["product", "spring_cost", "static_deflection", "support_frequency_squared", "total", "total_mass"]
 
-_GRAVITY = 9.80665
-
 
 def _make_quantity(name: str, unit: str, function: Callable[..., Array], text: str, *settings: object) -> Quantity:
     return BuiltinQuantity(name, unit, function, tiers=("leading",), text=text, settings=settings)
-
-
-def _platforms(scene: Scene, what: str) -> Platforms:
-    if not isinstance(scene.machine, Platforms):
-        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}; {what} needs a machine of platforms")
-    return scene.machine
 
 
 def support_frequency_squared() -> Quantity:
@@ -58,7 +48,7 @@ def support_frequency_squared() -> Quantity:
 
 
 def _budget(evaluation: Evaluation, tier: Tier) -> Array:
-    machine = _platforms(evaluation.scene, "the budget")
+    machine = require_platforms(evaluation.scene, "the budget")
     return jnp.sum(machine.stiffness / jnp.diagonal(evaluation.model.mass))
 
 
@@ -138,7 +128,7 @@ def total_mass() -> Quantity:
 
 def _mass(evaluation: Evaluation, tier: Tier) -> Array:
     scene = evaluation.scene
-    machine = _platforms(scene, "the mass")
+    machine = require_platforms(scene, "the mass")
     return jnp.sum(machine.mass) + jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,)))
 
 
@@ -165,26 +155,10 @@ def static_deflection(of: int | None = None) -> Quantity:
 
 
 def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
-    machine = _platforms(evaluation.scene, "the deflection")
-    model, carried = linear_model(evaluation.scene), _has_support(machine)
-    # Platforms without supports make the stiffness matrix singular. They are fixed here, and their result is NaN.
-    held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
-    sag = jnp.linalg.solve(model.carrier.stiffness + held, _GRAVITY * jnp.diagonal(model.mass))
+    sag = static_deflections(evaluation.scene)
     if of is not None and of > sag.shape[0]:
         raise InputError("of", f"is {of}; the machine has platforms 1 to {sag.shape[0]}")
-    sag = jnp.where(carried, jnp.abs(sag), jnp.nan)
     return jnp.max(sag) if of is None else sag[of - 1]
-
-
-def _has_support(machine: Platforms) -> Array:
-    """Return True (n,) for platforms with a support, or connected by links to a platform with a support."""
-    n = machine.mass.shape[0]
-    joined = jnp.eye(n, dtype=bool)
-    for (i, j), stiffness in zip(machine.links, machine.link_stiffness, strict=True):
-        joined = joined.at[[i - 1, j - 1], [j - 1, i - 1]].max(stiffness > 0.0)
-    for _ in range(max(n - 1, 1).bit_length()):  # each product doubles the length of the included paths
-        joined = jnp.any(joined[:, :, None] & joined[None], axis=1)
-    return jnp.any(joined & (machine.stiffness > 0.0)[None], axis=1)
 
 
 @validated
@@ -220,7 +194,7 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
 
 
 def _cost(evaluation: Evaluation, tier: Tier, stiffness: tuple[float, ...], price: tuple[float, ...]) -> Array:
-    machine = _platforms(evaluation.scene, "the cost of springs")
+    machine = require_platforms(evaluation.scene, "the cost of springs")
     springs = jnp.concatenate([jnp.ravel(machine.stiffness), jnp.ravel(machine.link_stiffness)])
     each = jnp.interp(springs, jnp.asarray(stiffness), jnp.asarray(price), left="extrapolate", right="extrapolate")
     least = jnp.where(springs < stiffness[0], price[0], jnp.where(springs > stiffness[-1], price[-1], 0.0))

@@ -28,7 +28,7 @@ def test_modes_json_has_the_promised_keys(typed):
     code, out, err = typed("modes", "machine.toml", "--json")
     document = json.loads(out)
     assert code == 0 and err == ""
-    assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "folds"}
+    assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "measures", "folds"}
     keys = {"mode", "omega", "stable", "growth_of_free_loads", "status", "amplitude", "foundation_force"}
     assert set(document["modes"][0]) == keys and document["judged"] == "by slope, for light loads that stay together"
     assert set(document["folds"][0]) == {"omega", "rotor_speed"}
