@@ -139,7 +139,7 @@ class RotorDynamics(eqx.Module):
         return Motion(state, speed, self._imbalance_derivatives(t, state), no_loads, drag, weight, no_contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
-        """Express the exciter's own accelerations in terms of those of the mount.
+        """Express the exciter's own accelerations in terms of the accelerations of the mount's rows.
 
         The friction of `contact` is linear in the accelerations.
         """
@@ -300,7 +300,7 @@ class ExciterDynamics(RotorDynamics):
         return Motion(state, speed, imbalance_derivatives, found, drag, self.weight(t, state), contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
-        """Express the accelerations of loads and rotor in terms of those of the mount.
+        """Express the accelerations of loads and rotor in terms of the accelerations of the mount's rows.
 
         The friction of `contact` is linear in the accelerations.
         """

@@ -160,7 +160,7 @@ class JammedModel(LinearModel):
             return small_solve(self.dynamic_stiffness(omega, speed), self.force(omega))
 
         def product(y: Array) -> Array:
-            """Return D(w) y from the matrices: derivatives are those of the matrices, not of their eigenvectors."""
+            """Return D(w) y from the matrices, so that derivatives follow from the matrices and not from eigenvectors."""
             carrier = self.carrier
             elastic, inertia, viscous = (_real_times(a, y) for a in (carrier.stiffness, self.mass, carrier.damping))
             return elastic - omega**2 * inertia + 1j * omega * viscous

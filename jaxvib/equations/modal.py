@@ -68,7 +68,8 @@ def modal_response(
     """
     n, eps = frequencies.shape[0], jnp.finfo(frequencies.dtype).eps
     positive = jnp.where(frequencies > 0.0, frequencies, jnp.inf)
-    # q must follow from Omega q. A motion that is free to drift therefore gets a spring, too soft to matter at any load speed.
+    # q must follow from Omega q. A motion that is free to drift therefore gets a spring that is too soft to have an effect at
+    # any load speed.
     free = jnp.where(jnp.isfinite(jnp.min(positive)), jnp.min(positive), 1.0) * eps ** (1 / 3)
     stiff = jnp.where(frequencies > 0.0, frequencies, free)
     coupling, rounding = shapes.T @ damping @ shapes, jnp.abs(shapes.T) @ jnp.abs(damping) @ jnp.abs(shapes)

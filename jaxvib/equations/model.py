@@ -23,7 +23,7 @@ class Model(eqx.Module):
     **Attributes**
 
     - `scene`, and its `carrier`, see `Carrier`
-    - `mounts` of its exciters, see `Mount`; `mount`, that of the only exciter
+    - `mounts`: the mounts of its exciters, see `Mount`; `mount`: the mount of the only exciter
     - `supports`: rows (k, nd) of the place of each `SupportForce` of the scene's effects
     """
 

@@ -104,7 +104,7 @@ def resolve_contact(
     - `needed`: force along the track in the motion in which all loads roll, N
     - `a`: acceleration in that motion of the points that carry the loads, by axis
     - `rolling`: generalised forces on loads that roll
-    - `centre`: generalised forces at the centres of the loads, without those of the contact
+    - `centre`: generalised forces at the centres of the loads, without the contact forces
     - `friction` of rolling loads
     """
     kappa = loads.inertia_factor()

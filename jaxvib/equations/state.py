@@ -14,7 +14,7 @@ from jaxvib.results.fields import in_unit, part
 
 
 class Spin(eqx.Module):
-    """Free rotation of rolling loads, if effects release it (`FreeSpin`, `Sliding`); also the time derivative of one.
+    """Free rotation of rolling loads, if effects release it (`FreeSpin`, `Sliding`), or its time derivative.
 
     **Attributes** (each is None if no effect releases it)
 
@@ -33,7 +33,7 @@ class Spin(eqx.Module):
 
 
 class ExciterState(eqx.Module):
-    """Positions and velocities of one exciter; also the time derivative of them.
+    """Positions and velocities of one exciter, or their time derivatives.
 
     All angles are anticlockwise.
 
@@ -68,7 +68,7 @@ _OMITTED: Any = _Omitted()
 
 
 class State(eqx.Module):
-    """Positions and velocities of all parts; also the time derivative of such a state.
+    """Positions and velocities of all parts of a scene, or their time derivatives.
 
     **Arguments**
 

@@ -132,7 +132,7 @@ class Loads(Part):
 
     @abc.abstractmethod
     def inertia_factor(self) -> Array:
-        """Return kappa, the inertia of a load along its track relative to that of its mass alone."""
+        """Return kappa: the inertia of a load along its track, divided by the inertia of an equal point mass."""
 
     @abc.abstractmethod
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:

@@ -216,7 +216,7 @@ ball_radius = "12.5 mm"     # of a ball; the rest of the tube is the gap in whic
 kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
 speed = "140 rad/s"
 
-[effects]                   # only those of the scene
+[effects]                   # effects of the scene
 gravity = { along = "axis" }                   # the axis is vertical
 static_imbalance = { moment = "6.87 g m" }     # of the rotor: mass times eccentricity
 rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths the change of sign

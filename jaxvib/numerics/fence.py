@@ -48,7 +48,7 @@ def through_memory(values: Sequence[Array], one: Array) -> list[Array]:
 
 @jax.custom_jvp
 def _from_bits(stack: Array, one: Array) -> list[Array]:
-    """Unstack numbers by reading their bits. The compiler would replace a number that is read as a number by its operands.
+    """Unstack numbers by reading their bits. If they were read as numbers, the compiler would replace them by their operands.
     Tangents are unstacked as numbers."""
     bits = jax.lax.bitcast_convert_type(stack, jnp.dtype(f"uint{8 * stack.dtype.itemsize}"))
     return [jax.lax.bitcast_convert_type(bits[i], stack.dtype) for i in range(len(stack))]

@@ -21,7 +21,7 @@ _PHASE = 1.0
 def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
     """Nodes c of Radau's right quadrature on [0, 1] and the matrix a, integrals of the Lagrange polynomials up to each node.
 
-    Both follow from Legendre polynomials, whose matrices are well conditioned; those of powers would lose five digits.
+    Both follow from Legendre polynomials, whose matrices are well conditioned; powers in their place would lose five digits.
     """
     ends = np.zeros(stages + 1)
     ends[-2:] = -1.0, 1.0  # the nodes are the roots of P_s - P_(s-1), 1 is one of them

@@ -23,7 +23,8 @@ Scalar: TypeAlias = Any
 """A traced scalar, a NumPy scalar, or a `ComplexParts`: one entry of `Scalars`."""
 
 Rule: TypeAlias = Callable[..., Scalars | list[Scalars]]
-"""Function from the `Scalars` of an operation's arguments, and its parameters as keywords, to those of its results."""
+"""Function that returns the `Scalars` of an operation's results from the `Scalars` of its arguments, with its parameters as
+keywords."""
 
 _Axes: TypeAlias = tuple[Sequence[int], Sequence[int]]
 _Function: TypeAlias = Callable[..., PyTree[Array]]
@@ -252,9 +253,8 @@ def _pad(x: Scalars, value: Scalars, *, padding_config: Sequence[tuple[int, int,
 
 
 def primitive_of(function: _Function, *arguments: ArrayLike) -> Primitive:
-    """Primitive of a public function of JAX that consists of one.
-
-    **Raises** `NotScalarizable` if it consists of several, or of none.
+    """Return the primitive of a public function of JAX that consists of a single primitive. **Raises** `NotScalarizable` if
+    the function consists of several primitives, or of none.
     """
     equations = jax.make_jaxpr(function)(*arguments).jaxpr.eqns
     if len(equations) != 1:

@@ -167,7 +167,7 @@ class LoadContact(Effect):
         return 2.0 * damping_ratio(self.restitution) * jnp.sqrt(self.stiffness * self._reduced_mass(loads))
 
     def _reduced_mass(self, loads: Loads) -> Array:
-        """Return mu. If the loads differ, it is that of the lightest ones."""
+        """Return mu; if the loads differ, its value for the lightest loads."""
         return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (ball_radius(loads) / loads.arm()[0]) ** 2)
 
 

@@ -126,7 +126,7 @@ class NamedNumber(NamedTuple):
 def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
     """Return all continuous parameters of a scene by name.
 
-    An array of one unit has one name. In an array of several units each entry has its own name.
+    An array whose entries have one unit has one name. If the entries have different units, each entry has its own name.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

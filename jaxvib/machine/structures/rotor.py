@@ -37,8 +37,8 @@ class Rotor(Machine):
     - `mass` M kg; `transverse_inertia` A and `polar_inertia` C kg m^2, of the rotor without loads
     - `stiffness` k (2,) N/m, `damping` (2,) N s/m and `position` L (2,) m along the axis, of the two supports
     - `stations` s of the loads along the axis, m: one for all (scalar) or (count,)
-    - `stiffness_terms` (c1 N/m, c2 N, c3 N m), `damping_terms` (b1 N s/m, b2 N s, b3 N m s), or None for those of
-      the supports, c1 = k_1 + k_2, c2 = k_1 L_1 + k_2 L_2, c3 = k_1 L_1^2 + k_2 L_2^2, and the same for b
+    - `stiffness_terms` (c1 N/m, c2 N, c3 N m), `damping_terms` (b1 N s/m, b2 N s, b3 N m s); None: the terms of the supports,
+      c1 = k_1 + k_2, c2 = k_1 L_1 + k_2 L_2, c3 = k_1 L_1^2 + k_2 L_2^2, and the same for b
 
     Source: Artyunin 2013, equation (1), with L_2 counted negative.
     """
@@ -149,10 +149,10 @@ def rotor(
     - `position` (2,) of the supports along the axis, m from the mass centre, one side negative; typical: 0.1 to 0.5
     - `stations` of the loads along the axis, m from the mass centre, one number or one for each load; typical: -0.3 to 0.3,
       default 0
-    - `stiffness_terms` (c1, c2, c3) in N/m, N, N m: a list of three in place of those of the supports; typical: 1e6, up to 2e4,
-      3e4
-    - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of those of the supports; typical: 800, up to
-      10, 20
+    - `stiffness_terms` (c1, c2, c3) in N/m, N, N m: a list of three in place of the terms that follow from the supports;
+      typical: 1e6, up to 2e4, 3e4
+    - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of the terms that follow from the supports;
+      typical: 800, up to 10, 20
 
     **Returns** `Rotor`.
 

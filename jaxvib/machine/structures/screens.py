@@ -29,7 +29,7 @@ at = [1.6, -0.3]
 stiffness = ["280 N/mm", "460 N/mm"]
 damping = [2000.0, 2500.0]
 
-[[exciters]]                # the direction of throw is that of the point halfway between the axes, here 45 degrees
+[[exciters]]                # direction of throw: from the centre of mass to the midpoint of both axes, here 45 degrees
 at = [0.46, 0.81]
 direction = 1               # anticlockwise
 unbalance = { force = "50 kN", at = "1000 rpm" }    # centrifugal force from the catalogue, or "4.56 kg m"
@@ -97,7 +97,7 @@ at = [0.8, -0.15]
 stiffness = ["80 N/mm", "126 N/mm"]
 damping = [300.0, 400.0]
 
-[[exciters]]                # halfway between the axes lies opposite to the direction of throw, at 25 + 180 degrees
+[[exciters]]                # the midpoint of both axes lies opposite to the direction of throw, at 25 + 180 degrees
 at = [-0.607, -0.118]
 direction = 1               # anticlockwise
 unbalance = { force = "10 kN", at = "1500 rpm" }

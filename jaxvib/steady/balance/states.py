@@ -229,7 +229,8 @@ def _inscribed_polygon(sides: np.ndarray) -> np.ndarray:
         return 2.0 * np.arcsin(np.minimum(sides / sides[largest] * x, 1.0))
 
     # x = largest side / diameter. The centre is inside the polygon if the angles of the sides at x = 1 add up to a full turn or
-    # more. Otherwise it is beyond the largest side, whose angle is then the sum of the others, in the opposite direction.
+    # more. Otherwise the centre is beyond the largest side, whose angle is then the sum of the others, in the opposite
+    # direction.
     inside = centre_angles(1.0).sum() >= 2.0 * np.pi
     others = np.arange(sides.size) != largest
 

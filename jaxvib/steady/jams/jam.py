@@ -226,9 +226,10 @@ def jam_modes(scene: Scene) -> JamModes:
     - Rising pieces (odd modes) are stable by slope, falling ones are not
     - If the branch has more peaks than resonances, the lowest peaks, each of which covers a narrow range of rotor speeds, are
       ignored
-    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor speed
-      and that of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The amplitudes and
-      the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use `simulate`
+    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor
+      speed, and the force of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The
+      amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use
+      `simulate`
 
     **Arguments**: `scene` with a drive of constant speed and loads with drag; typical: loads of 0.1 % to 5 % of the machine's
     mass. The relative error of the result is about this share times the magnification at resonance, see `jam_orbit`.
@@ -368,8 +369,8 @@ def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
 
 
 def _solved_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]:
-    """Return load speeds on the monotone pieces at which the branch has the scene's rotor speed, and a mask of those that
-    exist."""
+    """Return load speeds on the monotone pieces at which the branch has the scene's rotor speed, and a mask, True for those
+    that exist."""
     target = model.scene.drive.speed
     gaps = pieces.speed_low - target, pieces.speed_high - target
     exists = (pieces.high > pieces.low) & (gaps[0] * gaps[1] <= 0.0)

@@ -146,9 +146,10 @@ def phase_jams(
       load speeds, the speed is solved for as well (`phase_jam`)
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out
-    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor speed
-      and that of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The amplitudes and
-      the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use `simulate`
+    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor
+      speed, and the force of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The
+      amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use
+      `simulate`
 
     **Arguments**
 

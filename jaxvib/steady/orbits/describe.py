@@ -74,7 +74,7 @@ class Orbit(Result):
     - `power`, W: mean power that the loads take from the rotor, by drag and dry friction
     - `stable`: True if small deviations of the loads from this motion decay, that is `multiplier` < 1
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
-    - `multipliers`, complex: all of them, those of loads that separate from each other last
+    - `multipliers`: all Floquet multipliers, complex; those of loads that separate from each other are the last ones
     - `trivial`: the multiplier that is 1, as computed
     - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m (rad for tilts), `force_harmonics` (nb, K), N: the
       c_k. Loads that have equal parameters have one deviation (G = 1), otherwise each has its own (G = count)

@@ -249,7 +249,7 @@ def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution)
     highest harmonic of psi is added.
     """
     deviation, omega, speed = motion
-    # Its orders are those of the grid, followed by the higher ones.
+    # The orders of the fine grid are those of `grid`, followed by higher orders.
     fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
 
     def residual(w: Array, n: Array) -> tuple[Array, tuple[Array, Array, _Balance]]:

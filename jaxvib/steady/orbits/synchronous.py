@@ -94,8 +94,8 @@ class SynchronousOrbit(PathsOfPoints, Result):
       directions of the force the root of their summed squares
     - `stable`: True if small disturbances decay, that is `multiplier` < 1
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
-    - `multipliers`, complex: all of them; `trivial`: the multiplier that is 1, as computed, NaN if an ideal drive turns an
-      unbalance, because a shift in time is then not a solution
+    - `multipliers`: all Floquet multipliers, complex; `trivial`: the multiplier that is 1, as computed, NaN if an ideal drive
+      turns an unbalance, because a shift in time is then not a solution
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
       of angles in rad, due to the number of harmonics
     - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad

@@ -279,8 +279,9 @@ def _solve_jvp(primals, tangents, *, grid: tuple[int, bool], forced: bool, is_kn
 def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, forced: bool) -> tuple[Array, Array]:
     """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion.
 
-    The error is that of the speed, relative, of angles, rad, and of displacements, relative to the largest one. It is
-    estimated from the change in one Newton step with the residuals at twice as many points, and from the highest harmonic.
+    The error is the largest of the relative error of the speed, the error of angles, rad, and the error of displacements
+    relative to the largest displacement. It is estimated from the change in one Newton step with the residuals at twice as
+    many points, and from the highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
     found, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates

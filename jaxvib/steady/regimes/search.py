@@ -121,7 +121,7 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
 
 
 def _sets_of_phases(prescribed: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """Return regular and random sets of phases (n, count); those of masses of prescribed speed are 0."""
+    """Return regular and random sets of phases (n, count); the phases of masses with prescribed speed are 0."""
     count = prescribed.size
     free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, count)
     n = free.size

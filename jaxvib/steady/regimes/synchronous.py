@@ -80,7 +80,7 @@ class AbstractSynchronousRegime(Result):
 
         angle of mass k in the fixed frame: direction_k (Omega t + phases_k),       q = Re(displacement exp(i Omega t))
 
-    The masses are those of the exciters in order: the unbalance of each, or its loads.
+    The masses are the unbalance or the loads of each exciter, in the order of the exciters.
 
     **Attributes**
 
