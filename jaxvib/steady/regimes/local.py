@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.averaged import largest_growth, mean_torque
+from jaxvib.equations.averaged import averaged_growth, largest_growth, mean_torque
 from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, influence_of, motion_of
 from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, svd_in_turn
 
@@ -76,6 +76,12 @@ def implicit_step(x: Array, slopes: Slopes, residuals: Array) -> Array:
     inverse = jnp.where(known, 1.0 / jnp.where(known, slopes.values, 1.0), 0.0)
     along = inverse * (slopes.left.T @ (slopes.rows * residuals))
     return x - slopes.columns * (slopes.right.T @ along)
+
+
+def regime_growth(balance: TorqueBalance, omega: Array, phase: Array, neutral: Array | int) -> Array:
+    """Return the growth rate of small disturbances of a regime according to the averaged equations, 1/s."""
+    vibration = omega**2 * influence_of(balance, omega)[1] @ (balance.unbalance * jnp.exp(1j * phase))
+    return averaged_growth(balance.averaged, omega, phase, vibration, balance.averaged.free_shifts + neutral)
 
 
 def quasi_static_growth(balance: TorqueBalance, omega: Array, phase: Array, neutral: Array | int) -> Array:

@@ -21,7 +21,7 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
-from jaxvib.steady.regimes.local import slopes_of, vibration_scale
+from jaxvib.steady.regimes.local import regime_growth, slopes_of, vibration_scale
 from jaxvib.steady.regimes.symmetry import Exchange, distinct_regimes, exchanges_of
 
 _EVEN_SPEEDS, _NEAR_SPEEDS = 200, 40
@@ -35,6 +35,12 @@ _STARTS_PER_PROGRAM = 256
 
 _MAX_ROUNDS = 3
 """Number of times that exchanged phases of known regimes are used as starts."""
+
+_EVEN_PHASES = 8
+"""Number of phases of the second mass from which `most_stable` starts."""
+
+_NEAR_WORKING_SPEED = 0.99
+"""Speed from which `most_stable` starts, relative to the largest working speed of a drive."""
 
 _ITERATIONS = 60
 """Maximum number of steps of Newton's method."""
@@ -72,10 +78,13 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _one_of_each_family(omega: np.ndarray, neutral: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return indices of isolated regimes and of the first member of each family."""
+    """Return indices of isolated regimes and of one member of each family, with the fewest neutral directions.
+
+    At some members of a family more phases can change than at others, for example if two pairs of exciters are in antiphase.
+    """
     kept: list[int] = []
-    for k in np.flatnonzero(neutral):
-        if not any(neutral[i] == neutral[k] and abs(omega[i] - omega[k]) <= tolerance * omega[k] for i in kept):
+    for k in sorted(np.flatnonzero(neutral), key=lambda k: neutral[k]):
+        if not any(abs(omega[i] - omega[k]) <= tolerance * omega[k] for i in kept):
             kept.append(int(k))
     return np.sort(np.concatenate([np.flatnonzero(neutral == 0), np.asarray(kept, dtype=int)]))
 
@@ -122,17 +131,47 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
 
 def _sets_of_phases(prescribed: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Return regular and random sets of phases (n, count); the phases of masses with prescribed speed are 0."""
-    count = prescribed.size
-    free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, count)
+    free = _free_phases(prescribed)
     n = free.size
-    halves = np.pi * (np.arange(min(2**n, _MOST_REGULAR))[:, None] >> np.arange(n) & 1)
-    splayed = 2.0 * np.pi / (n + 1) * np.arange(1, n + 1)[:, None] * np.arange(1, n + 1)
     even = np.linspace(-np.pi, np.pi, _PHASES_PER_UNKNOWN, endpoint=False)[:, None] if n == 1 else np.zeros((0, n))
     random = np.random.default_rng(0).uniform(-np.pi, np.pi, (_PHASES_PER_UNKNOWN * n * n if n > 1 else 0, n))
-    sets = np.concatenate([halves, splayed, even, random])
+    return _with_fixed(np.concatenate([_regular_sets(n), even, random]), free, prescribed.size, dtype)
+
+
+def _free_phases(prescribed: np.ndarray) -> np.ndarray:
+    """Return the masses whose phases are unknown."""
+    return np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
+
+
+def _regular_sets(n: int) -> np.ndarray:
+    """Return sets (sets, n) of phases that are multiples of half a turn, or spread evenly."""
+    halves = np.pi * (np.arange(min(2**n, _MOST_REGULAR))[:, None] >> np.arange(n) & 1)
+    splayed = 2.0 * np.pi / (n + 1) * np.arange(1, n + 1)[:, None] * np.arange(1, n + 1)
+    return np.concatenate([halves, splayed])
+
+
+def _with_fixed(sets: np.ndarray, free: np.ndarray, count: int, dtype: np.dtype) -> np.ndarray:
+    """Return sets of all phases (sets, count) from those of the `free` masses; the others are 0."""
     phases = np.zeros((len(sets), count), dtype)
     phases[:, free] = sets
     return phases
+
+
+def most_stable(balance: TorqueBalance) -> tuple[Array, Array]:
+    """Return the speed, rad/s, and the phases (count,) of the regime with the smallest growth rate.
+
+    Newton's method starts near the working speed from regular sets of phases.
+    """
+    prescribed = balance.is_prescribed
+    free = _free_phases(prescribed)
+    even = 2.0 * np.pi / _EVEN_PHASES * np.arange(_EVEN_PHASES)[:, None]
+    sets = _with_fixed(even if free.size == 1 else _regular_sets(free.size), free, prescribed.size, balance.unbalance.dtype)
+    omega, phases, neutral, good = jax.vmap(lambda a: solve_near(_NEAR_WORKING_SPEED * balance.speed, a, balance))(
+        jnp.asarray(sets)
+    )
+    growth = jax.vmap(lambda *at: regime_growth(balance, *at))(omega, phases, neutral)
+    best = jnp.argmin(jnp.where(good & jnp.isfinite(growth), growth, jnp.inf))
+    return omega[best], phases[best]
 
 
 def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,19 +211,18 @@ def _solutions(balance: TorqueBalance, omega: np.ndarray, phases: np.ndarray) ->
 
 @cached
 def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
-    """Return speeds, phases, numbers of neutral directions, and True for each start that leads to a solution."""
+    """Return `solve_near` for starts (n,), (n, count)."""
+    return jax.vmap(lambda w, phase: solve_near(w, phase, balance))(omega, phases)
 
-    def one(w: Array, phase: Array) -> tuple[Array, Array, Array, Array]:
-        start = unknowns_of(balance, w, phase)
-        x, _ = damped_newton(
-            lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_scalars=False
-        )
-        w, angles = motion_of(balance, x)
-        good = is_balanced(balance, x)
-        neutral = slopes_of(jnp.where(good, x, start), balance).neutral
-        return w, jnp.arctan2(jnp.sin(angles), jnp.cos(angles)), neutral, good
 
-    return jax.vmap(one)(omega, phases)
+def solve_near(omega: Array, phase: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
+    """Return speed, phases, number of neutral directions, and True if the start leads to a solution."""
+    start = unknowns_of(balance, omega, phase)
+    x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), start, balance, _ITERATIONS, on_scalars=False)
+    w, angles = motion_of(balance, x)
+    good = is_balanced(balance, x)
+    neutral = slopes_of(jnp.where(good, x, start), balance).neutral
+    return w, jnp.arctan2(jnp.sin(angles), jnp.cos(angles)), neutral, good
 
 
 def is_balanced(balance: TorqueBalance, x: Array) -> Array:

@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import speed_text
-from jaxvib.equations.averaged import averaged_growth, require_rotating_masses
+from jaxvib.equations.averaged import require_rotating_masses
 from jaxvib.equations.linear import peak_force
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
@@ -39,8 +39,15 @@ from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import degrees
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
-from jaxvib.steady.regimes.local import implicit_step, margin_of, quasi_static_growth, slopes_of, vibration_scale
-from jaxvib.steady.regimes.search import all_regimes, is_balanced
+from jaxvib.steady.regimes.local import (
+    implicit_step,
+    margin_of,
+    quasi_static_growth,
+    regime_growth,
+    slopes_of,
+    vibration_scale,
+)
+from jaxvib.steady.regimes.search import all_regimes, is_balanced, most_stable
 from jaxvib.units import Number, number, numbers
 from jaxvib.units.known import when_known
 
@@ -276,6 +283,18 @@ def _regime_near(scene: Scene, omega: Array, phases: Array) -> SynchronousRegime
     return SynchronousRegime(**_numbers_near(scene, omega, phases), scene=scene)
 
 
+@cached
+def most_stable_regime(scene: Scene) -> SynchronousRegime:
+    """Return the synchronous regime with the smallest growth rate among those near the working speed of the drives.
+
+    It is a function of the scene by a fixed number of operations, for searches over many machines; `synchronous_regimes` finds
+    all regimes. The status is `not_converged` if there is none.
+    """
+    require_rotating_masses(scene)
+    omega, phases = most_stable(jax.lax.stop_gradient(assemble_torque_balance(scene)))
+    return SynchronousRegime(**_numbers_near(scene, omega, phases), scene=scene)
+
+
 def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     """Return the fields of the regime to which a start leads, without the scene."""
     balance = assemble_torque_balance(scene)
@@ -308,8 +327,8 @@ def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     status = RegimeStatus.where(good, status, RegimeStatus.not_converged)
     status = RegimeStatus.where(bounded | ~jnp.isfinite(w), status, RegimeStatus.unbounded)
 
-    known, at, moved = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z))
-    growth = averaged_growth(frozen.averaged, known, at, moved, frozen.averaged.free_shifts + neutral)
+    known, at = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles))
+    growth = regime_growth(frozen, known, at, neutral)
     numbers = {
         "speed": w,
         "phases": angles,
