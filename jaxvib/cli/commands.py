@@ -24,20 +24,22 @@ _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "r
 
 
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
-@click.argument("kind", metavar="KIND", type=click.Choice([*_MACHINES, "design", "measurement", "sweep"]))
+@click.argument("kind", metavar="KIND", type=click.Choice([*_MACHINES, "design", "identification", "measurement", "sweep"]))
 @shared
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep` or `identify`.
 
     KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus, linear-screen, circular-screen or feeder for a
-    machine; design for `optimize`; sweep (a study) for `sweep`; measurement (a recorded swing) for `identify`."""
+    machine; design for `optimize`; sweep (a study) for `sweep`; identification (recorded runs of a machine) or measurement (a
+    recorded swing) for `identify`."""
+    from jaxvib.exchange.recordings.fit_file import TEMPLATE as IDENTIFICATION
     from jaxvib.machine.files import TEMPLATES
     from jaxvib.machine.structures.screens import SCREENS
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
     from optimize.files import TEMPLATE as DESIGN
 
-    files = {"design": DESIGN, "measurement": MEASUREMENT, "sweep": STUDY}
+    files = {"design": DESIGN, "identification": IDENTIFICATION, "measurement": MEASUREMENT, "sweep": STUDY}
     text = files[kind] if kind in files else {**TEMPLATES, **SCREENS}[kind.replace("-", "_")]
     name = "study" if kind == "sweep" else kind
     path = output.file(f"{name}.toml" if kind in files else "machine.toml")

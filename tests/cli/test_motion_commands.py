@@ -227,4 +227,4 @@ def test_help_imports_nothing_slow_and_lists_the_choices():
     }
     assert options["cost", "quantity"] == QUANTITIES and options["cost", "solvers"] == tuple(SOLVERS)
     machines = tuple(name.replace("_", "-") for name in (*TEMPLATES, *SCREENS))
-    assert options["new", "kind"] == (*machines, "design", "measurement", "sweep")
+    assert options["new", "kind"] == (*machines, "design", "identification", "measurement", "sweep")

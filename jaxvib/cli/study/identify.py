@@ -11,6 +11,7 @@ import click
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.cli.output import fields_of
+from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
     from jaxvib.machine.files import Tables
@@ -44,9 +45,12 @@ def _with_number_options(command: Command) -> Command:
 @click.option("--dry/--no-dry", "identify__dry", default=None, help="Identify mu2 of dry friction as well as mu1.")
 @shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
-    """Identify the friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a
-    measurement file (TOML) that names one; options replace the values in the file. --out adds the picture and the fit
-    (fit.csv)."""
+    """Identify numbers of a machine from recorded runs, or the friction of a bearing from a recorded swing.
+
+    RECORD is an identification file (TOML) that names a scene file, recorded runs and their channels; --out adds the fitted
+    scene (found.toml), the picture and the fit (fit.npz). For a bearing, it is a CSV file of time and angle of a pendulum that
+    swings down on it, or a measurement file (TOML) that names one; options replace the values in the file, and --out adds the
+    picture and the fit (fit.csv)."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml
@@ -54,6 +58,9 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
 
     is_file = record.suffix.lower() == ".toml"
     tables: Tables = read_toml(record) if is_file else {"record": {"file": record.name}}
+    if not {"machine", "run", "channel"}.isdisjoint(tables):
+        _identify_machine(tables, record.parent, output, [name for name, value in given.items() if value is not None])
+        return
     for name, value in given.items():
         section, _, field = name.partition("__")
         if value is not None:
@@ -103,6 +110,27 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
         return "\n".join([*lines, *found.notes])
 
     output.done(document, text, "identify", found)
+
+
+def _identify_machine(tables: Tables, folder: Path, output: Output, options: list[str]) -> None:
+    """Identify the numbers of the machine of an identification file in `folder`."""
+    from jaxvib.exchange.recordings.fit_file import fit_from_tables  # slow imports, which --help does not need
+    from jaxvib.machine.rewrite import rewrite_scene
+
+    if options:
+        name = f"--{options[0].partition('__')[2].replace('_', '-')}"
+        raise InputError(name, "is for the swing of a pendulum; leave it out for a machine, and change the identification file")
+    fit = fit_from_tables(tables, folder)
+    found = jv.identify(fit.scene, fit.runs, unknown=fit.unknown, known=fit.known)
+    output.picture("fit.png", found.plot)
+    output.keep("fit.npz", found)
+    path = output.file("found.toml")
+    if path is not None:
+        path.write_text(rewrite_scene(fit.scene_file.read_text(encoding="utf-8"), found.scene), encoding="utf-8")
+    document = {"status": found.status_name, "message": found.message}
+    document |= fields_of(found, "notes", "names", "units", "estimates", "frequency", "damping_ratio", "gain_names", "gains")
+    document |= {name: [each.sentence for each in getattr(found, name)] for name in ("undetermined", "by_gain")}
+    output.done(document, found.summary, "identify", found)
 
 
 def _row(name: str, estimate: Estimate) -> list[str]:

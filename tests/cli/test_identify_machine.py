@@ -1,0 +1,113 @@
+"""The command that identifies a machine from recorded runs; the runs are integrated by SciPy."""
+
+import json
+
+import numpy as np
+import pytest
+from run_ups_by_scipy import DURATION, TRUTH, accelerations, ramp, scene_of
+
+import jaxvib as jv
+
+FIT = """
+[machine]
+file = "machine.toml"
+
+[[run]]
+file = "run_up.csv"
+from = "0.5 s"
+
+[[channel]]
+name = "frame"
+kind = "acceleration"
+at = 1
+gain_error = 0.0
+
+[[channel]]
+name = "deck"
+kind = "acceleration"
+at = 2
+gain_error = 0.0
+
+[[channel]]
+name = "tacho"
+kind = "pulses"
+
+[identify]
+unknown = ["machine.stiffness", "machine.damping[0]"]
+known = { "exciters[0].unbalance" = 0.05 }
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Times and readings of a run-up: accelerations, g, with noise, and the level of a tachometer, V."""
+    times = np.arange(0.0, DURATION, 2e-3)
+    readings = accelerations(times, [TRUTH])[0] / 9.80665
+    noise = 1e-3 * np.std(readings) * np.random.default_rng(0).standard_normal(readings.shape)
+    level = np.clip(50.0 * np.sin(ramp(times)[0]), 0.0, 5.0)
+    return np.column_stack([times, readings + noise, level])
+
+
+@pytest.fixture
+def typed(type_, recorded, tmp_path, monkeypatch):
+    """Runs a command line in a folder with an identification file, its scene and its recording."""
+    monkeypatch.chdir(tmp_path)
+    head = "time (s),frame (g),deck (g),tacho (V)"
+    np.savetxt("run_up.csv", recorded, delimiter=",", header=head, comments="", fmt="%.9g")
+    start = {**TRUTH, "machine.stiffness[0]": 5.2e4, "machine.stiffness[1]": 5.8e4, "machine.damping[0]": 200.0}
+    jv.save_scene(scene_of(start), "machine.toml")
+    (tmp_path / "fit.toml").write_text(FIT)
+    return type_
+
+
+def test_machine_is_identified_from_the_command_line(typed, tmp_path):
+    code, out, err = typed("identify", "fit.toml", "--json", "--out", "o")
+    document = json.loads(out)
+    assert (code, err) == (0, "")
+    assert document["names"] == ["machine.stiffness[0]", "machine.stiffness[1]", "machine.damping[0]"]
+    for name, estimate in zip(document["names"], document["estimates"], strict=True):
+        assert estimate["value"] == pytest.approx(TRUTH[name], rel=5e-3)
+    found = jv.load_scene(tmp_path / "o" / "found.toml")
+    np.testing.assert_allclose(found.machine.stiffness, [5e4, 6e4], rtol=5e-3)
+    assert (tmp_path / "o" / "fit.png").stat().st_size > 10_000
+
+
+def test_template_of_identification_is_complete(type_, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert type_("new", "identification", "--out", "o")[0] == 0
+    text = (tmp_path / "o" / "identification.toml").read_text()
+    for field in ("from", "until", "rate", "change", "unit", "direction", "gain_error", "delay", "high_pass", "range", "known"):
+        assert f"# {field} = " in text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("[[run]]", "[run]", "run is {'file': 'run_up.csv', 'from': '0.5 s'}; write [[run]] for each run"),
+        ("[[run]]", "[[runs]]", "runs is not part of an identification file; did you mean 'run'?"),
+        ('from = "0.5 s"', 'form = "0.5 s"', "run[0].form is not a field here; did you mean 'from'?"),
+        ('file = "run_up.csv"', 'file = "none.csv"', "run[0]: none.csv cannot be read"),
+        ('file = "run_up.csv"', "", "run[0].file is missing; write the path of a recording"),
+        ('file = "machine.toml"', "file = 3", "machine is not the name of a scene file; write [machine]"),
+        ('from = "0.5 s"', "change = 3", "run[0].change is 3; write { "),
+        ('kind = "pulses"', 'sort = "pulses"', "channel[2].sort is not a field here; allowed: name, kind"),
+        ("at = 2", "at = 0", "channel 'deck': at is 0; it must be the number of a platform"),
+        ('name = "deck"', 'name = "desk"', "run_up.csv: channel 'desk' is not in the file; its channels are 'frame', 'deck'"),
+        ("[identify]", "[identify]\nfree = 1", "identify.free is not a field here; allowed: unknown, known"),
+        (
+            '["machine.stiffness", "machine.damping[0]"]',
+            '"machine.stiffness"',
+            "identify.unknown is 'machine.stiffness'; write a",
+        ),
+    ],
+)
+def test_wrong_identification_files(typed, tmp_path, old, new, says):
+    assert old in FIT
+    (tmp_path / "fit.toml").write_text(FIT.replace(old, new, 1))
+    code, out, err = typed("identify", "fit.toml")
+    assert (code, out) == (2, "") and says in err and err.count("\n") == 1
+
+
+def test_options_of_a_pendulum_are_refused_for_a_machine(typed):
+    code, out, err = typed("identify", "fit.toml", "--mass", "3 kg")
+    assert (code, out) == (2, "") and "--mass is for the swing of a pendulum; leave it out for a machine" in err
