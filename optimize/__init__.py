@@ -26,6 +26,7 @@ from optimize.quantities.quantity import Demand, Quantity, largest, least
 from optimize.quantities.severity import acceleration, shaft_torque, stroke, support_load, transmissibility, velocity
 from optimize.space import DesignSpace, HeldQuantity, hold
 from optimize.synthesize import Outcome, Synthesis, synthesize
+from optimize.tolerance import ToleranceRange, tolerance_ranges
 
 __all__ = [
     "Demand",
@@ -36,6 +37,7 @@ __all__ = [
     "Outcome",
     "Quantity",
     "Synthesis",
+    "ToleranceRange",
     "acceleration",
     "amplitude",
     "expected",
@@ -62,6 +64,7 @@ __all__ = [
     "support_frequency_squared",
     "support_load",
     "synthesize",
+    "tolerance_ranges",
     "total",
     "total_mass",
     "transmissibility",

@@ -20,8 +20,9 @@ from jaxvib.errors import ComputationError, InputError, legible, quoted
 
 if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
+    from optimize import ToleranceRange
 
-__all__ = ["SPEED", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
+__all__ = ["SPEED", "TOLERANCE", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table", "tolerance_table"]
 
 
 def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
@@ -80,6 +81,29 @@ SPEED_TYPE = _SpeedType()
 
 SPEED = click.option("--speed", type=SPEED_TYPE, help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
 """Option of commands about motions at a constant rotor speed."""
+
+
+TOLERANCE = click.option(
+    "--tolerance",
+    "tolerances",
+    multiple=True,
+    metavar="NAME=SHARE",
+    help="Ranges over machines with deviations, repeatable: stiffness=5%, damping=30%, load=0..20kg (material on platform 1).",
+)
+"""Option of commands that show ranges over machines within tolerances."""
+
+
+def tolerance_table(found: Sequence[ToleranceRange], tolerances: Sequence[str]) -> str:
+    """Return the ranges of quantities over machines within tolerances as a table."""
+    from jaxvib.display import shown_unit
+
+    rows = []
+    for each in found:
+        unit, factor = shown_unit(each.unit, max(abs(each.design), abs(each.high)))
+        values = [f"{factor * x:.4g}" for x in (each.design, each.low, each.high, each.worst)]
+        rows.append([f"{each.words}, {unit}".rstrip(", "), *values, f"{100.0 * each.share:.3g} %"])
+    head = ["light loads", "design", "95 % from", "to", "worst", "machines that have or meet it"]
+    return table(f"machines with {', '.join(tolerances)}", head, rows)
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:

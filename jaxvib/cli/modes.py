@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED, TOLERANCE, WITHOUT, Output, app, loaded_scene, shared, table, tolerance_table
 from jaxvib.cli.output import CSV, fields_of
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
-    pass
+    from optimize import ToleranceRange
 
 
 @app.command("modes")
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     "--phases", is_flag=True, help="Compute light-load jams with unequal phases (default for a rotor without --exact)."
 )
 @WITHOUT
+@TOLERANCE
 @CSV
 @shared
 def modes(
@@ -33,6 +34,7 @@ def modes(
     exact: bool,
     phases: bool,
     without: tuple[str, ...],
+    tolerances: tuple[str, ...],
     csv: Path | None,
     output: Output,
 ) -> None:
@@ -46,6 +48,8 @@ def modes(
         raise InputError(
             "--phases", "cannot be combined with --exact; jams with unequal phases are computed for light loads only"
         )
+    if tolerances and (exact or phases or loaded.mounting.axes != (1,)):
+        raise InputError("--tolerance", "is for light loads on platforms that stay together; leave it or the other option out")
     if exact:
         _exact(loaded, csv, output)
         return
@@ -56,10 +60,10 @@ def modes(
             )
         _phases(loaded, output)
         return
-    _light(loaded, csv, output)
+    _light(loaded, csv, tolerances, output)
 
 
-def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
+def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], output: Output) -> None:
     """Print the jams of light loads that stay together, and their folds."""
     import jax  # slow imports, which --help does not need
     import numpy as np
@@ -76,6 +80,7 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
     staying = [jam for jam in jams if bool(jam.stable) and not growth[int(jam.mode)] > 0.0]
     measures = {int(jam.mode): jax.device_get(jv.vibration_measures(scene, jam)) for jam in staying}
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
+    ranges = _ranges(scene, [int(jam.mode) for jam in staying], tolerances)
     document = {
         "rotor_speed": scene.drive.speed,
         "resonances": found.resonances,
@@ -91,6 +96,7 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
         ],
         "measures": [_measures_document(jam, measures[int(jam.mode)]) for jam in jams if int(jam.mode) in measures],
         "folds": [{"omega": found.folds.omega[k], "rotor_speed": found.folds.rotor_speed[k]} for k in folds],
+        **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {}),
     }
 
     def text() -> str:
@@ -123,6 +129,8 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
         ]
         if rows:
             lines.append("stays, no: after a small disturbance the loads (balls, rollers, pendulums) leave")
+        if tolerances:
+            lines.append(tolerance_table(ranges, tolerances))
         for mode, each in measures.items():
             lines.append("\n".join([f"mode {mode}:", *(f"  {line}" for line in each.summary().splitlines())]))
         if folds:
@@ -131,6 +139,25 @@ def _light(scene: jv.Scene, csv: Path | None, output: Output) -> None:
         return "\n".join([*lines, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
+
+
+def _ranges(scene: jv.Scene, modes: list[int], tolerances: tuple[str, ...]) -> list[ToleranceRange]:
+    """Return the ranges of load speed, amplitudes and foundation force in some modes."""
+    if not tolerances:
+        return []
+    from optimize import amplitude, foundation_force, jam_frequency, tolerance_ranges
+
+    count = len(scene.machine.structure().coordinates)
+    asked = [
+        quantity
+        for mode in modes
+        for quantity in (
+            jam_frequency(mode=mode),
+            *(amplitude(mode=mode, of=k + 1) for k in range(count)),
+            foundation_force(mode=mode),
+        )
+    ]
+    return tolerance_ranges(scene, asked, list(tolerances))
 
 
 def _measures_document(jam: jv.Jam, measures: jv.VibrationMeasures) -> dict[str, object]:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import TOLERANCE, Output, app, shared, table, tolerance_table
 from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
-    from optimize import Synthesis
+    from optimize import Demand, Design, Quantity, Synthesis
 
 
 @app.command("optimize")
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 )
 @click.option("--resume", type=click.Path(path_type=Path), help="search.npz of an earlier search of this design to continue.")
 @click.option("--no-verify", is_flag=True, help="Skip the verification by an exact periodic motion and time integration.")
+@TOLERANCE
 @shared
 def optimize(
     design: Path,
@@ -32,6 +33,7 @@ def optimize(
     searcher: str | None,
     resume: Path | None,
     no_verify: bool,
+    tolerances: tuple[str, ...],
     output: Output,
 ) -> None:
     """Search for the machine that DESIGN describes; --out saves its scene file, the search, the pictures and the motion of the
@@ -41,7 +43,7 @@ def optimize(
 
     from jaxvib.machine.files import read_toml
     from jaxvib.machine.rewrite import rewrite_scene
-    from optimize import Synthesis, load_design, synthesize
+    from optimize import Synthesis, load_design, synthesize, tolerance_ranges
 
     loaded = load_design(design)
     given = {"starts": starts, "seed": seed, "searcher": searcher}
@@ -74,7 +76,18 @@ def optimize(
     if best.run is not None:
         output.picture("history.png", best.run.plot)
         output.keep("run.npz", best.run)
-    output.done(_document(best), lambda: _text(best), "optimize", best)
+    ranges = tolerance_ranges(best.scene, _toleranced(loaded), list(tolerances)) if tolerances else []
+    document = {**_document(best), **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {})}
+    parts = [tolerance_table(ranges, tolerances)] if tolerances else []
+    output.done(document, lambda: "\n".join([_text(best), *parts]), "optimize", best)
+
+
+def _toleranced(design: Design) -> list[Quantity | Demand]:
+    """Return the quantities of a design whose ranges within tolerances are shown: the objective, the force, the demands."""
+    from optimize import foundation_force
+
+    mode = design.objective.mode
+    return [design.objective, *([] if mode is None else [foundation_force(mode=mode)]), *design.subject_to]
 
 
 def _document(best: Synthesis) -> dict:

@@ -43,12 +43,12 @@ _MIN_SLIP = 1e-4
 have a relative rounding error of 1e-12."""
 
 
-def acceleration_of(amplitude: Array, speed: Array) -> Array:
+def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
     """Return the amplitude of the acceleration, in g, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
     return speed**2 * amplitude / STANDARD_GRAVITY
 
 
-def rms_velocity_of(amplitude: Array, speed: Array) -> Array:
+def rms_velocity_of(amplitude: Array, speed: Array | float) -> Array:
     """Return the root mean square of the velocity, m/s, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
     return speed * amplitude / np.sqrt(2.0)
 

@@ -1,0 +1,154 @@
+"""Quantities of machines whose parameters differ from the design: ranges, and the share of machines that meet demands."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
+from jaxvib.machine.scene import Scene
+from jaxvib.units import number, random_numbers
+from optimize.quantities.cases import Sampled
+from optimize.quantities.quantity import Demand, Quantity
+
+_SHORT_NAMES = {
+    "stiffness": ("machine.stiffness", "machine.link_stiffness"),
+    "damping": ("machine.damping", "machine.link_damping"),
+    "mass": ("machine.mass",),
+    "drag": ("loads.drag",),
+}
+"""Names of arrays of a scene that a short name stands for, if the scene has them."""
+
+_SHARE_PATTERN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
+_RANGE = re.compile(r"(.+?)\.\.(.+)")
+_MATERIAL = re.compile(r"load(?:\[(\d+)\])?")
+
+_DEFAULT_SAMPLES = 128
+
+
+class ToleranceRange(NamedTuple):
+    """Range of a quantity over machines within tolerances.
+
+    Returned by `tolerance_ranges`.
+
+    **Attributes**: `words`: name of the quantity; its SI `unit`; its value in the `design`; `low` and `high`: 95 % of the
+    machines that have the quantity lie between them; `worst` value (the largest, for a demand "at least" the smallest); `share`
+    of the machines that have the quantity and, for a demand, meet it.
+    """
+
+    words: str
+    unit: str
+    design: float
+    low: float
+    high: float
+    worst: float
+    share: float
+
+
+class _NumberRange(NamedTuple):
+    """Range of a number: a value, or a mass in addition to that of the design if `is_added`."""
+
+    found: NamedNumber
+    low: float
+    high: float
+    is_added: bool
+
+
+@validated
+def tolerance_ranges(
+    scene: Scene,
+    quantities: Sequence[Quantity | Demand],
+    tolerances: Sequence[str],
+    *,
+    samples: int = _DEFAULT_SAMPLES,
+    seed: int = 0,
+) -> list[ToleranceRange]:
+    """Return the ranges of quantities over machines whose parameters differ from a design, to leading order of the loads' mass.
+
+    **Arguments**
+
+    - `scene` of the design
+    - `quantities`, or demands of quantities; typical: 1 to 5
+    - `tolerances`: texts of the form NAME=SHARE, such as "stiffness=5%" (95 of 100 machines are within it, each number has its
+      own deviation) or NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg" (any value of the range is equally likely).
+      Short names are stiffness, damping, mass and drag. "load=0..20kg" is material on platform 1, "load[2]=..." on platform 2
+    - `samples`: number of machines; typical: 64 to 1000 (default 128)
+    - `seed` of the random deviations
+
+    **Returns** a list of `ToleranceRange`. **Raises** `InputError` for a text of another form and for an unknown name.
+
+    >>> import jaxvib as jv
+    >>> from optimize import jam_frequency
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
+    >>> found = tolerance_ranges(scene, [jam_frequency(mode=1)], ["stiffness=2%"], samples=16)[0]
+    >>> found.share, found.low < found.design < found.high
+    (1.0, True)
+    """
+    machines = list(_machines(scene, tolerances, samples, seed))
+    found = []
+    for each in quantities:
+        quantity = (each.quantity if isinstance(each, Demand) else each).easy
+        values = np.array([float(quantity(machine)) for machine in machines])
+        there = values[np.isfinite(values)]
+        kept = np.isfinite(values)
+        at_least = isinstance(each, Demand) and each.sense == "at least"
+        if isinstance(each, Demand):
+            limits = np.array([float(each.limit(machine)) for machine in machines])
+            kept = values >= limits if at_least else values <= limits
+        low, high = np.quantile(there, [0.025, 0.975]) if there.size else (np.nan, np.nan)
+        worst = np.nan if not there.size else np.min(there) if at_least else np.max(there)
+        design = float(quantity(scene))
+        found.append(
+            ToleranceRange(each.words, quantity.unit, design, float(low), float(high), float(worst), float(np.mean(kept)))
+        )
+    return found
+
+
+def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) -> Iterator[Scene]:
+    """Yield scenes with deviations of their numbers."""
+    errors: list[tuple[str, float]] = []
+    ranges: list[_NumberRange] = []
+    there = numbers_of(scene)
+    for text in tolerances:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals:
+            raise InputError("tolerance", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+        if share := _SHARE_PATTERN.fullmatch(value):
+            size = float(share[1]) / 100.0
+            if not 0.0 < size < 1.0:
+                raise InputError("tolerance", f"is {quoted(text)}; the share must be greater than 0 % and less than 100 %")
+            short = [each for each in _SHORT_NAMES.get(name, ()) if each in there]
+            errors += [(each, size) for each in short or [find_number(scene, name, "tolerance").name]]
+        elif ends := _RANGE.fullmatch(value):
+            ranges.append(_range(scene, name, ends[1], ends[2]))
+        else:
+            raise InputError("tolerance", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+    random = random_numbers(seed)
+    batch = Sampled(tuple(errors), samples, seed).scenes(scene) if errors else None
+    shares = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
+    for k in range(samples):
+        machine = scene if batch is None else jax.tree.map(lambda leaf, k=k: leaf[k], batch)
+        for each, share in zip(ranges, shares, strict=True):
+            value = each.low + (each.high - each.low) * share[k]
+            now = each.found.read(machine)
+            machine = put_numbers(machine, (each.found,), now + value if each.is_added else 0.0 * now + value)
+        yield machine
+
+
+def _range(scene: Scene, name: str, low: str, high: str) -> _NumberRange:
+    """Return a range; its first end may lack the unit of the second."""
+    material = _MATERIAL.fullmatch(name)
+    found = find_number(scene, f"machine.mass[{int(material[1] or 1) - 1}]" if material else name, "tolerance")
+    unit = "".join(re.findall(r"[^\d.eE+\-\s].*$", high.strip()))
+    ends = [low if re.search(r"[^\d.eE+\-\s]", low) else f"{low.strip()} {unit}".strip(), high]
+    first, last = (float(number(end.strip(), found.unit, f"tolerance.{name}")) for end in ends)
+    if not first < last:
+        raise InputError(f"tolerance.{name}", f"is {low}..{high}; the second must be larger than the first")
+    return _NumberRange(found, first, last, material is not None)

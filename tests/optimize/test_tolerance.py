@@ -1,0 +1,47 @@
+"""Ranges of quantities over machines within tolerances, against closed forms of one mass."""
+
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from optimize import jam_frequency, static_deflection, tolerance_ranges
+
+
+@pytest.fixture
+def scene():
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    return jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
+
+
+def test_range_of_a_sag_is_that_of_the_stiffness(scene):
+    found = tolerance_ranges(scene, [static_deflection()], ["stiffness=10%"], samples=400)[0]
+    sag = 51.0 * 9.80665 / 4e4
+    np.testing.assert_allclose(found.design, sag, rtol=1e-12)
+    np.testing.assert_allclose([found.low, found.high], [sag / 1.1, sag / 0.9], rtol=0.01)
+    assert found.share == 1.0 and found.worst <= sag / 0.85 * (1.0 + 1e-9)
+
+
+def test_material_on_the_platform_adds_its_weight(scene):
+    found = tolerance_ranges(scene, [static_deflection()], ["load=0..20kg"], samples=400)[0]
+    lowest, highest = (9.80665 * (51.0 + 20.0 * share) / 4e4 for share in (0.025, 0.975))
+    np.testing.assert_allclose([found.low, found.high], [lowest, highest], rtol=1e-3)
+
+
+def test_share_of_machines_that_meet_a_demand(scene):
+    limit = 9.80665 * (51.0 + 5.0) / 4e4
+    below, above = tolerance_ranges(
+        scene, [static_deflection() < limit, static_deflection() > limit], ["machine.mass=50..70 kg"], samples=400
+    )
+    np.testing.assert_allclose([below.share, above.share], [0.25, 0.75], atol=0.003)
+    assert below.worst > limit > above.worst
+
+
+def test_modes_that_vanish_lower_the_share(scene):
+    found = tolerance_ranges(scene, [jam_frequency(mode=1)], ["machine.stiffness=1e4..1e5 N/m"], samples=32)[0]
+    assert 0.0 < found.share < 1.0 and np.isfinite(found.high)
+
+
+@pytest.mark.parametrize("text", ["stiffness", "stiffness=5", "stiffness=200%", "nothing=5%", "load=20..0kg", "load=0..2m"])
+def test_wrong_tolerances_are_refused(scene, text):
+    with pytest.raises(jv.InputError, match="tolerance"):
+        tolerance_ranges(scene, [static_deflection()], [text], samples=4)
