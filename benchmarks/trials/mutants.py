@@ -52,16 +52,18 @@ PYTEST = ("-m", "pytest", "-p", "no:cacheprovider", "-p", "mutants")
 
 def drawn(count: int, seed: int, folders: Sequence[str]) -> list[Mutant]:
     """`count` mutants of each folder, of all kinds alike."""
-    possible = collections.defaultdict(list)
-    for file in sources():
-        for one in mutants(file, (ROOT / file).read_text()):
-            possible[one.folder, one.kind].append(one)
-    taken = []
+    counted, taken = all_folders(), {}
     for folder in folders:
-        kinds = [sorted(found, key=lambda one: one.rank(seed)) for (place, _), found in possible.items() if place == folder]
+        possible = collections.defaultdict(list)
+        for file in sources():
+            # A folder below those that mutants are counted by holds all files below it.
+            if folder_of(file) == folder or (folder not in counted and file.startswith(f"{folder}/")):
+                for one in mutants(file, (ROOT / file).read_text()):
+                    possible[one.kind].append(one)
+        kinds = [sorted(found, key=lambda one: one.rank(seed)) for found in possible.values()]
         mixed = [one for row in itertools.zip_longest(*kinds) for one in row if one is not None]
-        taken += mixed[:count]
-    return sorted(taken, key=lambda one: one.file)
+        taken |= {one.name: one for one in mixed[:count]}
+    return sorted(taken.values(), key=lambda one: one.file)
 
 
 def sources() -> list[str]:
@@ -232,7 +234,10 @@ def _run(mutant: Mutant, copy_of: pathlib.Path, file: str, tests: list[str] | No
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", nargs="+", choices=all_folders(), default=all_folders(), help="folders to draw from (all)")
+    below = sorted({str(parent) for file in sources() for parent in pathlib.Path(file).parents[:-1]})
+    parser.add_argument(
+        "--folder", nargs="+", choices=below, default=all_folders(), metavar="FOLDER", help="folders to draw from (all)"
+    )
     parser.add_argument("--count", type=int, default=30, help="mutants of each folder (30)")
     parser.add_argument("--seed", type=int, default=0, help="order of the draw (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")

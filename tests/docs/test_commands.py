@@ -31,7 +31,7 @@ def printed():
 
 
 COMMANDS = printed()
-CALLED = {"two-mass": "machine", "sweep": "study", "measurement": "swing"}
+CALLED = {"two-mass": "machine", "linear-screen": "screen", "sweep": "study", "measurement": "swing"}
 FAST = ("new", "describe", "sketch", "modes", "whirl", "envelope")
 
 
@@ -56,7 +56,7 @@ def test_printed_options_are_those_of_the_command(line):
 def folder(tmp_path_factory):
     """A folder with what the documentation's commands refer to."""
     folder = tmp_path_factory.mktemp("commands")
-    for name in ("two-mass", "rotor", "torus", "design", "sweep", "measurement"):
+    for name in ("two-mass", "rotor", "torus", "linear-screen", "design", "sweep", "measurement"):
         (folder / f"{CALLED.get(name, name)}.toml").write_text(template(name))
     shutil.copytree(ROOT / "examples", folder / "examples")
     return folder
