@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxvib.errors import InputError
@@ -210,7 +211,7 @@ def _not(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> st
 
 
 def _round(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:
-    return f"{'rint' if 'EVEN' in str(params['rounding_method']) else 'round'}({values[0]})"
+    return f"{'rint' if params['rounding_method'] == jax.lax.RoundingMethod.TO_NEAREST_EVEN else 'round'}({values[0]})"
 
 
 _SPECIAL: Mapping[str, Callable[[list[str], Mapping[str, Any], JaxprEqn], str]] = {

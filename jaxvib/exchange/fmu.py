@@ -32,7 +32,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import Start, initial_state, validate_state
-from jaxvib.motion.stiffness import fastest_decay, steps_of
+from jaxvib.motion.stiffness import fastest_decay
 from jaxvib.ode.scalarize import NotScalarizable, scalar_program
 from jaxvib.runtime.compat import HAS_JAXPRS
 
@@ -186,8 +186,7 @@ def _described(scene: Scene) -> str:
 def _step(scene: Scene) -> float:
     """Return the longest step of co-simulation, s."""
     fastest, decay = float(frequency_bounds(scene)[0]), float(fastest_decay(scene))
-    explicit, _ = steps_of(fastest, min(decay, fastest), _STEPS_PER_RADIAN)
-    return float(f"{min(explicit, 1.0 / max(decay, 1e-300)):.3g}")
+    return float(f"{1.0 / max(_STEPS_PER_RADIAN * fastest, decay):.3g}")
 
 
 class _Programs(NamedTuple):

@@ -1,5 +1,6 @@
 """Functional mock-up units against the equations in JAX, CVode against `simulate`, and a host without Python."""
 
+import ctypes
 import functools
 import itertools
 import os
@@ -280,6 +281,32 @@ def test_derivatives_by_inputs_equal_differences(opened):
         if known == "rotor.torque":  # imbalance and loads change the inertia by little
             assert slope[names.index("der(rotor.speed)")] == pytest.approx(1.0 / float(found.scene.drive.inertia), rel=0.1)
         put_all(machine, found, {known: 0.0})
+
+
+@needs_compiler
+def test_written_operations_equal_jax(tmp_path):
+    """Operations that scenes use seldom, on both sides of their branches."""
+
+    def operations(x, y):
+        above, equal = x > 0.3, x == y
+        kinds = [jnp.where(~above, x, y), jnp.where(above & ~equal, x, 2.0), jnp.where(above | equal, 1.0, x)]
+        kinds += [jnp.clip(x, -0.5, y), jnp.maximum(x, y), jnp.minimum(x, y), jnp.sign(x), jnp.abs(x), jnp.round(3.0 * x)]
+        kinds += [jnp.floor(x), jnp.ceil(x), jnp.fmod(x, 0.7), x**3, (x + 3.0) ** -2, (x + 3.0) ** y, jax.lax.rsqrt(x + 3.0)]
+        kinds += [jnp.arctan2(x, y), jax.nn.sigmoid(x), jnp.expm1(x), jnp.log1p(x + 2.0), jnp.tanh(x), jnp.cbrt(x)]
+        kinds += [above.astype(float) * 2.0, jax.lax.select_n((x > y).astype(int) + above, x, y, 5.0 * x)]
+        return kinds
+
+    point = jnp.asarray(0.5), jnp.asarray(0.25)
+    names = [f"y[{k}]" for k in range(len(operations(*point)))]
+    written = write_program(scalar_program(operations, *point), ["x[0]", "x[1]"], 0, names)
+    body = "\n".join([*written.prepare, *written.body])
+    (tmp_path / "f.c").write_text(f"#include <math.h>\nvoid f(const double *x, double *y) {{\n{body}\n}}\n")
+    subprocess.run(["cc", "-std=c99", "-shared", "-fPIC", "-o", "f.so", "f.c", "-lm"], cwd=tmp_path, check=True)
+    function = ctypes.CDLL(str(tmp_path / "f.so")).f
+    for x, y in ((0.5, 0.25), (-1.7, 0.25), (0.4, 1.3), (0.2, 0.2), (1.5, -0.4)):
+        given, found = (ctypes.c_double * 2)(x, y), (ctypes.c_double * len(names))()
+        function(given, found)
+        np.testing.assert_allclose(list(found), np.array(operations(jnp.asarray(x), jnp.asarray(y))), rtol=1e-14)
 
 
 @needs_compiler
