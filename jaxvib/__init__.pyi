@@ -126,6 +126,7 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 from jaxvib.identification.checks import FitStatus
 from jaxvib.identification.directions import Direction
 from jaxvib.identification.identify import MachineFit, identify
+from jaxvib.identification.plan import PlannedRun, RunPlan, plan_runs
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.exchange.recordings.read import read_recording, read_run
@@ -337,6 +338,9 @@ __all__ = [
     "Direction",
     "FitStatus",
     "MachineFit",
+    "PlannedRun",
+    "RunPlan",
+    "plan_runs",
     "MeasuredRun",
     "read_run",
     "read_recording",

@@ -159,6 +159,14 @@ RESULTS = {
     "Swing": swung,
     "Identified": cached(identified),
     "MachineFit": cached(machine_fit),
+    "RunPlan": lambda: jv.plan_runs(
+        RESULTS["MachineFit"](),
+        [
+            jv.PlannedRun(
+                "slow", jv.RunUp(60.0, acceleration=6.0), "10 s", [jv.Channel("frame", "acceleration", at=1)], rate=200.0
+            )
+        ],
+    ),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "RunUps": run_ups,
     "Capture": lambda: _summarize_captures(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxvib.identification.fit import Fitted
+from jaxvib.identification.problem import Problem
 
 UNDETERMINED = 1.0
 """Relative standard error of a direction above which it counts as undetermined: a factor of e."""
@@ -69,7 +70,7 @@ def information_of(fitted: Fitted) -> Information:
     unknowns, p = problem.unknowns, fitted.x.size
     moved = len(unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
-    free = [k for k, known in enumerate(problem.unbalances) if known is None or known.error > 1.001e-4 * known.value]
+    free = free_unbalances(problem)
     own = np.array([*range(moved), *(p + 2 * k for k in free)], int)
     names = (*(number.name for number in unknowns.numbers), *(f"exciters[{k}].unbalance" for k in free))
     values = np.concatenate([np.asarray(unknowns.values(fitted.x)), sizes[free]])
@@ -80,11 +81,8 @@ def information_of(fitted: Fitted) -> Information:
     without_gains[gains, gains] = 0.0
 
     whole, loose = (eliminate(data + known, own) for known in (prior, without_gains))
-    errors, axes = _errors(whole)
-    lost = errors > UNDETERMINED
-    covariance = (axes[:, ~lost] * errors[~lost] ** 2) @ axes[:, ~lost].T
-    undetermined = axes[:, lost]
-    determined = ~np.any(np.abs(undetermined) > _MIN_SHARE, axis=1)
+    found = covariance_of(whole)
+    covariance, undetermined = found.covariance, found.undetermined
     loose_errors, loose_axes = _errors(loose)
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
     # Directions that nothing determines are left out of those that the gains determine.
@@ -92,9 +90,44 @@ def information_of(fitted: Fitted) -> Information:
     basis, sizes_of, _ = np.linalg.svd(by_gain, full_matrices=False) if by_gain.size else (by_gain, np.zeros(0), None)
     by_gain = basis[:, : int(np.sum(sizes_of > 0.5))]
     by_gain_errors = np.sqrt(np.einsum("ku,kl,lu->u", by_gain, covariance, by_gain))
-    return Information(
-        names, values, scale, logarithmic, covariance, undetermined, errors[lost], determined, by_gain, by_gain_errors
-    )
+    return Information(names, values, scale, logarithmic, *found, by_gain, by_gain_errors)
+
+
+class Covariance(NamedTuple):
+    """`covariance` (k, k) in the determined directions; `undetermined` directions (k, u) and their `errors` (u,); `determined`
+    (k,): False for numbers that take part in an undetermined direction."""
+
+    covariance: np.ndarray
+    undetermined: np.ndarray
+    errors: np.ndarray
+    determined: np.ndarray
+
+
+def covariance_of(information: np.ndarray) -> Covariance:
+    """Return the covariance that follows from an information matrix, see `Covariance`."""
+    errors, axes = _errors(information)
+    lost = errors > UNDETERMINED
+    covariance = (axes[:, ~lost] * errors[~lost] ** 2) @ axes[:, ~lost].T
+    return Covariance(covariance, axes[:, lost], errors[lost], ~np.any(np.abs(axes[:, lost]) > _MIN_SHARE, axis=1))
+
+
+def combined_information(fitted: Fitted) -> np.ndarray:
+    """Return the information about the numbers of a fit, the gains of its sensors, and the angle of the first unbalance.
+
+    The information about the angle is 0 if the runs have different zeros of the rotor's angle.
+    """
+    problem, p = fitted.problem, fitted.x.size
+    data, prior, _ = in_polar_unbalances(fitted)
+    moved, gains = len(problem.unknowns.numbers), len(problem.unknowns.gains)
+    own = [*range(moved), *(p + 2 * k for k in free_unbalances(problem)), *range(moved, moved + gains)]
+    if problem.marked:
+        return eliminate(data + prior, np.array([*own, p + 1], int))
+    return np.pad(eliminate(data + prior, np.array(own, int)), (0, 1))
+
+
+def free_unbalances(problem: Problem) -> list[int]:
+    """Return the exciters whose unbalance is unknown or has a known error."""
+    return [k for k, known in enumerate(problem.unbalances) if known is None or not known.is_exact]
 
 
 def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

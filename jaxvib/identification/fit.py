@@ -249,3 +249,15 @@ def _pass(
         noise=tuple(np.maximum(each, 1e-12 * old) for each, old in zip(noise, deviations, strict=True)),
         converged=converged,
     )
+
+
+def information_at(problem: Problem, unbalance: np.ndarray) -> Fitted:
+    """Return a fit without iterations, whose information is that at the first values of the unknowns.
+
+    **Arguments**: `unbalance`: components (a, b) of each unbalance; states and offsets are 0.
+    """
+    linear = np.zeros(_linear_count(problem))
+    linear[: unbalance.size] = unbalance
+    x = np.zeros(problem.unknowns.count)
+    information, prior, _ = _equations(problem, _Trial(x, linear, 0.0))
+    return Fitted(x, linear, problem, information, prior, (), (), True)

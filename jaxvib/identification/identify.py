@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -15,6 +15,7 @@ from jaxvib.identification.checks import FitStatus, status_of
 from jaxvib.identification.directions import (
     Direction,
     Information,
+    combined_information,
     directions_of,
     eliminate,
     in_polar_unbalances,
@@ -42,6 +43,9 @@ if TYPE_CHECKING:
 QUANTILE = 1.959964
 """97.5 % quantile of the normal distribution."""
 
+_STEP = 1e-4
+"""Relative change of a number in a difference quotient."""
+
 
 class MachineFit(Result):
     """Machine fitted to recorded runs.
@@ -55,6 +59,8 @@ class MachineFit(Result):
     - `scene` with the fitted numbers
     - `names` (k,), `units` (k,) and `estimates` (k,) of the numbers; the interval of an undetermined number is unbounded
     - `covariance` (k, k) of the relative errors of the numbers in the determined directions
+    - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the numbers and of the gains, and about
+      the angle of the first unbalance
     - `undetermined`: a `Direction` for each combination of numbers that the records do not determine
     - `by_gain`: a `Direction` for each one that is known from the gains of the sensors only
     - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the damped modes
@@ -73,6 +79,7 @@ class MachineFit(Result):
     units: tuple[str, ...]
     estimates: tuple[Estimate, ...] = eqx.field(metadata=in_unit("", "number"))
     covariance: np.ndarray = eqx.field(metadata=in_unit("", "number", "number_2"))
+    information: np.ndarray = eqx.field(metadata=in_unit("", "unknown", "unknown_2"))
     undetermined: tuple[Direction, ...]
     by_gain: tuple[Direction, ...]
     frequency: tuple[Estimate, ...] = eqx.field(metadata=in_unit("rad/s", "mode"))
@@ -92,6 +99,21 @@ class MachineFit(Result):
         if name not in self.names:
             raise InputError("name", f"is {quoted(name)}; the unknown numbers were: {', '.join(self.names)}")
         return self.estimates[self.names.index(name)]
+
+    def interval_of(self, quantity: Callable[[Scene], float]) -> Estimate:
+        """Return a quantity of the fitted scene with the interval that follows from the errors of the numbers.
+
+        **Arguments**: `quantity`: a function of a scene, such as `lambda scene: jv.natural_frequencies(scene)[0]`.
+
+        **Returns** an `Estimate`; its interval is unbounded if the quantity changes along an undetermined direction.
+        """
+        axes = np.array([each.weights for each in self.undetermined]).reshape(-1, len(self.names)).T
+        errors = np.array([each.error for each in self.undetermined])
+
+        def values(scene: Scene) -> np.ndarray:
+            return np.asarray(quantity(scene), float).reshape(1)
+
+        return propagate(self.scene, self.names, self.covariance, axes, errors, values)[0]
 
     def summary(self) -> str:
         """Return the numbers with their intervals, and the sentences about them, as text."""
@@ -207,19 +229,23 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     status, chance, notes = status_of(fitted, known)
     undetermined, by_gain = directions_of(known)
     exciters = len(problem.unbalances)
-    frequency, damping = _modes(problem, fitted, known)
+    fitted_to = fitted_scene(problem, fitted.x, fitted.linear)
+    modes = propagate(
+        fitted_to, known.names, known.covariance, known.undetermined, known.errors, lambda scene: np.concatenate(natural(scene))
+    )
     return MachineFit(
         status=status,
         notes=(*problem.notes, *notes),
-        scene=fitted_scene(problem, fitted.x, fitted.linear),
+        scene=fitted_to,
         names=known.names,
         units=tuple(find_number(scene, name, "unknown").unit for name in known.names),
         estimates=tuple(map(_estimate, known.values, known.scale, known.logarithmic, _spreads(known), known.determined)),
         covariance=known.covariance,
+        information=combined_information(fitted),
         undetermined=undetermined,
         by_gain=by_gain,
-        frequency=frequency,
-        damping_ratio=damping,
+        frequency=tuple(modes[: len(modes) // 2]),
+        damping_ratio=tuple(modes[len(modes) // 2 :]),
         gain_names=problem.unknowns.gains,
         gains=_gains(fitted),
         phase=np.array([math.atan2(*fitted.linear[2 * k : 2 * k + 2][::-1]) for k in range(exciters)]),
@@ -236,7 +262,7 @@ def fitted_scene(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Scene:
     """Return the scene with the fitted numbers and unbalances."""
     scene: Any = problem.unknowns.scene(problem.scene, np.asarray(x))
     for k, known in enumerate(problem.unbalances):
-        if known is None or known.error > 1.001e-4 * known.value:
+        if known is None or not known.is_exact:
             number = find_number(scene, f"exciters[{k}].unbalance", "unknown")
             scene = put_numbers(scene, (number,), np.hypot(*linear[2 * k : 2 * k + 2])[None])
     return validate_scene(scene)
@@ -266,24 +292,31 @@ def _gains(fitted: Fitted) -> tuple[Estimate, ...]:
     return tuple(_estimate(math.exp(x), math.exp(x), True, float(spread), True) for x, spread in pairs)
 
 
-def _modes(problem: Problem, fitted: Fitted, known: Information) -> tuple[tuple[Estimate, ...], tuple[Estimate, ...]]:
-    """Return the natural frequencies and damping ratios with their intervals, by central differences."""
-    moved = len(problem.unknowns.numbers)
-    values = np.stack(natural(problem.unknowns.scene(problem.scene, fitted.x)))
-    slopes = np.zeros((*values.shape, len(known.names)))
-    for k in range(moved):
-        step = np.zeros(fitted.x.size)
-        step[k] = 1e-5
-        high, low = (np.stack(natural(problem.unknowns.scene(problem.scene, fitted.x + s * step))) for s in (1.0, -1.0))
-        if high.shape == low.shape == values.shape:
-            slopes[:, :, k] = (high - low) / 2e-5
-    spread = np.sqrt(np.maximum(np.einsum("amk,kl,aml->am", slopes, known.covariance, slopes), 0.0))
-    lost = np.abs(np.einsum("amk,ku->amu", slopes, known.undetermined)) * np.minimum(known.errors, 1e3)
-    determined = np.all(lost < 0.1 * np.maximum(np.abs(values), 1e-300)[:, :, None], axis=2)
-    return tuple(
-        tuple(
-            _estimate(value, value, True, each / value, bool(sure))
-            for value, each, sure in zip(values[a], spread[a], determined[a], strict=True)
-        )
-        for a in (0, 1)
-    )  # pyright: ignore[reportReturnType]
+def propagate(
+    scene: Scene,
+    names: Sequence[str],
+    covariance: np.ndarray,
+    axes: np.ndarray,
+    errors: np.ndarray,
+    function: Callable[[Scene], np.ndarray],
+) -> list[Estimate]:
+    """Return the values (m,) of a function of the scene with their intervals, by central differences.
+
+    **Arguments**: `names` (k,) of the uncertain numbers; the `covariance` (k, k) of their relative errors; undetermined
+    directions `axes` (k, u) and their `errors` (u,); the `function`, which returns values (m,) other than 0.
+    """
+    values, slopes = function(scene), []
+    for name in names:
+        number = find_number(scene, name, "unknown")
+        now = np.asarray(number.read(scene))
+        step = _STEP * np.where(now != 0.0, now, number.spec.typical or 1.0)
+        high, low = (function(put_numbers(scene, (number,), now + sign * step)) for sign in (1.0, -1.0))
+        slopes.append((high - low) / (2.0 * _STEP) if high.shape == low.shape == values.shape else np.full_like(values, np.nan))
+    slopes = np.stack(slopes, axis=1)
+    spread = np.sqrt(np.maximum(np.einsum("mk,kl,ml->m", slopes, covariance, slopes), 0.0))
+    lost = np.abs(slopes @ axes) * np.minimum(errors, 1e3)
+    sure = np.all(lost < 0.1 * np.abs(values)[:, None], axis=1)
+    return [
+        _estimate(value, abs(value), value > 0.0, each / abs(value), bool(is_sure))
+        for value, each, is_sure in zip(values, spread, sure, strict=True)
+    ]

@@ -44,6 +44,11 @@ class Known(NamedTuple):
     value: float
     error: float
 
+    @property
+    def is_exact(self) -> bool:
+        """True for a number without an error; for an unbalance the error `_EXACT` stands for 0."""
+        return self.error <= 1.001 * _EXACT * abs(self.value)
+
 
 class Problem(NamedTuple):
     """Least-squares problem of an identification.
@@ -55,6 +60,7 @@ class Problem(NamedTuple):
     - of each run, without the padding: `masks` (n, C), True for samples that count; `raw` (n, C), readings without a filter;
       `times` (n,), s; `angles` of the rotors (n, E), rad
     - `means` and `precisions` (p,): known values of x, and 1/error^2, 0 for a free number
+    - `marked`: True if the zero of the rotor's angle is the same mark in all runs
     - `unbalances`: for each exciter its known value, None if it is free
     - `notes`: sentences for the reader
     """
@@ -68,6 +74,7 @@ class Problem(NamedTuple):
     angles: tuple[np.ndarray, ...]
     means: np.ndarray
     precisions: np.ndarray
+    marked: bool
     unbalances: tuple[Known | None, ...]
     notes: tuple[str, ...]
 
@@ -160,6 +167,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
         turned,
         means=np.concatenate([means, np.zeros(len(gains) + len(turns))]),
         precisions=1.0 / errors**2,
+        marked=all(marked),
         unbalances=unbalances,
         notes=tuple(dict.fromkeys(notes)),
     )

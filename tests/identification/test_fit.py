@@ -2,9 +2,12 @@
 
 import functools
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_ups_by_scipy import TRUTH, accelerations, record, scene_of
+from run_ups_by_scipy import TOP, TRUTH, accelerations, ramp, record, scene_of
 
 import jaxvib as jv
 
@@ -90,8 +93,20 @@ def test_intervals_hold_the_truth_in_repeated_records():
     assert 0.85 < np.std(ratios) < 1.15
 
 
+@functools.cache
+def everything_free():
+    return jv.identify(start(1.05), run_of(), unknown=[*NAMES, "machine.mass"])
+
+
+@functools.cache
+def with_added_mass():
+    noise = np.random.default_rng(1)
+    heavier = record(T, clean(**{"machine__mass[0]": 130.0}), NOISE, noise, change={"machine.mass[0]": "+10 kg"})
+    return jv.identify(start(1.05, mass=1.03), [run_of(), heavier], unknown=[*NAMES, "machine.mass"])
+
+
 def test_common_factor_of_all_numbers_is_undetermined():
-    fit = jv.identify(start(1.05), run_of(), unknown=[*NAMES, "machine.mass"])
+    fit = everything_free()
     assert fit.status_name == "undetermined" and len(fit.undetermined) == 1
     assert fit.undetermined[0].sentence.startswith("multiplying all masses, stiffnesses, dampings and unbalances by one number")
     np.testing.assert_allclose(fit.undetermined[0].weights, 1.0 / 3.0)
@@ -102,10 +117,7 @@ def test_common_factor_of_all_numbers_is_undetermined():
 
 
 def test_known_mass_that_is_added_determines_all_numbers():
-    heavier = record(
-        T, clean(**{"machine__mass[0]": 130.0}), NOISE, np.random.default_rng(1), change={"machine.mass[0]": "+10 kg"}
-    )
-    fit = jv.identify(start(1.05, mass=1.03), [run_of(), heavier], unknown=[*NAMES, "machine.mass"])
+    fit = with_added_mass()
     assert fit.status_name == "found"
     assert np.max(np.abs(distances(fit))) < 4.0
     assert fit.estimate("machine.mass[0]").error < 0.5
@@ -149,6 +161,40 @@ def test_results_are_saved_and_drawn(tmp_path):
     again = jv.load(fit.save(tmp_path / "fit"))
     assert again.summary() == fit.summary() and "mode 2" in fit.summary()
     assert len(fit.plot().axes) == 2
+
+
+class Ramp(jv.IdealDrive):
+    """Run-up of the records as a prescribed drive."""
+
+    speed: jax.Array
+    kind: str = eqx.field(static=True, default="ramp", kw_only=True)
+
+    def angle_at(self, t):
+        return ramp(t)[0]
+
+    def speed_at(self, t):
+        return ramp(t)[1]
+
+    def acceleration_at(self, t):
+        return ramp(t)[2]
+
+
+def test_plan_predicts_the_errors_after_a_run_with_an_added_mass():
+    drive, channels = Ramp(jnp.asarray(TOP)), run_of().channels
+    again = jv.PlannedRun("again", drive, 16.0, channels, rate=500.0)
+    heavier = jv.PlannedRun("heavier", drive, 16.0, channels, rate=500.0, change={"machine.mass[0]": "+10 kg"})
+    plan = jv.plan_runs(everything_free(), [again, heavier])
+    assert plan.candidates == ("heavier", "again")
+    assert np.all(np.isinf(plan.errors[1])) and np.all(np.isinf(plan.now))
+    found = np.array([each.error / each.value for each in with_added_mass().estimates])
+    np.testing.assert_allclose(plan.errors[0], found, rtol=0.2)
+
+
+def test_interval_of_a_quantity_follows_from_the_numbers():
+    fit = everything_free()
+    lowest = fit.interval_of(lambda scene: float(jv.natural_frequencies(scene)[0]))
+    np.testing.assert_allclose(lowest, fit.frequency[0], rtol=2e-3)
+    assert np.isinf(fit.interval_of(lambda scene: float(scene.machine.mass[0])).high)
 
 
 @pytest.mark.parametrize(
