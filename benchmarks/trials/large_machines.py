@@ -1,41 +1,52 @@
-"""Time of a second call for machines of many platforms and rotors with many loads, and the error of the modal form.
+"""Time and error for machines of many platforms and rotors with many loads.
 
-    python benchmarks/trials/large_machines.py
+    python benchmarks/trials/large_machines.py [2 5 10 20 50 100 200]
 
-Milliseconds of the processor, the least of several calls. The error is the largest relative difference of the amplitudes of all
-jam modes from a dense solution at their load speeds.
+Milliseconds of the processor: the least of several calls and, in brackets, the first call, which compiles. A step of `simulate`
+follows from two runs of different length; the rest of a run is the time beyond its steps. The error is the largest relative
+difference of the amplitudes of all jam modes from a dense solution.
 """
 
 from __future__ import annotations
 
+import os
 import pathlib
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
-import jax
-import numpy as np
+os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
 
 import jaxvib as jv
 
+jv.prepare_cpu()
+
+import equinox as eqx  # noqa: E402
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 
-from guard import chain, planar
-from parts.common import machine_line
+from guard import chain, planar  # noqa: E402
+from parts.common import machine_line  # noqa: E402
+
+from jaxvib.steady.balance.speeds import characteristic_speeds  # noqa: E402
 
 
-def seconds(function: Callable[[], object], repeats: int = 5) -> float:
-    """Least time of the processor of a call, after a first one."""
-    jax.block_until_ready(jax.tree.leaves(function()))
+def seconds(function: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
+    """Time of the processor of a first call, and the least of several later ones."""
     found = []
-    for _ in range(repeats):
+    for _ in range(repeats + 1):
         begun = time.process_time()
         jax.block_until_ready(jax.tree.leaves(function()))
         found.append(time.process_time() - begun)
-    return min(found)
+    return found[0], min(found[1:])
 
 
-def error(scene: jv.Scene) -> float:
+def jam_error(scene: jv.Scene) -> float:
     """Largest relative difference of the amplitudes of the jam modes from a dense solution."""
     modes, carrier, loads = jv.jam_modes(scene), scene.machine.carrier(), scene.loads
     there = np.flatnonzero(np.isfinite(modes.omega))
@@ -51,18 +62,59 @@ def error(scene: jv.Scene) -> float:
     return worst
 
 
-def main() -> None:
+def gradient(scene: jv.Scene) -> Callable[[], jax.Array]:
+    """Gradient of the sum of the foundation forces of all jam modes by the stiffness of every support."""
+
+    @jax.jit
+    @jax.grad
+    def slope(stiffness: jax.Array) -> jax.Array:
+        changed = eqx.tree_at(lambda s: s.machine.stiffness, scene, stiffness)
+        return jnp.nansum(jv.jam_modes(changed).foundation_force)
+
+    return lambda: slope(scene.machine.stiffness)
+
+
+def step_and_rest(scene: jv.Scene) -> tuple[float, float]:
+    """Time of a step of `simulate`, and of a run without its steps."""
+    times, steps = [], []
+    for end in (2.0, 40.0):
+        run = partial(jv.simulate, scene, end, save="window", estimate=False)
+        times.append(seconds(run, 8)[1])
+        done = run()
+        steps.append(int(done.steps) + int(done.rejected))
+    each = (times[1] - times[0]) / (steps[1] - steps[0])
+    return each, times[0] - steps[0] * each
+
+
+def main(sizes: list[int]) -> None:
     print(machine_line())
-    print(f"{'platforms':>10s} {'jam_modes, ms':>15s} {'error':>10s}")
-    for n in (2, 5, 10, 20, 50, 100, 200):
+    heads = (
+        "jam_modes (first)",
+        "error",
+        "gradient (first)",
+        "exact orbit (first)",
+        "speeds (first)",
+        "step, us",
+        "rest of a run",
+    )
+    print(f"{'platforms':>9s}  {', '.join(heads)}; speeds: the characteristic speeds of the criterion")
+    for n in sizes:
         scene = chain(n)
-        print(f"{n:10d} {1e3 * seconds(lambda: jv.jam_modes(scene)):15.2f} {error(scene):10.1e}", flush=True)  # noqa: B023
-    print(f"{'loads':>10s} {'phase_jams, ms':>15s}")
+        modes, slopes = seconds(lambda: jv.jam_modes(scene)), seconds(gradient(scene))  # noqa: B023
+        first = int(np.flatnonzero(np.isfinite(jv.jam_modes(scene).omega))[0]) + 1
+        orbit = seconds(lambda: jv.jam_orbit(scene, mode=first, throw=False))  # noqa: B023
+        speeds = seconds(lambda: characteristic_speeds(scene))  # noqa: B023
+        step, rest = step_and_rest(scene)
+        cells = [f"{1e3 * later:9.2f} ({1e3 * before:6.0f})" for before, later in (modes, slopes, orbit, speeds)]
+        cells.insert(1, f"{jam_error(scene):8.1e}")
+        print(f"{n:9d}  {'  '.join(cells)}  {1e6 * step:8.2f}  {1e3 * rest:8.2f}", flush=True)
+    print(f"{'loads':>9s}  phase_jams (first)")
     for n in (3, 8, 12, 16):
         scene = planar(n)
-        print(f"{n:10d} {1e3 * seconds(lambda: jv.phase_jams(scene)):15.1f}", flush=True)  # noqa: B023
+        before, later = seconds(lambda: jv.phase_jams(scene))  # noqa: B023
+        print(f"{n:9d}  {1e3 * later:9.1f} ({1e3 * before:6.0f})", flush=True)
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main()
+    main([int(n) for n in sys.argv[1:]] or [2, 5, 10, 20, 50, 100, 200])

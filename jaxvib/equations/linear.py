@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import Self, cast
 
 import equinox as eqx
 import jax
@@ -71,7 +71,7 @@ class LinearModel(Model):
         D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
 
     **Attributes**, in addition to those of `Model`: `mass` M (nd, nd) kg, with each load at its own place; `modal`, the modal
-    form of the model, see `JammedModel.decomposed`.
+    form of the model, see `decomposed`.
     """
 
     mass: Array
@@ -111,6 +111,20 @@ class LinearModel(Model):
         values, vectors = hermitian_modes(square)
         return root_or_zero(values), inverse.T @ vectors
 
+    def decomposed(self) -> Self:
+        """Return this model with its modal form, which is faster for many load speeds.
+
+        Models of up to 3 coordinates are returned without it, because a direct solution takes no longer.
+        """
+        if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mount.gyroscopic is not None:
+            return self
+        frozen = jax.lax.stop_gradient(self)
+        frequencies, shapes = frozen.modes()
+        carrier = frozen.carrier
+        matrices = carrier.stiffness, carrier.damping, frozen.mass
+        modal = modal_response(frequencies, shapes, *matrices, frozen.direction)
+        return eqx.tree_at(lambda model: model.modal, self, modal, is_leaf=lambda leaf: leaf is None)
+
 
 def linear_model(scene: Scene) -> LinearModel:
     """Return the linear model of a scene with its loads, see `LinearModel`."""
@@ -140,6 +154,11 @@ class JammedModel(LinearModel):
     unbalance: Array
     drag: Array
     force_direction: Array
+
+    @property
+    def direction(self) -> Array:
+        """Return `force_direction`."""
+        return self.force_direction
 
     @property
     def loads(self) -> CircularLoads:
@@ -178,20 +197,6 @@ class JammedModel(LinearModel):
         if self.modal is None:
             return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))
         return self.modal.receptance(omega, self.unbalance * omega**4)
-
-    def decomposed(self) -> JammedModel:
-        """Return this model with its modal form, which is faster for many load speeds.
-
-        Models of up to 3 coordinates are returned without it, because a direct solution takes no longer.
-        """
-        if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mount.gyroscopic is not None:
-            return self
-        frozen = jax.lax.stop_gradient(self)
-        frequencies, shapes = frozen.modes()
-        carrier = frozen.carrier
-        matrices = carrier.stiffness, carrier.damping, frozen.mass
-        modal = modal_response(frequencies, shapes, *matrices, frozen.force_direction)
-        return eqx.tree_at(lambda model: model.modal, self, modal, is_leaf=lambda leaf: leaf is None)
 
 
 def _real_times(matrix: Array, vector: Array) -> Array:

@@ -255,12 +255,22 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     trace = jnp.finfo(last.dtype).eps ** 0.75 * last
     # This term changes neither the real part of 1/A nor the sign changes. It makes the function smooth at the poles.
     participation = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
-    smooth = 1j * last**2 / participation * jnp.outer(b, b.conj())
+    smoothing = 1j * last**2 / participation
+    smooth = smoothing * jnp.outer(b, b.conj())
 
     def functional(m: LinearModel, w: Array) -> Array:
         # A small damping is added, because a mode without damping that never moves the port gives 0/0 at its resonance.
         matrix = m.dynamic_stiffness(w) + 2j * w * trace * frozen.mass + smooth
         return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
+
+    damped = eqx.tree_at(lambda m: m.carrier.damping, frozen, frozen.carrier.damping + 2.0 * trace * frozen.mass)
+    modal = damped.decomposed().modal
+
+    def fast_functional(w: Array) -> Array:
+        if modal is None:
+            return functional(frozen, w)
+        receptance = modal.receptance(w, jnp.ones_like(w))
+        return (receptance / (1.0 + smoothing * receptance)).real
 
     width = jnp.einsum("ar,ab,br->r", forms.conj(), jax.lax.stop_gradient(carrier.damping), forms).real / 2.0 + trace
     poles = jnp.where(jnp.isnan(poles), last, poles)
@@ -282,12 +292,16 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
 
     # Below the first resonance the sign is + for any damping; for a machine that can drift, the sign changes at speed 0.
     # A loop over the grid points, so that a batch of machines needs the memory of one grid point for each.
-    positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: functional(frozen, w) > 0.0, grid[1:]))
+    positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: fast_functional(w) > 0.0, grid[1:]))
     passed = jnp.cumsum(positive[1:] != positive[:-1])
     order = jnp.arange(2 * resonances.shape[0] - 1)
     cell = jnp.minimum(jnp.sum(passed[None, :] <= order[:, None], axis=1), passed.shape[0] - 1)
     found = order < passed[-1]
-    refine = lambda lo, hi: bracketed_root(lambda w: functional(model, w), lo, hi)  # noqa: E731
+
+    def refine(low: Array, high: Array) -> Array:
+        polish = None if modal is None else modal.is_rough
+        return bracketed_root(lambda w: functional(model, w), low, high, fast=fast_functional, polish=polish)
+
     roots = jax.vmap(refine)(grid[cell], grid[cell + 1])
     roots = jnp.where((order == 0) & (grid[0] == 0.0), 0.0, roots)
     return jnp.where(found, roots, jnp.nan)

@@ -218,6 +218,44 @@ def test_twenty_platforms():
     assert (len(labelled) - len(exact)) % 2 == 0
 
 
+def test_damped_speeds_and_gradients_of_equal_satellites():
+    """Four equal satellites on the exciter's platform have three equal modes that never move it, and the modal form is used.
+
+    Closed form at Re A(w) = 0, A = b^T y, y = D^-1 b: dw/dk = -Re(y_k^2) / Re(y^T (dD/dw) y), from NumPy's dense matrices.
+    """
+    links = [(1, k) for k in range(2, 6)]
+
+    def loaded(stiffness):
+        machine = jv.network(
+            mass=[5.0, 2.0, 2.0, 2.0, 2.0],
+            stiffness=stiffness,
+            damping=[8.0, 3.0, 3.0, 3.0, 3.0],
+            links=links,
+            link_stiffness=[2e3] * 4,
+            link_damping=[2.0] * 4,
+            exciter=1,
+        )
+        return jv.Scene(machine, jv.balls(count=2, mass=0.2, radius=0.1, drag=1.0), jv.ConstantSpeed(50.0))
+
+    def damped(stiffness):
+        found = characteristic_speeds(loaded(stiffness))
+        return jnp.concatenate([found.damped_resonances, found.damped_additional])
+
+    stiffness = jnp.asarray([2e4, 3e3, 3e3, 3e3, 3e3])
+    speeds, slopes = np.asarray(damped(stiffness)), np.asarray(jax.jit(jax.jacrev(damped))(stiffness))
+    s, there = loaded(stiffness), np.flatnonzero(np.isfinite(speeds))
+    carrier, (b,) = s.machine.carrier(), np.asarray(s.machine.mount().rows[0])
+    k, c, mass = (np.asarray(a) for a in (carrier.stiffness, carrier.damping, carrier.mass))
+    mass = mass + 0.4 * np.outer(b, b)
+    assert there.size >= 3
+    for j in there:
+        w = speeds[j]
+        y = np.linalg.solve(k - w**2 * mass + 1j * w * c, b)
+        by_speed = (y @ (-2.0 * w * mass + 1j * c) @ y).real
+        assert abs((b @ y).real / by_speed) < 1e-10 * w
+        np.testing.assert_allclose(slopes[j], -(y**2).real / by_speed, rtol=1e-8, atol=1e-10 * np.max(np.abs(slopes[j])))
+
+
 NAMES = ("mass", "stiffness", "damping", "link_stiffness", "link_damping")
 
 
