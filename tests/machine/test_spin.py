@@ -203,7 +203,7 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
             lambda: jv.Scene(
                 HEAVY, jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1), jv.ConstantSpeed(1.0), (jv.Sliding(0.1),)
             ),
-            "effects.sliding needs loads that roll, with a ball_radius",
+            "effects.sliding needs loads that roll and have a ball_radius",
         ),
         (
             lambda: jv.Scene(HEAVY, balls(), jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1), (jv.FreeSpin(),)),

@@ -161,7 +161,7 @@ def test_frequency_about_the_equator_is_the_resolved_one():
                 scene().drive,
                 (jv.RollingFriction(1e-5),),
             ),
-            "rolling_friction needs loads that roll, with a ball_radius",
+            "rolling_friction needs loads that roll and have a ball_radius",
         ),
         (
             lambda: jv.Scene(
