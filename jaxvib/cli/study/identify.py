@@ -54,6 +54,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml
+    from jaxvib.study.bearing.identify import identify_bearing
     from jaxvib.study.bearing.measurement import measurement_from_tables
 
     is_file = record.suffix.lower() == ".toml"
@@ -68,7 +69,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
             old = tables.get(section, {})
             tables[section] = {**old, field: value} if isinstance(old, dict) else old
     pendulum, swing, dry, instrument = measurement_from_tables(tables, record.parent)
-    found = jv.identify(pendulum, swing, dry=dry, instrument=instrument)
+    found = identify_bearing(pendulum, swing, dry=dry, instrument=instrument)
     output.picture("record.png", found.plot)
     data = output.file("fit.csv")
     if data is not None:
@@ -122,6 +123,7 @@ def _identify_machine(tables: Tables, folder: Path, output: Output, options: lis
         raise InputError(name, "is for the swing of a pendulum; leave it out for a machine, and change the identification file")
     fit = fit_from_tables(tables, folder)
     found = jv.identify(fit.scene, fit.runs, unknown=fit.unknown, known=fit.known)
+    assert isinstance(found, jv.MachineFit)
     output.picture("fit.png", found.plot)
     output.keep("fit.npz", found)
     path = output.file("found.toml")
