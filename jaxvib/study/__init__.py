@@ -1,1 +1,1 @@
-"""Many runs: what a question costs, what an effect is worth, where an approximation holds."""
+"""Studies with many runs: cost of accuracy, importance of effects, limits of approximations."""

@@ -1,1 +1,1 @@
-"""The cost of accuracy: work-precision diagrams, tiers, harmonics."""
+"""Cost of accuracy: work-precision diagrams, comparison of tiers, convergence with harmonics."""

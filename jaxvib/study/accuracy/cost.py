@@ -1,4 +1,4 @@
-"""Costs of the methods for one quantity: rows of a table, the cheapest method, the figure."""
+"""Costs of the methods for one quantity: table rows, the fastest method, the figure."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 SHOWN_ERRORS = (1e-2, 1e-4, 1e-6)
-"""Errors for which tables and figures show the cheapest method."""
+"""Errors for which tables and figures show the fastest method."""
 
 _MAX_TIMING_SECONDS = 1.0
 """Total time after which a timing is not repeated, s."""
 
 
 class CostRow(NamedTuple):
-    """Cost of one method: `tier`, `method`, `dtype`, `setting` (a tolerance or a number of points, as text), its relative
-    `error`, the `seconds` of a compiled call, and the additional seconds of the first call, `compile`."""
+    """Cost of one method: `tier`, `method`, `dtype`, `setting` (a tolerance or a number of points, as text), relative `error`,
+    `seconds` of a compiled call, and `compile`, the additional seconds of the first call."""
 
     tier: str
     method: str
@@ -49,10 +49,9 @@ class Cost(Result):
     **Attributes**
 
     - `quantity`: its name
-    - `reference`: its reference values, a list
-    - `reference_error`: the error that these may have themselves, relative
-    - `rows`: a row for each tier, method, tolerance and dtype, with its error and seconds
-    - `left_out`: the tiers that cannot answer, a sentence with the reason for each
+    - `reference`: list of its reference values; `reference_error`: their relative error
+    - `rows`: a `CostRow` for each tier, method, tolerance and dtype
+    - `left_out`: for each tier that cannot compute the quantity, a sentence with the reason
     """
 
     status = Computed.done
@@ -65,9 +64,9 @@ class Cost(Result):
 
     @validated
     def cheapest(self, error: float) -> CostRow | None:
-        """Return the row of the fastest method with that relative `error`, such as 1e-4.
+        """Return the row of the fastest method whose relative error is at most `error`, such as 1e-4.
 
-        None if no row is as accurate, or if the reference is not accurate enough to tell.
+        None if no row is accurate enough, or if the reference is not accurate enough.
         """
         if not self.reference_error < error:
             return None
@@ -75,7 +74,7 @@ class Cost(Result):
         return min(able, key=lambda row: row.seconds, default=None)
 
     def summary(self) -> str:
-        """Return the fastest method for each of the errors `SHOWN_ERRORS`, and the tiers left out, as text."""
+        """Return the fastest method for each of `SHOWN_ERRORS`, and the omitted tiers, as text."""
         lines = [
             f"{self.quantity.replace('_', ' ')}: {len(self.rows)} methods, error of the reference {self.reference_error:.1e}"
         ]
@@ -87,7 +86,7 @@ class Cost(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot error against seconds, a line for each method, onto axes `ax` if given; see `cost_figure`.
+        """Plot error over computing time, with a line for each method; see `cost_figure`.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -95,11 +94,11 @@ class Cost(Result):
 
 
 def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
-    """Plot error against seconds: a panel for each of `costs` with its title, and the same line for a method in all panels.
+    """Plot error over computing time, with a panel for each of `costs`. A method has the same line style in all panels.
 
-    Rings mark the cheapest method for each of the errors `SHOWN_ERRORS`.
+    Rings mark the fastest method for each of `SHOWN_ERRORS`.
 
-    **Arguments**: `costs` a `Cost` for each title, which stands above its panel; `ax` as many axes to draw onto. **Returns**
+    **Arguments**: `costs`: a mapping from the title of each panel to its `Cost`; `ax`: as many axes to draw onto. **Returns**
     a matplotlib figure, or the given `ax`.
 
     >>> import jaxvib as jv
@@ -142,7 +141,7 @@ def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
 
 
 def relative(value: ArrayLike, reference: np.ndarray) -> float:
-    """Return the largest difference, relative to the largest entry; infinite for values that are not finite."""
+    """Return the largest difference, relative to the largest reference value; infinite for values that are not finite."""
     difference = float(np.max(np.abs(np.ravel(np.asarray(value, float)) - reference)) / np.max(np.abs(reference)))
     return difference if np.isfinite(difference) else np.inf
 

@@ -16,19 +16,19 @@ from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 
 SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
-"""Measuring window at the end of a run, and longest run, in slow periods."""
+"""Measuring window at the end of a run, and longest run, in slow periods (see `slow_period`)."""
 
 
 class ExactJam(NamedTuple):
-    """Exact jam with many collocation points, and with fewer for the estimate of its error."""
+    """Exact jam with many collocation points (`fine`), and with fewer (`coarse`) to estimate its error."""
 
     mode: int
     fine: Orbit
     coarse: Orbit
 
     def length(self, scene: Scene, tolerance: float) -> float:
-        """Return the duration, s, of a run to a stable jam: the time in which the influence of its start decays to the
-        tolerance, and the measuring window."""
+        """Return the duration, s, of a run to a stable jam: the time in which deviations of its start decay to the tolerance,
+        plus the measuring window."""
         rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
         window = slow_period(scene) * SLOW_PERIODS
         return min(window + np.log(1.0 / tolerance) / rate, slow_period(scene) * MOST_PERIODS)
@@ -58,12 +58,13 @@ def usual_mode(scene: Scene) -> int:
 
 
 def collocation_points(scene: Scene, points: int) -> int:
-    """Return the number of points on half a period, or with the same spacing on a whole one if the motion needs it."""
+    """Return the number of collocation points: `points` on half a period, or the same spacing on a whole period without
+    half-turn symmetry."""
     return points if has_half_turn(scene.all_effects) else 2 * points + 1
 
 
 def slow_period(scene: Scene) -> float:
-    """Return the longest period of the carrier's natural motions, s."""
+    """Return the slow period, s: the longest natural period of the carrier."""
     frequencies = natural_frequencies(scene)
     return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
 

@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-_RATIO = math.sqrt(10.0)
+_STEP_RATIO = math.sqrt(10.0)
 _DIFFERENCE_STEPS = tuple(float(h) for h in np.logspace(-2.0, -7.0, 11))
-"""Relative steps of the sweep; each is `_RATIO` times the next."""
+"""Relative steps of the finite differences; each is `_STEP_RATIO` times the next."""
 
 _SMALL_DERIVATIVE_SHARE = 1e-3
-"""Smallest scale of a derivative in its relative error, as a share of the largest derivative."""
+"""Smallest scale for the relative error of a derivative, as a share of the largest derivative."""
 
-_SAFETY = 3.0
-"""Factor on the error of finite differences within which a difference counts as noise."""
+_NOISE_FACTOR = 3.0
+"""Factor on the error of finite differences below which a deviation counts as noise."""
 
-_LARGE, _TINY = 1e-2, 1e4 * float(np.finfo(float).eps)
-"""Share of the largest change above which a change counts as equally large, and share of the quantity below which a change
+_MIN_LARGE_CHANGE, _MAX_ROUNDING_CHANGE = 1e-2, 1e4 * float(np.finfo(float).eps)
+"""Share of the largest change above which a change counts as about equally large; share of the quantity below which a change
 counts as rounding."""
 
 
@@ -50,7 +50,7 @@ class GradientStatus(eqx.Enumeration):
     noisy = "no derivative differs, but finite differences are too noisy for the requested tolerance"
     not_finite = "a derivative, or the quantity near the point, is not a finite number"
     chaotic = (
-        "the quantity changes by the same amount for any small change of a number: nearby motions "
+        "the quantity changes by the same amount for any small change of a parameter: nearby motions "
         "diverge, and derivatives are meaningless"
     )
 
@@ -58,9 +58,9 @@ class GradientStatus(eqx.Enumeration):
 class ImplicitRoute(NamedTuple):
     """Quantity that is computed from the solution of an equation.
 
-    `read(scene, x)` is the quantity, where `residual(scene, x)` = 0, with `solution(scene)` = x. Its derivative by the implicit
-    function theorem is d read/dp - (d read/dx) (d residual/dx)^-1 (d residual/dp). x is an array (n,) or a scalar, the residual
-    as long.
+    `solution(scene)` returns x, an array (n,) or a scalar; `residual(scene, x)` is 0 at the solution and has the shape of x;
+    `read(scene, x)` returns the quantity. By the implicit function theorem, the derivative of the quantity is
+    d read/dp - (d read/dx) (d residual/dx)^-1 (d residual/dp).
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> def stiffness_per_mass(scene):
@@ -82,24 +82,25 @@ class ImplicitRoute(NamedTuple):
 
 
 class GradientCheck(Result):
-    """Derivatives of a quantity by the numbers p of a scene, route by route, against finite differences.
+    """Comparison of derivatives of a quantity q with respect to parameters p of a scene with finite differences.
 
-    Returned by `check_gradients`.
+    Returned by `check_gradients`. A route is a method of differentiation: forward mode, reverse mode, or implicit.
 
-    All derivatives are p dq/dp, the change per relative change of the number, in the quantity's own unit. For a number that is
-    0, p is its typical size (an angle's is 1 rad, a position's 0.1 m).
+    All derivatives are p dq/dp, the change per relative change of the parameter, in the unit of the quantity. For a parameter
+    that is 0, p is its typical size (1 rad for an angle, 0.1 m for a position).
 
-    **Attributes** (n numbers, r routes, k steps)
+    **Attributes** (n parameters, r routes, k steps)
 
     - `value` of the quantity
-    - `numbers` (n,): their names, and `at` (n,): their values in SI
-    - `routes` (r,): their names
-    - `gradient` (r, n) by each route
-    - `difference` (n,) by finite differences, `noise` (n,): the error that these may have, `step` (n,): the best one, relative
-    - `error` (r, n) of each route against the differences, relative
-    - `steps` (k,) of the series, and `sweep` (n, k): the central differences at each
+    - `numbers` (n,): names of the parameters, and `at` (n,): their values in SI
+    - `routes` (r,): names of the routes
+    - `gradient` (r, n): derivatives by each route
+    - `difference` (n,): derivatives by finite differences; `noise` (n,): their possible error; `step` (n,): their best relative
+      step
+    - `error` (r, n): relative deviation of each route from the finite differences
+    - `steps` (k,): all relative steps; `sweep` (n, k): the central differences with each step
     - `tolerance` of the check
-    - `left_out`: numbers too close to a bound for a step
+    - `left_out`: parameters too close to a bound for a step
     """
 
     status: GradientStatus
@@ -118,7 +119,7 @@ class GradientCheck(Result):
     left_out: tuple[str, ...] = ()
 
     def summary(self) -> str:
-        """Return a line of text for each number, the worst first."""
+        """Return a line of text for each parameter, the worst first."""
         scale = _scale(self.difference)
         with np.errstate(invalid="ignore"):
             worst = np.max(np.where(np.isfinite(self.error), self.error, np.inf), axis=0)
@@ -142,8 +143,9 @@ class GradientCheck(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the central differences relative to the first route over their step, a line for each number, with the best
-        steps.
+        """Plot the deviation of the central differences from the first route over their step, with a line for each parameter.
+
+        The best steps are marked.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -164,38 +166,38 @@ def check_gradients(
     implicit: ImplicitRoute | None = None,
     tolerance: float = 1e-5,
 ) -> GradientCheck:
-    """Check the derivatives of a quantity of a scene: each route against finite differences, for your own tests.
+    """Compare the derivatives of a quantity of a scene, by each route, with finite differences; useful in your own tests.
 
-    Each number p of the scene is moved by relative steps from 1e-2 to 1e-7, and central differences
+    Each parameter p of the scene is changed by relative steps h from 1e-2 to 1e-7. The central differences D are extrapolated
+    once, which gives E:
 
         D(h) = (q(p + h p) - q(p - h p)) / (2 h),      E(h) = D(h/r) + (D(h/r) - D(h)) / (r^2 - 1),      r = sqrt 10
 
-    are extrapolated once, E.
-
-    - The best step is the one at which E agrees best with those at the next larger and the next smaller one. The larger of both
-      differences is the possible error of E, the noise: truncation at large steps, rounding (eps |q|/h at least) and the
-      quantity's own tolerance at small ones
-    - A derivative differs if its distance from E is more than `tolerance` and three times the noise
-    - The status is `chaotic`, even if the routes agree, if steps of 1e-5 to 1e-7 change the quantity about as much as the
-      largest step does, and by a derivative the smallest step alone would change it as much: disturbances have then grown by
-      more than 1e5. `growth` gives the time after which a run reaches that
+    - The best step is the one for which E agrees best with the values for the next larger and the next smaller step. The larger
+      of these two differences is the possible error of E, called noise. Its causes are truncation at large steps, and rounding
+      (at least eps |q|/h) and the tolerance of the quantity itself at small steps
+    - A derivative differs if its distance from E is more than `tolerance` plus three times the noise
+    - The status is `chaotic`, even if the routes agree, if two conditions are met: steps of 1e-5 to 1e-7 change the quantity
+      about as much as the largest step, and a derivative predicts a change of this size for the smallest step. Disturbances
+      have then grown by more than 1e5. `growth` gives the time after which this happens
 
     **Arguments**
 
     - `scene` in double precision
     - `quantity`: a function of a `Scene` that returns one number, such as
       `lambda s: jv.jam_modes(s).select(3).foundation_force`
-    - `free`: names of the numbers, such as "machine.stiffness", "loads.drag" or "effects.stop[0].gap": all their entries;
-      default: all parameters of the scene; typical: 5 to 20. A number that is 0 is moved by steps of its typical size; one at a
-      bound, such as a damping of 0, is left out. Each number takes 22 evaluations
-    - `routes`: "forward" and "reverse" mode of JAX through the quantity; name those that it has (`simulate` has reverse unless
-      it is given `diffrax.ForwardMode()`, and then forward)
-    - `implicit`: a third route for a quantity that is computed from the solution of an equation, see `ImplicitRoute`
-    - `tolerance` of each derivative, relative to it, or to a thousandth of the largest derivative (as p dq/dp) if that is more;
-      typical: 1e-4 to 1e-6 (default 1e-5)
+    - `free`: names of parameters or arrays, such as "machine.stiffness", "loads.drag" or "effects.stop[0].gap"; all entries of
+      an array are checked; default: all parameters of the scene; typical: 5 to 20. The steps of a parameter that is 0 are
+      relative to its typical size. A parameter at a bound, such as a damping of 0, is left out. Each parameter needs 22
+      evaluations
+    - `routes`: "forward" and "reverse" mode of JAX, as far as the quantity supports them (`simulate` supports reverse mode by
+      default, and forward mode with `diffrax.ForwardMode()`)
+    - `implicit`: an additional route for a quantity that is computed from the solution of an equation, see `ImplicitRoute`
+    - `tolerance` of each derivative, relative to the derivative itself, or to a thousandth of the largest derivative (as
+      p dq/dp) if that is more; typical: 1e-4 to 1e-6 (default 1e-5)
 
-    **Returns** `GradientCheck`; its `require()` is the assertion. **Raises** `InputError` for a scene in single precision, a
-    quantity that is no number, unknown names and routes.
+    **Returns** `GradientCheck`; its method `require()` raises an error if a derivative differs. **Raises** `InputError` for a
+    scene in single precision, a quantity that is not a real scalar, and unknown names and routes.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -215,31 +217,31 @@ def check_gradients(
         raise InputError("routes", f"are {quoted(list(routes))}; name some of {', '.join(_MODES)}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
         raise InputError("tolerance", f"is {quoted(tolerance)}; it must be a number between 0 and 1, such as 1e-5")
-    numbers, scales, left_out = _movable(scene, free)
+    numbers, scales, left_out = _changeable_parameters(scene, free)
     at = np.asarray([float(each.read(scene)[0]) for each in numbers])
 
     def put(shares: Array) -> Scene:
         return put_numbers(scene, numbers, at + shares * scales)
 
-    def by(shares: Array) -> Array:
-        """Return the values of the quantity with each number changed by that share of its size."""
+    def quantity_at(shares: Array) -> Array:
+        """Return the quantity with each parameter changed by `shares` (n,) of its size."""
         given = call_user(quantity, "quantity", put(shares))
         if not is_real(given):
             raise InputError("quantity", f"gives {quoted(given)}; it must give one real number")
         return jnp.asarray(given)
 
-    nothing = jnp.zeros(len(numbers))
-    value = by(nothing)
+    no_change = jnp.zeros(len(numbers))
+    value = quantity_at(no_change)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise InputError("quantity", f"gives {value.dtype} of shape {value.shape}; it must give one real number")
-    gradient = {route: np.asarray(_MODES[route](by)(nothing), float) for route in routes}
+    gradient = {route: np.asarray(_MODES[route](quantity_at)(no_change), float) for route in routes}
     if implicit is not None:
-        gradient["implicit"] = np.asarray(_implicit(implicit, put, nothing), float)
-    sweep = np.asarray([[_central(by, len(numbers), i, h) for h in _DIFFERENCE_STEPS] for i in range(len(numbers))])
+        gradient["implicit"] = np.asarray(_implicit(implicit, put, no_change), float)
+    sweep = np.asarray([[_central(quantity_at, len(numbers), i, h) for h in _DIFFERENCE_STEPS] for i in range(len(numbers))])
     difference, noise, best = (np.asarray(x) for x in zip(*(_extrapolated(row, float(value)) for row in sweep), strict=True))
     scale, routed = _scale(difference), np.stack(list(gradient.values()))
     away = np.abs(routed - difference)
-    parts = any(_parts(row, slopes, float(value)) for row, slopes in zip(sweep, routed.T, strict=True))
+    parts = any(_is_chaotic(row, slopes, float(value)) for row, slopes in zip(sweep, routed.T, strict=True))
     return GradientCheck(
         status=member(GradientStatus, "chaotic" if parts else _compare_derivatives(away, noise, scale, tolerance)),
         value=float(value),
@@ -261,8 +263,8 @@ def check_gradients(
 _MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]] = {"forward": jax.jacfwd, "reverse": jax.grad}
 
 
-def _movable(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber], np.ndarray, tuple[str, ...]]:
-    """Return the checked numbers, the sizes to which their steps are relative, and the names of numbers at a bound."""
+def _changeable_parameters(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber], np.ndarray, tuple[str, ...]]:
+    """Return the checked parameters, the sizes to which their steps are relative, and the names of parameters at a bound."""
     found, scales, left_out = [], [], []
     for name in numbers_of(scene) if free is None else free:
         for each in find_number(scene, name, "free").single(scene):
@@ -276,23 +278,24 @@ def _movable(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber
                 left_out.append(each.name)
     if not found:
         raise InputError(
-            "free", "contains no number that can change in both directions; give numbers that are not at their bounds"
+            "free", "contains no parameter that can change in both directions; name parameters that are not at their bounds"
         )
     return found, np.asarray(scales), tuple(left_out)
 
 
-def _central(by: Callable[[Array], Array], n: int, i: int, step: float) -> float:
+def _central(quantity_at: Callable[[Array], Array], n: int, i: int, step: float) -> float:
     move = jnp.asarray(np.eye(n)[i] * step)
-    return (float(by(move)) - float(by(-move))) / (2.0 * step)
+    return (float(quantity_at(move)) - float(quantity_at(-move))) / (2.0 * step)
 
 
 def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, float]:
     """Return the derivative from central differences (k,) with decreasing steps, its error, and the best step."""
-    better = central[1:] + (central[1:] - central[:-1]) / (_RATIO**2 - 1.0)
+    better = central[1:] + (central[1:] - central[:-1]) / (_STEP_RATIO**2 - 1.0)
     apart = np.abs(np.diff(better))
     rounding = np.finfo(float).eps * abs(value) / np.asarray(_DIFFERENCE_STEPS[2:-1])
     noise = np.maximum(np.maximum(apart[:-1], apart[1:]), rounding)
-    # Differences with steps below the resolution of the quantity agree with each other, but not with the larger ones.
+    # Steps below the resolution of the quantity give differences that agree with each other, but not with those of larger
+    # steps.
     inner = better[1:-1]
     for k in range(1, noise.size):
         with np.errstate(invalid="ignore"):
@@ -304,16 +307,18 @@ def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, floa
     return float(inner[k]), float(noise[k]), _DIFFERENCE_STEPS[k + 1]
 
 
-def _parts(central: np.ndarray, slopes: np.ndarray, value: float) -> bool:
-    """Return True if the quantity changes as much at small steps as at large ones, consistent with its derivatives (r,).
+def _is_chaotic(central: np.ndarray, slopes: np.ndarray, value: float) -> bool:
+    """Return True if small steps change the quantity as much as large ones, and a derivative (r,) predicts such a change.
 
-    Noise also causes changes at small steps, but leaves the derivatives unchanged; a wrong derivative leaves the quantity
-    unchanged.
+    Noise also causes changes at small steps, but not large derivatives; a wrong derivative does not cause changes of the
+    quantity.
     """
     changed = 2.0 * np.abs(central) * np.asarray(_DIFFERENCE_STEPS)
     most, small = float(np.max(changed)), float(np.median(changed[-5:]))
     claimed = np.abs(slopes) * 2.0 * _DIFFERENCE_STEPS[-1]
-    return small > max(_LARGE * most, _TINY * abs(value)) and bool(np.any(claimed > _LARGE * most))
+    return small > max(_MIN_LARGE_CHANGE * most, _MAX_ROUNDING_CHANGE * abs(value)) and bool(
+        np.any(claimed > _MIN_LARGE_CHANGE * most)
+    )
 
 
 def _scale(difference: np.ndarray) -> np.ndarray:
@@ -325,13 +330,13 @@ def _scale(difference: np.ndarray) -> np.ndarray:
 def _compare_derivatives(away: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: float) -> str:
     if not (np.all(np.isfinite(away)) and np.all(np.isfinite(noise))):
         return "not_finite"
-    if np.any(away > tolerance * scale + _SAFETY * noise):
+    if np.any(away > tolerance * scale + _NOISE_FACTOR * noise):
         return "differ"
-    return "noisy" if np.any(_SAFETY * noise > tolerance * scale) else "agree"
+    return "noisy" if np.any(_NOISE_FACTOR * noise > tolerance * scale) else "agree"
 
 
-def _implicit(route: ImplicitRoute, put: Callable[[Array], Scene], nothing: Array) -> Array:
-    solved = jnp.asarray(route.solution(put(nothing)))
+def _implicit(route: ImplicitRoute, put: Callable[[Array], Scene], no_change: Array) -> Array:
+    solved = jnp.asarray(route.solution(put(no_change)))
     x, shape = jnp.atleast_1d(solved), solved.shape
 
     def residual(p: Array, x: Array) -> Array:
@@ -340,5 +345,5 @@ def _implicit(route: ImplicitRoute, put: Callable[[Array], Scene], nothing: Arra
     def read(p: Array, x: Array) -> Array:
         return route.read(put(p), x.reshape(shape))
 
-    inner = jnp.linalg.solve(jax.jacfwd(residual, 1)(nothing, x), jax.jacfwd(residual)(nothing, x))
-    return jax.grad(read)(nothing, x) - jax.grad(read, 1)(nothing, x) @ inner
+    inner = jnp.linalg.solve(jax.jacfwd(residual, 1)(no_change, x), jax.jacfwd(residual)(no_change, x))
+    return jax.grad(read)(no_change, x) - jax.grad(read, 1)(no_change, x) @ inner

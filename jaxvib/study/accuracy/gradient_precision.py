@@ -1,4 +1,4 @@
-"""Work-precision of gradients: implicit, through time, and by finite differences."""
+"""Work-precision of gradients: by the implicit function theorem, through time integration, and by finite differences."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from jaxvib.study.accuracy.exact_reference import ExactJam, collocation_points, 
 _GRADIENT_TOLERANCE = 1e-8
 
 _MAX_RECORDED_STEPS = 2**17
-"""Maximum number of steps of a run with derivatives, which records the end of each step."""
+"""Maximum number of steps of a run with derivatives; such a run stores the end of each step."""
 
 _supports = operator.attrgetter("machine.stiffness")
 """Stiffnesses of the supports of a scene."""

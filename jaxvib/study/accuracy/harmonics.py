@@ -42,7 +42,7 @@ class HarmonicConvergence(Result):
     - `harmonics` (n,): the highest harmonic of the carrier
     - `omega` (w,), rad/s, of the jams
     - `error` (n, w): relative error of the rotor speed, by comparison with twice the largest number of points
-    - `known` (n, w): the estimate of the error by each jam itself
+    - `known` (n, w): estimate of this error from each jam alone
     """
 
     status = Computed.done
@@ -72,7 +72,7 @@ class HarmonicConvergence(Result):
 def harmonic_convergence(
     scene: Scene, omega: Sequence[Number], *, points: Sequence[int] = (4, 6, 8, 10, 12, 16, 20, 24)
 ) -> HarmonicConvergence:
-    """Return the error of exact jams over the number of collocation points: it falls exponentially (spectral convergence).
+    """Return the error of exact jams over the number of collocation points; it decreases exponentially (spectral convergence).
 
     **Arguments**
 

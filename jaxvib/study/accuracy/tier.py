@@ -1,4 +1,4 @@
-"""Tiers: methods to compute the jam of a scene, each with the scenes that it includes."""
+"""Tiers: methods to compute the jam of a scene, each with a test for the scenes that it supports."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class JamValues(Protocol):
 class Tier(NamedTuple):
     """Method to compute a jam.
 
-    **Attributes**: `name`; `purpose`: text; `require(scene)` raises `InputError` if the tier cannot include the
-    scene, and names the property that a part of the scene lacks; `jam(scene, mode, until)` returns the result for a jam mode,
-    integrated until a time (s) if the tier integrates in time.
+    **Attributes**: `name`; `purpose`: text; `require(scene)` raises `InputError` if the tier does not support the scene, and
+    names the property that a part of the scene lacks; `jam(scene, mode, until)` returns the result for a jam mode, integrated
+    to the time `until`, s, if the tier integrates in time.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Tier(NamedTuple):
     jam: Callable[[Scene, int, float], JamValues]
 
     def refusal(self, scene: Scene) -> str | None:
-        """Return the sentence with which the tier refuses the scene, or None if it includes the scene.
+        """Return a sentence with the reason why the tier does not support the scene, or None if it does.
 
         >>> import jaxvib as jv
         >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
@@ -92,4 +92,4 @@ TIERS = (
         lambda scene, mode, until: settle(scene, mode=mode, throw=False),
     ),
 )
-"""Tiers in order of cost; the last one includes every scene."""
+"""Tiers in order of cost; the last one supports every scene."""

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 class TierValues(eqx.Module):
-    """Results of one tier, NaN for missing ones: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,
-    `stable` (n,); `message` (n sentences): the outcome of each, with the reason for a missing one."""
+    """Results of one tier, NaN if missing: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N, `stable` (n,);
+    `message` (n,): the outcome of each computation as a sentence, with the reason for a missing result."""
 
     omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "mass"))
     amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "mass", "coordinate"))
@@ -39,7 +39,8 @@ class TierValues(eqx.Module):
 
 
 class Tiers(Result):
-    """Two tiers over the mass of one load: `mass` (n,), kg (its mean if loads differ), `leading` and `exact`: the jams."""
+    """Jams by two tiers over the mass of a load: `mass` (n,), kg (the mean if loads differ); `leading` and `exact`:
+    `TierValues`."""
 
     status = Computed.done
 
@@ -59,7 +60,9 @@ class Tiers(Result):
         return "\n".join(lines)
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot relative differences over the mass of a load: load speed, amplitude, foundation force; hollow if unstable.
+        """Plot relative differences of load speed, amplitude and foundation force over the mass of a load.
+
+        Hollow symbols mark unstable jams.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -75,10 +78,11 @@ class Tiers(Result):
 
 @validated
 def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers:
-    """Compare a jam mode by the leading order with the exact one, for loads heavier and lighter than the scene's.
+    """Compare a jam mode to leading order with the exact jam, for loads that are heavier and lighter than those of the scene.
 
-    Drag grows with the square of the mass, which leaves the leading-order balance n(Omega) as it is, except for the loads'
-    share in the mass of their platform. Dry friction grows as the mass does, as in a machine: with it the balance moves too.
+    The drag is multiplied by the square of the factor on the mass. The leading-order balance n(Omega) then stays the same,
+    except for the contribution of the loads to the mass of their platform. Dry friction is proportional to the mass, as in a
+    machine, and changes the balance.
 
     **Arguments**
 
@@ -95,10 +99,10 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
     >>> [f"{abs(a / b - 1):.0e}" for a, b in zip(tiers.leading.omega, tiers.exact.omega)]
     ['1e-06', '1e-05', '1e-04']
 
-    Source: the leading order is the antiphase paper's, see `jam_modes`; the comparison is ours.
+    Source: the antiphase paper for the leading order, see `jam_modes`; the comparison is ours.
     """
     loads, factors = jammed_loads(scene), np.atleast_1d(numbers(factors, "", "factors", None, low=0.0, open_low=True)).tolist()
-    answers: list[tuple[Jam, Orbit]] = []
+    jams_of_masses: list[tuple[Jam, Orbit]] = []
     for factor in factors:
         heavier = eqx.tree_at(
             lambda x: (x.mass, x.drag, x.inertia),
@@ -107,10 +111,10 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
             is_leaf=lambda x: x is None,
         )
         now = eqx.tree_at(lambda s: s.loads, scene, heavier)
-        answers.append((jam_modes(now).select(mode, throw=False), jam_orbit(now, mode=mode, throw=False)))
+        jams_of_masses.append((jam_modes(now).select(mode, throw=False), jam_orbit(now, mode=mode, throw=False)))
 
     def tier(which: int) -> TierValues:
-        jams = [answer[which] for answer in answers]
+        jams = [jams[which] for jams in jams_of_masses]
         names = ("omega", "amplitude", "foundation_force", "stable")
         numbers = (np.stack([np.asarray(getattr(jam, name)) for jam in jams]) for name in names)
         return TierValues(*numbers, message=tuple(jam.message for jam in jams))

@@ -1,4 +1,4 @@
-"""Work-precision: error against seconds of one quantity of a scene, by all methods."""
+"""Work-precision: error and computing time of one quantity of a scene by all methods."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver | None]] = {
 
 _TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 _ORBIT_POINTS = (8, 16)
-_AVERAGED = (1e-3, 1e-6)
+_ENVELOPE_TOLERANCES = (1e-3, 1e-6)
 
-_SINGLE = 2e-6
+_MIN_SINGLE_TOLERANCE = 2e-6
 """Smallest tolerance in single precision."""
 
 
@@ -63,35 +63,36 @@ def work_precision(
     solvers: Sequence[str] = tuple(SOLVERS),
     repeats: int = 3,
 ) -> Cost:
-    """Compute a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time that it takes.
+    """Compute a quantity of a scene by every tier, method, tolerance and dtype, with its error and computing time.
 
-    - "amplitude", "foundation_force": of a jam mode, if the scene has jams that can be computed exactly; tiers leading order,
-      exact orbit, averaged equations, and full integration, both from the leading order's motion. The reference is the exact
-      orbit with 32 points, its own error the difference to 24. Otherwise (run-ups, imbalance, loads at different stations) as
-      measured at the end of a run from rest; the reference is full integration to a tolerance of 1e-13, its own error the
-      difference to 1e-11
-    - "final_state": of the full equations at `until`, from rest; every solver, in double and in single precision. The reference
-      is a run to a tolerance of 1e-13, its own error estimated as every run's
-    - "gradient": of the jam's largest amplitude with respect to the machine's stiffnesses; implicit derivatives of leading
-      order and exact orbit, forward and reverse mode and finite differences through the full integration
+    - "amplitude" and "foundation_force" of a jam mode, if exact jams of the scene can be computed. The tiers are leading order,
+      exact orbit, averaged equations and full equations; the last two are integrated from the leading-order motion. The
+      reference is the exact orbit with 32 points; its error is the difference to 24 points. For other scenes (run-ups,
+      imbalance, loads at different stations), the quantity is measured at the end of a run from rest. The reference is then the
+      full equations with a tolerance of 1e-13; its error is the difference to 1e-11
+    - "final_state": the state of the full equations at `until`, from rest, by every solver, in double and in single precision.
+      The reference is a run with a tolerance of 1e-13, with the estimated error of this run
+    - "gradient" of the largest amplitude of the jam with respect to the stiffnesses of the machine: implicit derivatives of
+      leading order and exact orbit; forward mode, reverse mode and finite differences through time integration
 
-    Single precision is that of the leading order and of the default method of full integration. A tier that cannot answer is
-    left out, and the result states the reason.
+    Single precision is used for the leading order and for the default method of time integration. A tier that cannot compute
+    the quantity is left out, and the result states the reason.
 
     **Arguments**
 
     - `scene` in double precision
     - `quantity`: one of `QUANTITIES`, the names above
-    - `mode`: a jam mode; default: the second highest with a rising slope, because in the highest the loads turn with the rotor
-      except for a small slip; if there is one only, that one
-    - `until`, s or text; default: 20 slow periods, and for a jam also as long as its slowest Floquet multiplier needs to forget
-      the start to the tolerance of the run
+    - `mode`: a jam mode; default: the second-highest mode that is stable by slope, or the only one (in the highest mode the
+      loads turn almost with the rotor)
+    - `until`, s or text; default: 20 times the longest natural period of the carrier. For a jam, the time is added in which
+      deviations of the start decay to the tolerance of the run, according to the largest Floquet multiplier
     - `tolerances` of time integration, at least one; typical: 1e-3 to 1e-11 (the default)
-    - `solvers`: the methods, names from `SOLVERS`
-    - `repeats`: number of timings of each (less often if it takes seconds), the fastest counts; typical: 3 (the default)
+    - `solvers`: names of methods from `SOLVERS`
+    - `repeats`: number of timings of each method, fewer if a call takes seconds; the shortest time is reported; typical: 3 (the
+      default)
 
     **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, no tolerance, a scene in single precision, a
-    gradient of a scene without an exact jam; further errors as `jam_modes`, `simulate`.
+    gradient of a scene without an exact jam; and the errors of `jam_modes` and `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -101,7 +102,7 @@ def work_precision(
     >>> [row.tier for row in cost.rows if row.error < 1e-6][0], cost.reference_error < 1e-9
     ('exact orbit', True)
 
-    Source: ours; the tiers have theirs, see `jam_modes`, `jam_orbit`, `envelope`, `simulate`.
+    Source: ours; sources of the tiers: see `jam_modes`, `jam_orbit`, `envelope`, `simulate`.
     """
     require_one_of(quantity, QUANTITIES, "quantity")
     unknown = [name for name in solvers if name not in SOLVERS]
@@ -116,9 +117,9 @@ def work_precision(
         problem = "is in single precision; errors are measured against double: switch JAX to float64 before it is made"
         raise InputError("scene", problem)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
-    ask = _Ask(scene, tuple(tolerances), tuple(solvers), repeats)
+    request = _Request(scene, tuple(tolerances), tuple(solvers), repeats)
     if quantity == "final_state":
-        return _final_state(ask, end)
+        return _final_state(request, end)
     if quantity == "gradient":
         return gradient_precision(scene, exact_jam(scene, mode), end, repeats)
     try:
@@ -126,11 +127,11 @@ def work_precision(
     except InputError as problem:
         if mode is not None:
             raise
-        return _at_the_end(ask, quantity, end, f"leading order, exact orbit: {problem}")
-    return _steady(ask, quantity, jam, end)
+        return _at_the_end(request, quantity, end, f"leading order, exact orbit: {problem}")
+    return _steady(request, quantity, jam, end)
 
 
-class _Ask(NamedTuple):
+class _Request(NamedTuple):
     scene: Scene
     tolerances: tuple[float, ...]
     solvers: tuple[str, ...]
@@ -142,8 +143,8 @@ def _single(tree: Tree) -> Tree:
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
 
 
-def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
-    scene, mode = ask.scene, jam.mode
+def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) -> Cost:
+    scene, mode = request.scene, jam.mode
 
     def read(found: Result) -> Array:
         return getattr(found, quantity)
@@ -155,7 +156,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
 
     def leading(scene: Scene, dtype: str) -> CostRow:
         call = _compiled(lambda s: read(jam_modes(s).select(mode)), scene)
-        return row_of("leading order", "", "", call, error, ask.repeats, dtype)
+        return row_of("leading order", "", "", call, error, request.repeats, dtype)
 
     rows, left_out = [], []
     light = jam_modes(scene).select(mode, throw=False)
@@ -170,7 +171,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
     for few in _ORBIT_POINTS:
         points = collocation_points(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points)), scene)
-        rows.append(row_of("exact orbit", "", f"{points} points", call, error, ask.repeats))
+        rows.append(row_of("exact orbit", "", f"{points} points", call, error, request.repeats))
     if not bool(jam.fine.stable):
         left_out.append(unstable("envelope, full", jam))
     else:
@@ -178,54 +179,59 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
         def length(tolerance: float) -> float:
             return jam.length(scene, tolerance) if end is None else end
 
-        integrated, reasons = _integrated(ask, read, error, start, length)
+        integrated, reasons = _integrated(request, read, error, start, length)
         rows, left_out = rows + integrated, left_out + reasons
     return Cost(quantity, reference.tolist(), relative(read(jam.coarse), reference), rows, tuple(left_out))
 
 
-def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cost:
+def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str) -> Cost:
     """Return the cost of a quantity of a motion without a jam, measured at the end of a run from rest."""
-    end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
+    end = SLOW_PERIODS * slow_period(request.scene) if end is None else end
 
     def read(found: Result) -> Array:
         return getattr(found, quantity)
 
-    start = initial_state(ask.scene)
+    start = initial_state(request.scene)
 
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
-        """Return the reference value, computed at the first use: rows of the same program then include its compilation."""
-        run = simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
+        """Return the reference value. It is computed at its first use, so that the compilation of its program is timed in a
+        row."""
+        run = simulate(request.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
         return np.ravel(np.asarray(read(run), float))
 
-    rows, left_out = _integrated(ask, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
+    rows, left_out = _integrated(request, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
     return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference()), rows, (reason, *left_out))
 
 
 def _integrated(
-    ask: _Ask, read: Callable[[Result], Array], error: Callable[[Array], float], start: State, length: Callable[[float], float]
+    request: _Request,
+    read: Callable[[Result], Array],
+    error: Callable[[Array], float],
+    start: State,
+    length: Callable[[float], float],
 ) -> tuple[list[CostRow], list[str]]:
     """Return rows of the quantity at the end of averaged and full runs, with a `length` for each tolerance."""
-    full, rows, left_out = _full(ask, start, length, lambda run: error(read(run))), [], []
-    for tolerance in _AVERAGED:
+    full, rows, left_out = _full(request, start, length, lambda run: error(read(run))), [], []
+    for tolerance in _ENVELOPE_TOLERANCES:
         end = length(tolerance)
 
         def averaged(end: float = end, tolerance: float = tolerance) -> Array:
             chosen = Tolerance(tolerance)
-            return read(envelope(ask.scene, end, start=start, save="window", stepsize_controller=chosen, throw=False))
+            return read(envelope(request.scene, end, start=start, save="window", stepsize_controller=chosen, throw=False))
 
         try:
-            rows.append(row_of("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error, ask.repeats))
+            rows.append(row_of("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error, request.repeats))
         except InputError as problem:
             left_out.append(f"envelope: {problem}")
             break
     return rows + full, left_out
 
 
-def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
+def _full(request: _Request, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
     """Return rows of full runs by every solver to every tolerance, in double and (default method) in single precision."""
-    ends = {tolerance: length(tolerance) for tolerance in ask.tolerances}
-    fastest, _ = frequency_bounds(ask.scene)
+    ends = {tolerance: length(tolerance) for tolerance in request.tolerances}
+    fastest, _ = frequency_bounds(request.scene)
     steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # one number for all runs, since it is part of the program
 
     def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:
@@ -245,15 +251,15 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
             )
 
         return [
-            row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, ask.repeats, dtype)
-            for tolerance in ask.tolerances
+            row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, request.repeats, dtype)
+            for tolerance in request.tolerances
             if tolerance >= least
         ]
 
-    found = [row for name in ask.solvers for row in rows(ask.scene, start, name, "float64")]
-    if "default" in ask.solvers:
+    found = [row for name in request.solvers for row in rows(request.scene, start, name, "float64")]
+    if "default" in request.solvers:
         with jax.enable_x64(False):
-            found += rows(_single(ask.scene), _single(start), "default", "float32", _SINGLE)
+            found += rows(_single(request.scene), _single(start), "default", "float32", _MIN_SINGLE_TOLERANCE)
     return found
 
 
@@ -262,21 +268,21 @@ def _compiled(function: Callable[[Scene], Array], scene: Scene) -> Callable[[], 
     return lambda: jitted(scene)
 
 
-def _final_state(ask: _Ask, end: float | None) -> Cost:
-    end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
-    best = functools.cache(lambda: simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
+def _final_state(request: _Request, end: float | None) -> Cost:
+    end = SLOW_PERIODS * slow_period(request.scene) if end is None else end
+    best = functools.cache(lambda: simulate(request.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
 
     @functools.cache
     def scale() -> State:
-        return error_scale(best().window.state, natural_units(ask.scene))
+        return error_scale(best().window.state, natural_units(request.scene))
 
     def error(run: Run) -> float:
         last, exact = _last(run), _last(best())
-        single = run.error.dtype.itemsize < 8  # the number of whole turns of its angles is unknown
+        single = run.error.dtype.itemsize < 8  # in single precision the number of whole turns of angles is unknown
         value = float(scaled_error(turned(last, exact) if single else last, exact, scale()))
         return value if np.isfinite(value) else np.inf
 
-    rows = _full(ask, initial_state(ask.scene), lambda tolerance: end, error)
+    rows = _full(request, initial_state(request.scene), lambda tolerance: end, error)
     reason = "leading order, exact orbit, envelope: these do not determine the phase, which is part of the final state"
     parts = jax.tree.leaves(jax.tree.map(lambda x, unit: np.ravel(x / unit), _last(best()), scale()))
     return Cost("final_state", np.concatenate(parts).tolist(), float(best().error), rows, (reason,))

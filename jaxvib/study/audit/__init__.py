@@ -1,1 +1,1 @@
-"""Audit of effects and tiers on a scene: their changes, their cost, and missing effects."""
+"""Audit of a scene: changes and cost of its effects and of the tiers, and effects that it may lack."""

@@ -1,4 +1,4 @@
-"""Audit of each effect and each tier on a scene: changes, cost, and effects that may be missing."""
+"""Audit of a scene: changes and cost of each effect and each tier, and effects that it may lack."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class Audit(Result):
 
     **Attributes**
 
-    - `accuracy` that was requested, relative
-    - `motion` that was compared, as text
+    - `accuracy`: the requested relative accuracy
+    - `motion`: description of the compared motion
     - `kind` of the motion of the scene as given, before any effect is taken out or put in; its `omega`, rad/s, `amplitude`
       (nd,), m (rad for tilts), and `foundation_force`, N; `fold`: the rotor speed at which the jam ends, rad/s
     - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if times were not measured)
@@ -74,7 +74,7 @@ class Audit(Result):
 
     @validated
     def advised(self, advice: str) -> list[str]:
-        """Return the names of the effects with that `advice`, "needed" or "negligible" for example."""
+        """Return the names of the effects with the given `advice`, for example "needed" or "negligible"."""
         return [row.effect for row in self.effects if row.advice == advice]
 
     def summary(self) -> str:
@@ -92,7 +92,7 @@ class Audit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the change by each effect relative to the requested accuracy, and its cost, onto two axes `ax` if given.
+        """Plot the change by each effect, relative to the requested accuracy, and its cost, on two axes.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -118,15 +118,17 @@ def audit(
     tiers: bool = True,
     repeats: int = 3,
 ) -> Audit:
-    """Compute the change and the cost of each effect and each tier on a scene; find negligible and missing effects.
+    """Compute by how much each effect and each tier changes the results of a scene, and their cost.
 
-    - Each effect of the scene is taken out; each that it lacks and could have is put in, with typical values
-      (`Effect.typical`). The same quantities of both scenes are computed
-    - The compared motion of a scene that jams at a constant rotor speed is its jam, by the exact orbit or, if that is refused,
-      by the full equations until nothing changes. The compared motion of any other scene is the end of a run. The transient
-      before it is not compared
-    - The coupling of a rotor's tilts and the limit of a motor's power are taken out in the same way
-    - Effects are characterized by their properties, so that one of your own is audited as the package's are
+    The audit shows which effects are negligible, and which ones the scene lacks.
+
+    - Each effect of the scene is removed. Each effect that the scene lacks and could have is added, with typical values
+      (`Effect.typical`). The same quantities of both scenes are compared
+    - For a scene that jams at a constant rotor speed the jam is compared. It is computed by the exact orbit, or by the full
+      equations until they settle if the theory of exact orbits does not support the scene. For other scenes the end of a run
+      is compared. Transients are not compared
+    - The gyroscopic coupling of a rotor's tilts and the limited power of a motor are removed in the same way
+    - Your own effects are audited in the same way as those of the package
 
     **Arguments**
 
@@ -135,15 +137,15 @@ def audit(
     - `mode`: the jam mode; default: the second-highest of the modes that are stable by slope, or the only one
     - `until`, s or text: the end of a run; default: 100 times the longest natural period of the carrier, plus twice the time of
       the last jump of the drive's acceleration
-    - `start` of the run: "rest", "turning" (loads evenly spread, as fast as the rotor) or a `State`. With it a run is computed
-      in any case; default: "turning" if the rotor's speed is constant, otherwise "rest"
-    - `possible`: effects to put in, in place of those that the package knows; `()` for none
+    - `start` of the run: "rest", "turning" (loads evenly spread, at the rotor speed) or a `State`. If it is given, a run is
+      compared, and not a jam; default of the run: "turning" if the rotor speed is constant, otherwise "rest"
+    - `possible`: effects to add, in place of those of the package; `()` for none
     - `tiers`: True to compute every tier as well
-    - `repeats`: number of timings of a run of 100 turns, the fastest counts; typical: 3 (the default); 0 for no times, which
-      saves a compilation for each effect
+    - `repeats`: number of timings of a run of 100 turns, of which the shortest is reported; typical: 3 (the default); 0 for no
+      timings, which saves a compilation for each effect
 
-    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1 and as `jam_modes`, `simulate`;
-    `ComputationError` (status "absent") for a mode that does not exist.
+    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, `ComputationError` (status
+    "absent") for a mode that does not exist, and the errors of `jam_modes` and `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -163,10 +165,10 @@ def audit(
     scene = validate_scene(scene)
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
-    question, words = _comparison(scene, mode, end, start)
-    repeated = RepeatedComparison(question, repeats)
+    comparison, description = _comparison(scene, mode, end, start)
+    repeated = RepeatedComparison(comparison, repeats)
     own = repeated.values(scene, repeated.tier(scene))
-    until = question.until if isinstance(question, RunComparison) else None
+    until = comparison.until if isinstance(comparison, RunComparison) else None
     # The scale of a machine that almost does not move is the unbalance radius of its loads.
     amplitude = [a * (own.magnified / MIN_AMPLITUDE_SHARE if own.magnified > 1.0 else 1.0) for a in own.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
@@ -180,7 +182,7 @@ def audit(
     return Audit(
         status=member(AuditStatus, status),
         accuracy=float(accuracy),
-        motion=words,
+        motion=description,
         kind=own.words,
         omega=own.omega,
         amplitude=np.asarray(own.amplitude),
@@ -190,14 +192,14 @@ def audit(
         seconds=seconds,
         compile=compiling,
         effects=effects,
-        tiers=tier_rows(scene, question, own, repeats) if tiers else [],
+        tiers=tier_rows(scene, comparison, own, repeats) if tiers else [],
         numbers=[_with_computed_advice(row, effects) for row in dimensionless_numbers(scene, own, accuracy)],
         coordinates=scene.machine.structure().coordinates,
     )
 
 
 def _with_computed_advice(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
-    """Return the row of a dimensionless number. If the audit of its effect has a clear result, it has that advice."""
+    """Return the row of a dimensionless number, with the advice from the audit of its effect if that has a clear result."""
     for effect in effects:
         if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
             return row._replace(advice=effect.advice, says=f"{row.says}; the advice is that of the computed effect")

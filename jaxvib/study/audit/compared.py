@@ -1,4 +1,4 @@
-"""Comparison of a scene with the same scene with or without an effect."""
+"""Comparison of a scene with a variant that has one effect more or less."""
 
 from __future__ import annotations
 
@@ -37,16 +37,17 @@ class EffectRow(NamedTuple):
 
     **Attributes**
 
-    - `name` of the effect, `present`: True if the scene has it (it was removed), False if not (it was added), `tier` of the
+    - `effect`: its name; `present`: True if the scene has it (it was removed), False if not (it was added); `tier` of the
       computation
-    - changes by the effect, relative to the scene's own value: `amplitude` (of the coordinate that changes most, in units of
-      the largest of its kind, or of a hundredth of the loads' unbalance radius if the machine almost does not move),
-      `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN if unknown
+    - changes caused by the effect, relative to the value for the scene: `amplitude` (of the coordinate with the largest change;
+      relative to the largest amplitude with the same unit, or to a hundredth of the unbalance radius of the loads if the
+      machine hardly moves), `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN if
+      unknown
     - `uncertainty` of these changes
-    - cost of the effect, with it less without: `operations` of the equations of motion; `seconds` of a run of 100 turns;
-      `compile`, seconds of processor time to trace and compile that run; NaN without timings. Small differences of times are
-      timing noise
-    - `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `says`: the reason, with its numbers
+    - cost of the effect (value with the effect minus value without it): `operations` of the equations of motion; `seconds` of a
+      run of 100 turns; `compile`: processor time to trace and compile that run, s; NaN without timings. Small differences of
+      times are timing noise
+    - `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `says`: the reason
     """
 
     effect: str
@@ -65,7 +66,7 @@ class EffectRow(NamedTuple):
 
     @property
     def change(self) -> float:
-        """Largest relative change, without its sign; NaN if change unknown."""
+        """Largest modulus of the relative changes; NaN if no change is known."""
         known = [abs(x) for x in (self.amplitude, self.foundation_force, self.omega, self.fold) if not math.isnan(x)]
         return max(known, default=math.nan)
 
@@ -78,7 +79,7 @@ class RepeatedComparison:
 
     def __init__(self, comparison: JamComparison | RunComparison, repeats: int):
         self.comparison, self.repeats = comparison, repeats
-        self._known: dict[tuple[int, bool], tuple[Scene, MotionValues]] = {}
+        self._values: dict[tuple[int, bool], tuple[Scene, MotionValues]] = {}
         self._times: dict[int, tuple[Scene, tuple[float, float]]] = {}
 
     def tier(self, *scenes: Scene) -> str:
@@ -88,9 +89,9 @@ class RepeatedComparison:
     def values(self, scene: Scene, tier: str) -> MotionValues:
         """Return the values of the motion of a scene by a tier."""
         exact = tier == "exact orbit"
-        if (id(scene), exact) not in self._known:  # stored with its scene, whose id stays unique this way
-            self._known[id(scene), exact] = scene, (self.comparison.exact if exact else self.comparison.full)(scene)
-        return self._known[id(scene), exact][1]
+        if (id(scene), exact) not in self._values:  # stored with its scene, whose id stays unique this way
+            self._values[id(scene), exact] = scene, (self.comparison.exact if exact else self.comparison.full)(scene)
+        return self._values[id(scene), exact][1]
 
     def times(self, scene: Scene) -> tuple[float, float]:
         """Return the times, s, of a run of 100 turns of the rotor, and of tracing and compiling it; NaN without timings."""
@@ -103,7 +104,7 @@ class RepeatedComparison:
 
 def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(start)):
-        start = initial_state(scene)  # without the jam, a run from another state takes the same time
+        start = initial_state(scene)  # if the jam does not exist, a run from another state takes the same time
     end = jnp.asarray(_TURNS * 2.0 * math.pi / float(scene.drive.speed))
     control = StepControl(jnp.asarray(_TOLERANCE, end.dtype), None, jnp.asarray(_MAX_STEPS, jnp.int32))
     plan = IntegrationPlan(None, control, None, 0, jnp.asarray(20.0, end.dtype), _MAX_STEPS)
@@ -114,7 +115,7 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
         return eqx.filter(inspect.unwrap(integrate)(*eqx.combine(numbers, choices)), eqx.is_array)
 
     with compiled_anew():
-        begun = time.process_time()  # processor time, which other processes do not change
+        begun = time.process_time()  # processor time, because other processes hardly influence it
         program = program_of_run.lower(numbers).compile()
         compiling = time.process_time() - begun
     _, seconds, _ = timed(lambda: program(numbers).omega, repeats)
@@ -136,7 +137,7 @@ def field_operations(scene: Scene) -> int:
 
 
 def relative_changes(new: MotionValues, old: MotionValues, own: MotionValues, units: tuple[str, ...]) -> dict[str, float]:
-    """Return the changes from `old` to `new`, relative to the values `own`, by the names in `CHANGES`; see `EffectRow`."""
+    """Return the changes from `old` to `new`, relative to the values `own`, with the keys `CHANGES`; see `EffectRow`."""
     moved, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
     largest = {unit: max(x for x, u in zip(size, units, strict=True) if u == unit) for unit in units}
     shares = [float(d) / largest[u] if largest[u] > 0.0 else math.nan for d, u in zip(moved, units, strict=True)]
@@ -162,7 +163,7 @@ def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, acc
     changes = relative_changes(new, old, own, scene.machine.structure().units)
     sizes = [(len(each.all_effects), len(without_excluded_effects(each).all_effects)) for each in (scene, variant.scene)]
     if sizes[0][0] != sizes[1][0] and sizes[0][1] == sizes[1][1]:
-        changes["fold"] = math.nan  # theories of jams leave the effect out of both
+        changes["fold"] = math.nan  # theories of jams omit this effect, so that both folds are equal
     # The uncertainties of both motions, relative to the motion of this scene.
     uncertainty = own.uncertainty + other.uncertainty * _size(other) / _size(own)
     sign = 1 if variant.present else -1
@@ -203,5 +204,5 @@ def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, st
         advice = "negligible"
     else:
         advice = "cannot tell"
-        sentences.append(f"the motion is periodic only to {row.uncertainty:.1e} only")
+        sentences.append(f"the motion is periodic only to {row.uncertainty:.1e}")
     return {"advice": advice, "says": "; ".join(filter(None, sentences))}

@@ -1,4 +1,4 @@
-"""Motions by which two scenes are compared: a jam, or the end of a run."""
+"""Motions that are compared between two scenes: a jam, or the end of a run."""
 
 from __future__ import annotations
 
@@ -29,17 +29,19 @@ from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 _MIN_UNCERTAINTY = 1e-9
 
 _WINDOW_PERIODS = 100
-"""Slow periods of the measuring window at the end of a run, which must cover the beat of an imbalance with jammed loads."""
+"""Length of the measuring window at the end of a run, in slow periods. It must include the beat of an imbalance with jammed
+loads."""
 
 MIN_AMPLITUDE_SHARE = 0.01
-"""Smallest scale of amplitudes, as a share of the unbalance radius S/M of the loads; a balanced rotor has less."""
+"""Smallest scale of amplitudes, in units of the unbalance radius S/M of the loads; amplitudes of a balanced rotor are
+smaller."""
 
 _GRID_SPEEDS = 100
-"""Number of load speeds in a grid on which an exact fold is bracketed."""
+"""Number of load speeds in the grid with which an exact fold is bracketed."""
 
 
 class MotionValues(NamedTuple):
-    """Values of a motion that are compared.
+    """Compared values of a motion.
 
     **Attributes**
 
@@ -48,7 +50,7 @@ class MotionValues(NamedTuple):
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
     - `uncertainty`: relative uncertainty of these values
     - `closest`: smallest distance of two loads in units of their diameter, NaN for points and for coincident loads
-    - `magnified`: factor on these amplitudes and this force in relative changes, above 1 if the machine is almost at rest, see
+    - `magnified`: factor on amplitudes and force for relative changes, above 1 if the machine is almost at rest, see
       `MIN_AMPLITUDE_SHARE`
     """
 
@@ -64,12 +66,12 @@ class MotionValues(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The kind with the remark."""
+        """Kind of motion with the remark."""
         return f"{self.kind} ({self.remark})" if self.remark else self.kind
 
 
 class JamComparison(NamedTuple):
-    """Comparison by the jam `mode`: by its exact orbit, or by a run from near it if the theory refuses the scene."""
+    """Comparison of the jam `mode`, by its exact orbit, or by a run that starts near it if that theory excludes the scene."""
 
     mode: int
 
@@ -84,24 +86,27 @@ class JamComparison(NamedTuple):
     def exact(self, scene: Scene) -> MotionValues:
         """Return the values of the exact orbit; NaN and a kind "no jam mode" if the jam does not exist."""
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
-        there = bool(np.isfinite(orbit.omega))
-        kind = f"jam mode {self.mode}, {orbit.judgement}" if there else f"no jam mode {self.mode}"
+        exists = bool(np.isfinite(orbit.omega))
+        kind = f"jam mode {self.mode}, {orbit.judgement}" if exists else f"no jam mode {self.mode}"
         # The motion of loads that would separate is a different one; other statuses concern the computation only.
-        if there and bool(orbit.status == OrbitStatus.would_separate):
+        if exists and bool(orbit.status == OrbitStatus.would_separate):
             kind = f"{kind}, but the loads separate"
-        computed = not there or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)
+        computed = not exists or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)
         return MotionValues(
             kind,
             float(orbit.omega),
             tuple(np.abs(np.asarray(orbit.amplitude)).tolist()),
             float(orbit.foundation_force),
             fold_speed(without_excluded_effects(scene), float(orbit.omega)),
-            max(float(orbit.error), _MIN_UNCERTAINTY) if there else math.nan,
+            max(float(orbit.error), _MIN_UNCERTAINTY) if exists else math.nan,
             remark="" if computed else status_name(orbit.status),
         )
 
     def state(self, scene: Scene) -> State:
-        """Return a state on the exact jam, without effects that theories of jams exclude, with separated loads; else NaN."""
+        """Return a state on the exact jam with slightly separated loads; NaN if the jam does not exist.
+
+        Effects that theories of jams exclude are omitted.
+        """
         n = scene.loads.count
         orbit = jam_orbit(without_excluded_effects(scene), mode=self.mode, throw=False)
         displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
@@ -115,14 +120,16 @@ class JamComparison(NamedTuple):
 
 
 class RunComparison(NamedTuple):
-    """Comparison by the end, `until` s, of a run from `start`: "rest", "turning" (evenly spread loads at the rotor speed), or a
-    state."""
+    """Comparison of the end of a run from 0 to `until`, s.
+
+    `start` is "rest", "turning" (evenly spread loads at the rotor speed), or a state.
+    """
 
     until: float
     start: Literal["rest", "turning"] | State
 
     def state(self, scene: Scene) -> State:
-        """Return the initial state of `scene`, with the rotation of each load about itself if an effect makes it free."""
+        """Return the initial state of `scene`, completed by `with_spin`."""
         if isinstance(self.start, State):
             with contextlib.suppress(InputError):  # the state is of a scene with another effect
                 return with_spin(scene, self.start)
@@ -133,7 +140,7 @@ class RunComparison(NamedTuple):
         return initial_state(scene, "rest")
 
     def has_exact_orbit(self, scene: Scene) -> bool:
-        """Return False, since a run has no exact orbit."""
+        """Return False, because a run has no exact orbit."""
         return False
 
     def exact(self, scene: Scene) -> MotionValues:
@@ -150,7 +157,8 @@ class RunComparison(NamedTuple):
     def of_arguments(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunComparison:
         """Return a comparison by a run.
 
-        By default it ends at 5 `SLOW_PERIODS` slow periods plus twice the time of the last jump of the drive's acceleration.
+        By default the run ends at 5 `SLOW_PERIODS` slow periods plus twice the time of the last jump of the drive's
+        acceleration.
         """
         if start is None:
             start = "turning" if scene.drive.constant else "rest"
@@ -163,7 +171,7 @@ class RunComparison(NamedTuple):
 
 
 def without_excluded_effects(scene: Scene) -> Scene:
-    """Return the scene without effects that theories of jams exclude, such as imbalance, which acts at another speed."""
+    """Return the scene without effects that theories of jams exclude, such as imbalance, which turns at another speed."""
     kept = tuple(e for e in scene.all_effects if all(isinstance(term, COINCIDENT_TERMS) for term in e.terms()))
     return scene if len(kept) == len(scene.all_effects) else scene.replace(effects=kept)
 
@@ -180,7 +188,7 @@ def turning_state(scene: Scene) -> State:
 
 
 def mean_torque(scene: Scene, omega: float) -> float:
-    """Return the mean torque of the rotor on loads with the mean speed `omega`, N m, by drag alone."""
+    """Return the mean torque, N m, by which the drag of the rotor drives loads with the speed `omega`, rad/s."""
     n = scene.loads.count
     u = scene.loads.rest()
     rate = (jnp.full((n,), omega), *(jnp.zeros((n,)) for _ in u[1:]))
@@ -191,8 +199,8 @@ def mean_torque(scene: Scene, omega: float) -> float:
 def fold_speed(scene: Scene, omega: float) -> float:
     """Return the rotor speed, rad/s, of the fold at which the exact jam with load speed `omega` ends.
 
-    This is the next fold above the jam on the branch, otherwise the next one below. It is NaN if there is none, or if theories
-    of jams exclude the scene.
+    This is the next fold at higher load speeds, otherwise the next one at lower load speeds. It is NaN if there is none, or if
+    theories of jams exclude the scene.
     """
     try:
         folds = jam_modes(scene).folds
@@ -207,11 +215,11 @@ def fold_speed(scene: Scene, omega: float) -> float:
     for _ in range(2):
         grid = np.linspace(low, high, _GRID_SPEEDS)
         speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(grid)[None]))
-        turns = np.flatnonzero((slope[1:] > 0.0) != (slope[:-1] > 0.0))
-        turns = turns[np.isfinite(slope[turns]) & np.isfinite(slope[turns + 1])]
-        if not turns.size:
+        changes = np.flatnonzero((slope[1:] > 0.0) != (slope[:-1] > 0.0))
+        changes = changes[np.isfinite(slope[changes]) & np.isfinite(slope[changes + 1])]
+        if not changes.size:
             return math.nan
-        k = int(turns[np.argmin(np.abs(grid[turns] - near))])
+        k = int(changes[np.argmin(np.abs(grid[changes] - near))])
         low, high = float(grid[k]), float(grid[k + 1])
         found = float(speed[k] if abs(slope[k]) < abs(slope[k + 1]) else speed[k + 1])
     return found

@@ -1,4 +1,4 @@
-"""Dimensionless numbers on effects that a scene may lack."""
+"""Dimensionless numbers that indicate effects which a scene may lack."""
 
 from __future__ import annotations
 
@@ -35,20 +35,22 @@ class NumberRow(NamedTuple):
 
 
 def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -> list[NumberRow]:
-    """Compute the numbers on effects that `scene` lacks, for the motion `values` and a relative `accuracy`.
+    """Compute the dimensionless numbers of effects that `scene` lacks, for the motion `values` and a relative `accuracy`.
 
     - gravity on the loads: g/(R Omega^2), its share in the normal force of a load on its track
-    - crowding: the share of the track that the loads' diameters fill, N arcsin(r/R)/pi, and the share of the unbalance that is
-      lost if they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R; without a `ball_radius`, r is that of steel balls
-    - distance: smallest distance of two loads, in diameters, without contact
-    - dry friction over viscous friction: that of a ball bearing, or of steel on steel, over the drag b_W R^2 (n - Omega)
-    - gyroscopic: the loads' inertia about the axis over that of the machine about a tilt, with R as its radius of gyration, if
-      the machine cannot tilt
-    - lift: the foundation force over the weight; above 1, supports on which the machine stands would have to pull
+    - crowding: the share of the track that the diameters of the loads fill, N arcsin(r/R)/pi, and the share of the unbalance
+      that is lost if they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R. Without a `ball_radius`, r is the radius of
+      steel balls of the same mass
+    - distance: smallest distance between two loads, in diameters, if the scene has no contact between loads
+    - dry friction divided by viscous friction: friction of a ball bearing, or of steel on steel, divided by the drag torque
+      b_W R^2 (n - Omega)
+    - gyroscopic, if the machine cannot tilt: inertia of the loads about the axis, divided by that of the machine about a tilt
+      with the radius of gyration R
+    - lift: foundation force divided by the weight; above 1, supports under the machine would have to pull
 
-    Effects that are in the scene have no row. **Returns** a list of `NumberRow`.
+    Effects of the scene have no row. **Returns** a list of `NumberRow`.
 
-    Source: ours; the first is the claim of Artyunin and Sumenkov 2019 that gravity is below 0.5 %.
+    Source: ours; Artyunin and Sumenkov 2019 for the first number: they state that gravity is below 0.5 %.
     """
     if not np.isfinite(values.omega) or values.omega == 0.0:
         return []
@@ -62,7 +64,8 @@ def gravity_share(radius: float, omega: float, g: float = _G) -> float:
     >>> round(100.0 * gravity_share(0.08, 169.6), 3)      # per cent, of the published rotor's pendulums in their first jam
     0.426
 
-    Source: Artyunin and Sumenkov 2019, who say that it is below 0.5 %: it is above sqrt(g/(0.005 R)), 157 rad/s here.
+    Source: Artyunin and Sumenkov 2019, who state that it is below 0.5 %. This is true for load speeds above sqrt(g/(0.005 R)),
+    which is 157 rad/s here.
     """
     return g / (radius * omega**2)
 
@@ -101,12 +104,14 @@ def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     half = math.asin(min(ratio, 1.0))
     filled = n * half / math.pi
     if filled >= 1.0:
-        says = f"{own[1]}they do not fit on the track: use lighter loads, or more than one track"
+        says = f"{own[1]}the loads do not fit on the track: use lighter loads, or more than one track"
         return NumberRow("crowding: N arcsin(r/R)/pi", filled, 1.0, "perhaps needed", says)
     if not own[1]:
         return None
     lost = 1.0 - math.sin(n * half) / (n * math.sin(half))
-    says = f"{own[1]}side by side they fill {100.0 * filled:.3g} % of the track and carry this share less: give ball_radius"
+    says = (
+        f"{own[1]}side by side they fill {100.0 * filled:.3g} % of the track and lose this share of unbalance: give ball_radius"
+    )
     return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, says)
 
 
@@ -122,7 +127,7 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     if has_term(scene.all_effects, ContactFriction) or not drag > 0.0:
         return None
     arm, n = _arm(scene), scene.loads.count
-    pressed = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (n,)))) * arm * values.omega**2
+    normal_force = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (n,)))) * arm * values.omega**2
     if scene.loads.has_bearing:
         lever, of = 0.5 * _BEARING * _BEARING_WIDTH * arm, f"mu2 = {_BEARING:g}, {1e3 * _BEARING_WIDTH * arm:.3g} mm wide"
         says, name = f"of a ball bearing ({of}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
@@ -131,7 +136,7 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
         assert own is not None
         lever, name = _ROLLING / own[0] * arm, "rolling: k (R/r) m R Omega^2 / drag torque"
         says = f"{own[1]}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"
-    return _row(name, lever * pressed / drag, accuracy, says)
+    return _row(name, lever * normal_force / drag, accuracy, says)
 
 
 def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
@@ -143,8 +148,7 @@ def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRo
     n = scene.loads.count
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.inertia_factor() * scene.loads.mass, (n,))))
     says = (
-        "the machine does not tilt in this model: if it can, the rotating loads couple its tilts "
-        "(so does the inertia of a rotor)"
+        "the model has no tilts: if the machine can tilt, the rotating loads couple its tilts (as the inertia of a rotor does)"
     )
     return _row("gyroscopic: sum kappa m / M", loads / whole, accuracy, says)
 

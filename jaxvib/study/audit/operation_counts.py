@@ -26,7 +26,7 @@ class OperationCount(NamedTuple):
     """Number of operations in the equations of motion of a scene with a given part.
 
     **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations` with the part; `added`:
-    increase over the scene without it, which `beside` describes.
+    increase compared with the reference scene that `beside` describes.
     """
 
     part: str
@@ -102,7 +102,7 @@ def operation_counts() -> list[OperationCount]:
 
 
 def _build_with_halves(build: Callable[..., T]) -> T:
-    """Build an effect or a drive with the value 0.5 for each required number that may be 0.5, and with others that it needs."""
+    """Build an effect or a drive; required parameters are 0.5, or a special value if 0.5 is not allowed."""
     needed = {
         "motor": DCMotor(1.0, 1.0, 1.0),
         "reference": ConstantSpeed(1.0),

@@ -19,12 +19,12 @@ from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.scene import Scene
 
 _DROOP = 0.015
-"""Relative decrease of the speed of an induction motor twice as strong as needed: half of a usual rated slip of 3 %."""
+"""Relative decrease of the speed of an induction motor that has twice the required power: half of a usual rated slip of 3 %."""
 
 
 class Variant(NamedTuple):
     """Variant of the audited scene with one effect added or removed: `name` of the effect; `present`: True if the audited scene
-    has it; the varied `scene`; `says`: the numbers with which it was added."""
+    has it; the varied `scene`; `says`: the values with which it was added."""
 
     name: str
     present: bool
@@ -55,8 +55,11 @@ class WithoutGyroscopic(Machine):
 
 
 def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
-    """Yield the scene without each effect that it has, without gyroscopic coupling, and without the limit of its motor's power
-    (the rotor's speed then rises to that of the motor over half the time `until`, s)."""
+    """Yield variants of the scene without one of its effects, without gyroscopic coupling, and with unlimited power of its
+    motor.
+
+    With unlimited power the rotor speed rises to that of the motor during half the time `until`, s.
+    """
     kinds = [effect.kind for effect in scene.all_effects]
     for k, effect in enumerate(scene.all_effects):
         number = f" {kinds[: k + 1].count(effect.kind)}" if kinds.count(effect.kind) > 1 else ""
@@ -73,20 +76,20 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
 
 
 def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
-    """Yield the scene with each effect that it lacks and could have, and with a motor if its speed is prescribed.
+    """Yield variants of the scene with one effect that it lacks and could have, and with a motor if its speed is prescribed.
 
-    The effects are the `given` ones; by default those of the package with typical numbers (`Effect.typical`).
+    The effects are those of `given`, by default those of the package with typical values (`Effect.typical`).
     """
-    there = {effect.kind for effect in scene.all_effects if not effect.repeatable}
+    present = {effect.kind for effect in scene.all_effects if not effect.repeatable}
     for effect in given or ():
-        if effect.kind not in there:
+        if effect.kind not in present:
             more = scene.replace(effects=(*scene.all_effects, effect))
             yield Variant(effect.kind, False, more, "as given")
     if given is not None:
         return
-    known = {effect.kind for effect in scene.all_effects}
+    present_kinds = {effect.kind for effect in scene.all_effects}
     for kind, effect in EFFECTS.items():
-        if kind in known:
+        if kind in present_kinds:
             continue
         with contextlib.suppress(InputError):  # this machine or these loads cannot have the effect
             usual = effect.typical(scene.machine, scene.loads, scene.drive.speed, jnp.asarray(amplitude))

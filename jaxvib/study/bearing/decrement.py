@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-_LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
+_LARGE_AMPLITUDE, _LARGE_AMPLITUDE_ERROR = np.pi / 3.0, 1e-3
 """Amplitude, rad, above which a relative error of the averaged formula and of the fitted arcs is assumed, and this error."""
 
 _MAX_AMPLITUDE = np.pi / 2.0
@@ -45,17 +45,17 @@ class TurningPoints(NamedTuple):
 
 
 class Decrement(Result):
-    """Result of the formula of ten periods, on every pair of swings of a record.
+    """Result of the formula of ten periods, applied to every pair of swings of a record.
 
-    **Attributes**
+    **Attributes** (n pairs)
 
-    - `viscous` mu1, N m s, an `Estimate`; typical: 3e-4 to 2e-3
-    - `estimates` (n,), N m s, one for each pair, first to last
-    - `amplitude` (n,), rad, at the start of each
-    - `scatter`: largest deviation of one from their mean, relative
-    - `drift`: difference of the last pair's mu1 from the first's, in standard errors
+    - `viscous` mu1, N m s: an `Estimate`; typical: 3e-4 to 2e-3
+    - `estimates` (n,): mu1 of each pair, first to last, N m s
+    - `amplitude` (n,): amplitude of the first swing of each pair, rad
+    - `scatter`: largest relative deviation of an estimate from their mean
+    - `drift`: mu1 of the last pair minus mu1 of the first pair, in standard errors
     - `period`, s
-    - `periods` between the two swings of a pair
+    - `periods`: number of periods between the two swings of a pair
     """
 
     status = Computed.done
@@ -69,7 +69,7 @@ class Decrement(Result):
     periods: int = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
-        """Return the number with its interval as text."""
+        """Return mu1 with its interval as text."""
         return (
             f"over {self.periods} periods: mu1 {self.viscous.value:.5g} N m s, from {self.viscous.low:.5g} to "
             f"{self.viscous.high:.5g}; the values of {len(self.estimates)} pairs scatter by {self.scatter:.2g} (relative)"
@@ -82,7 +82,8 @@ class Decrement(Result):
 
     @property
     def is_drifting(self) -> bool:
-        """True if the first and the last pair differ by more than noise; the interval is then not valid for mu1."""
+        """True if noise does not explain the difference of the first and the last pair; the interval is then not valid for
+        mu1."""
         return abs(self.drift) > 4.0
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -96,11 +97,11 @@ class Decrement(Result):
 
 
 def turning_points(record: Record) -> TurningPoints:
-    """Return the turning points of a recorded swing, each from all samples within a sixth of a period about it.
+    """Return the turning points of a recorded swing, each computed from all samples within a sixth of a period about it.
 
-    The angle there is fitted by c + a cos(v t) + b sin(v t), whose extremum is the turning point. With v = w sqrt(cos A),
-    where w is the frequency of small swings and A the amplitude, the arc also has the fourth derivative of a large swing at
-    the turning point. The spread of the samples about all these arcs gives the noise.
+    The arc c + a cos(v t) + b sin(v t) is fitted to these samples; its extremum is the turning point. With v = w sqrt(cos A),
+    where w is the frequency of small swings and A the amplitude, the fourth derivative of the arc at the turning point is also
+    that of a large swing. The noise is computed from the deviations of the samples from all these arcs.
 
     **Returns** `TurningPoints`. **Raises** `InputError` for a record with fewer than three turning points, or too few samples
     in a period.
@@ -129,7 +130,7 @@ def turning_points(record: Record) -> TurningPoints:
             continue
         size = min(abs(f[k] - middle), np.pi)
         away = np.abs(frequency * (t - t[k]))
-        # A large swing has the form of the arc only close to the turning point; a coarse record needs the whole sixth.
+        # The arc describes a large swing only close to the turning point; a record with few samples needs the whole sixth.
         near = away <= np.pi / 3.0 / (1.0 + size**2 / 3.0)
         near = near if np.count_nonzero(near) >= 9 else away <= np.pi / 3.0
         # Time x in units of 1/w and square = (v/w)^2, which is negative beyond 90 deg: the arc is then a hyperbolic cosine.
@@ -174,7 +175,8 @@ def period_stretch(amplitude: np.ndarray) -> np.ndarray:
 
 
 def _alternating(f: np.ndarray, least: float) -> list[int]:
-    """Return indices of alternating maxima and minima, each followed by a return of at least `least`, without both ends."""
+    """Return indices of alternating maxima and minima, after each of which the angle changes by at least `least`; no end
+    points."""
     found: list[int] = []
     high = low = 0
     rising: bool | None = None
@@ -191,7 +193,7 @@ def _alternating(f: np.ndarray, least: float) -> list[int]:
 
 
 def _regular(t: np.ndarray, peaks: list[int]) -> list[int]:
-    """Return the longest stretch of regular turning points, which excludes noise at rest and the release by hand."""
+    """Return the longest sequence of regular turning points; this excludes noise at rest and the release by hand."""
     steps = np.diff(t[peaks])
     even = [True, *((steps[1:] < 1.6 * steps[:-1]) & (steps[1:] > 0.6 * steps[:-1])), False]
     cuts = [0, *(k for k, is_even in enumerate(even) if not is_even)]
@@ -261,7 +263,7 @@ def ten_periods(
     covariance = (slopes * turns.error**2) @ slopes.T
     value, error = float(np.mean(estimates)), float(np.sqrt(np.mean(covariance)))
     apart = covariance[0, 0] + covariance[-1, -1] - 2.0 * covariance[0, -1]
-    viscous = interval(value, error, 1.959964, float(np.hypot(instrument, _LARGE_ERROR * (a[0] > _LARGE))))
+    viscous = interval(value, error, 1.959964, float(np.hypot(instrument, _LARGE_AMPLITUDE_ERROR * (a[0] > _LARGE_AMPLITUDE))))
     if a[0] > _MAX_AMPLITUDE:
         viscous = Estimate(value, np.inf, 0.0, np.inf)
     return Decrement(

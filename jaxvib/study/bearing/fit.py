@@ -113,31 +113,31 @@ def fit_swing(
 
     def states(at: Unknowns) -> tuple[Array, Array]:
         # Give the pendulum the gravity with which its small swings have the trial frequency.
-        pull = at.frequency**2 * inertia / (pendulum.mass * length)
-        freed = eqx.tree_at(lambda p: p.g, pendulum, pull)
+        gravity = at.frequency**2 * inertia / (pendulum.mass * length)
+        retuned = eqx.tree_at(lambda p: p.g, pendulum, gravity)
         solver, adjoint = diffrax.Tsit5(), diffrax.ForwardMode()
         smooth = None if at.dry is None else width
         run = swing_states(
-            freed, time, at.angle, at.rate, at.viscous, at.dry, smooth, controller_to(TOLERANCE), solver, adjoint, max_steps
+            retuned, time, at.angle, at.rate, at.viscous, at.dry, smooth, controller_to(TOLERANCE), solver, adjoint, max_steps
         )
         return at.offset + run.angle, run.stopped_at
 
-    first, shape = jax.flatten_util.ravel_pytree(start)
+    first, unravel = jax.flatten_util.ravel_pytree(start)
     unit, _ = jax.flatten_util.ravel_pytree(scale)
 
     def residual(x: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-        fitted, stopped_at = states(shape(first + unit * x))
-        left = jnp.where(weight > 0.0, fitted - angle, 0.0) / size
-        return left, (left, stopped_at, fitted)
+        fitted, stopped_at = states(unravel(first + unit * x))
+        scaled_residual = jnp.where(weight > 0.0, fitted - angle, 0.0) / size
+        return scaled_residual, (scaled_residual, stopped_at, fitted)
 
-    x, left, slopes, (stopped_at, fitted), converged = _least_squares(residual, jnp.zeros_like(first), jnp.sum(weight))
-    left = size * left
-    variance = jnp.sum(left**2) / (jnp.sum(weight) - first.shape[0])
-    _, triangle = jnp.linalg.qr(size * slopes)
+    x, scaled_residual, jacobian, rest, converged = _least_squares(residual, jnp.zeros_like(first), jnp.sum(weight))
+    stopped_at, fitted = rest
+    variance = jnp.sum((size * scaled_residual) ** 2) / (jnp.sum(weight) - first.shape[0])
+    _, triangle = jnp.linalg.qr(size * jacobian)
     root = unit[:, None] * jnp.linalg.inv(triangle)
     covariance = variance * root @ root.T
     return Fit(
-        unknowns=shape(first + unit * x),
+        unknowns=unravel(first + unit * x),
         covariance=covariance,
         residual=fitted - angle,
         noise=jnp.sqrt(variance),
@@ -158,34 +158,34 @@ def _least_squares(
     **Returns** x (p,), the residual (n,), its Jacobian (n, p), the other two outputs of `residual` (`stopped_at` and the fitted
     angles (n,)), and True if the fit converged.
     """
-    slopes_of = jax.jacfwd(residual, has_aux=True)
+    jacobian_of = jax.jacfwd(residual, has_aux=True)
     size, p = jax.eval_shape(residual, start)[0].shape[0], start.shape[0]
     floor = n * (0.01 * TOLERANCE) ** 2
 
-    def goes_on(carry: tuple[Array, ...]) -> Array:
+    def is_unfinished(carry: tuple[Array, ...]) -> Array:
         return (carry[0] < _MAX_ITERATIONS) & (carry[-1] > 1e-4) & (carry[2] < 1e6)
 
     def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         count, trial, damping, *best, _ = carry
-        slopes, (left, stopped_at, fitted) = slopes_of(trial)
-        cost = jnp.sum(left**2)
+        jacobian, (scaled_residual, stopped_at, fitted) = jacobian_of(trial)
+        cost = jnp.sum(scaled_residual**2)
         better = cost < best[0]  # and not NaN
-        latest = (cost, trial, left, slopes, stopped_at, fitted)
+        latest = (cost, trial, scaled_residual, jacobian, stopped_at, fitted)
         best = [jnp.where(better, new, old) for new, old in zip(latest, best, strict=True)]
         damping = jnp.where(better, 0.1 * damping, 10.0 * damping)
-        cost, x, left, slopes, *_ = best
-        basis, triangle = jnp.linalg.qr(slopes)
-        reached = basis.T @ left
+        cost, x, scaled_residual, jacobian, *_ = best
+        basis, triangle = jnp.linalg.qr(jacobian)
+        reached = basis.T @ scaled_residual
         normal = triangle.T @ triangle
         damped = normal + damping * jnp.diag(jnp.diagonal(normal))
         trial = x - jnp.linalg.solve(damped, triangle.T @ reached)
         # The square of the next undamped step in standard errors, from the best point so far, because the sum of squares may
         # not decrease further at a kink.
-        left_to_go = jnp.sum(reached**2) / (cost / (n - p) + floor)
-        return count + 1, trial, damping, *best, left_to_go
+        next_step_squared = jnp.sum(reached**2) / (cost / (n - p) + floor)
+        return count + 1, trial, damping, *best, next_step_squared
 
     none = (jnp.asarray(jnp.inf), start, jnp.zeros(size), jnp.zeros((size, p)), jnp.asarray(jnp.nan), jnp.zeros(size))
-    end = jax.lax.while_loop(goes_on, step, (jnp.asarray(0), start, jnp.asarray(0.1), *none, jnp.asarray(jnp.inf)))
+    end = jax.lax.while_loop(is_unfinished, step, (jnp.asarray(0), start, jnp.asarray(0.1), *none, jnp.asarray(jnp.inf)))
     return end[4], end[5], end[6], (end[7], end[8]), end[-1] < 1e-2
 
 

@@ -30,15 +30,16 @@ from jaxvib.study.bearing.swing import BearingPendulum
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-_AT_REST = 1.3
-"""Number of half periods without a turning point before the first or after the last one that ends a swing; a swinging pendulum
-has at most 1.2."""
+_MAX_HALF_PERIODS = 1.3
+"""Number of half periods without a turning point, before the first or after the last one, after which the pendulum counts as at
+rest; for a swinging pendulum it is at most 1.2."""
 
-_STRUCTURE = 1e-5
-"""Share of records with pure noise about the fit that get the status `patterned`."""
+_PATTERN_PROBABILITY = 1e-5
+"""Probability of the status `patterned` for a record whose residuals are pure noise."""
 
 _MAX_FREQUENCY_DIFFERENCE = 0.05
-"""Relative difference of frequencies, in addition to instrument errors, that errors of length and mass cannot explain."""
+"""Relative difference of frequencies, in addition to instrument errors, above which errors of length and mass cannot explain
+it."""
 
 
 class IdentifyStatus(eqx.Enumeration):
@@ -61,20 +62,21 @@ class Identified(Result):
 
     - `status`: an `IdentifyStatus`
     - `notes`: sentences with further advice for the reader
-    - `viscous` mu1, N m s, and `dry` mu2 (None if it was not requested): an `Estimate` each, instruments' share in the
-      interval; typical: 3e-4 to 2e-3 N m s and 0.001 to 0.005
+    - `viscous` mu1, N m s, and `dry` mu2 (None if it was not requested): an `Estimate` each, whose interval includes the error
+      of the instruments; typical: 3e-4 to 2e-3 N m s and 0.001 to 0.005
     - `correlation` of the errors of mu1 and mu2 (NaN without mu2)
-    - `frequency`, rad/s, of small swings, `offset`, rad, of the record's zero, `angle`, rad, and `rate`, rad/s, at the first
-      sample: an `Estimate` each
-    - `inertia`, kg m^2: J that follows from the frequency with the pendulum's mass and length
-    - `noise`, rad, standard deviation of a sample
+    - `frequency` of small swings, rad/s; `offset`: the recorded angle of the hanging position, rad; `angle`, rad, and `rate`,
+      rad/s, at the first sample: an `Estimate` each
+    - `inertia`, kg m^2: J that follows from the frequency, with the mass and length of the pendulum
+    - `noise`: standard deviation of a sample, rad
     - `pattern`: correlation of neighbouring residuals, 0 for noise
-    - `structure`: F statistic of the residuals at the swing's frequency, its multiples and its slow changes, about 1 for noise
-    - `fitted` (n,), rad: the record as the model has it
-    - `until`, s, after which the record was left out: at rest
-    - `stopped_at`, s, NaN if the pendulum swings to the end
-    - `width`, rad/s, over which dry friction was smoothed (NaN without mu2)
-    - `decrement`: the formula of ten periods on the same record, None if the record is too short for it
+    - `structure`: F statistic of the residuals for slow changes and for vibrations at the frequency of the swing and its
+      multiples, about 1 for noise
+    - `fitted` (n,): the fitted angles, rad
+    - `until`: time, s, after which the pendulum is at rest and the record was not used
+    - `stopped_at`: time of the stop, s; NaN if the pendulum swings to the end
+    - `width`: width over which the sign of dry friction was smoothed, rad/s (NaN without mu2)
+    - `decrement`: result of the formula of ten periods for the same record, None if the record is too short
     - `record` and `pendulum` of the fit
     """
 
@@ -100,12 +102,12 @@ class Identified(Result):
     pendulum: BearingPendulum
 
     def summary(self) -> str:
-        """Return the numbers with their intervals as text."""
+        """Return the estimates with their intervals as text."""
         lines = [f"mu1 {shown(self.viscous)} N m s"]
         if self.dry is not None:
             lines[0] += f", mu2 {shown(self.dry)}"
         if self.decrement is not None:
-            lines.append(f"by {self.decrement.periods} periods: mu1 {shown(self.decrement.viscous)} N m s")
+            lines.append(f"formula of {self.decrement.periods} periods: mu1 {shown(self.decrement.viscous)} N m s")
         lines.append(f"frequency {shown(self.frequency)} rad/s, noise {self.noise:.2g} rad; {self.message}")
         return "\n".join([*lines, *self.notes])
 
@@ -129,24 +131,25 @@ def identify_bearing(
 
     - Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
       Levenberg and Marquardt's method with forward-mode derivatives through the integration
-    - The frequency is free, because a pendulum's size is never known well enough for its phase; the factor g absorbs the
-      difference, and J is taken from `pendulum`, so that mu1 is in proportion to it
-    - Samples before the release and after the last clear turning point, when the pendulum rests or its swing is below the
-      noise, are left out: the side of the dead zone on which it comes to rest is not a smooth function of the friction
-    - `width` is 0.005 of the smallest swing's speed: dry friction on it is 0.001 % too small, on larger ones less
+    - The frequency is a free parameter, because the size of a pendulum is never known accurately enough to predict the phase of
+      many swings. The factor g is adapted to it. J is taken from `pendulum`, so that mu1 is proportional to this J
+    - Samples before the release, and samples after the last clear turning point (the pendulum is at rest, or its swing is below
+      the noise), are not used: the position at which it comes to rest is not a smooth function of the friction
+    - `width` is 0.005 of the speed of the smallest swing. This reduces the dry friction of the smallest swing by 0.001 %, and
+      that of larger swings by less
 
     **Arguments**
 
     - `pendulum`: a `BearingPendulum`
     - `record` of its swing; typical: 250 to 10,000 samples over 10 to 60 s, first amplitude 3 to 60 deg
     - `dry`: True to find mu2 as well (the pendulum needs `bearing`)
-    - `instrument`: relative uncertainty of J, from ruler and scales, added to the intervals in squares; typical: 0.01 to 0.03
-      (0.03 in the paper; default 0)
+    - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
+      intervals; typical: 0.01 to 0.03 (0.03 in the paper; default 0)
     - `throw`: raise if no fit is found
 
     **Returns** `Identified`. **Raises** `InputError` for a record that cannot be fitted, `ComputationError` "not_converged".
 
-    Source: Artyunin, Sumenkov 2019, who read mu1 off two amplitudes; the fit to the whole record is ours.
+    Source: Artyunin, Sumenkov 2019, who determine mu1 from two amplitudes; the fit to the whole record is ours.
     """
     if dry and pendulum.bearing is None:
         raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
@@ -154,21 +157,21 @@ def identify_bearing(
         raise InputError("instrument", f"is {quoted(instrument)}; the relative uncertainty of J is at least 0 and less than 1")
     turns = turning_points(record)
     half = float(np.median(np.diff(turns.time)))
-    released = turns.time[0] - record.time[0] <= _AT_REST * half
+    released = turns.time[0] - record.time[0] <= _MAX_HALF_PERIODS * half
     swing = record if released else record.between(float(turns.time[0]), math.inf)
-    until = float(turns.time[-1]) if record.time[-1] - turns.time[-1] > _AT_REST * half else float(record.time[-1])
+    until = float(turns.time[-1]) if record.time[-1] - turns.time[-1] > _MAX_HALF_PERIODS * half else float(record.time[-1])
     start, width = first_guess(pendulum, swing, turns, dry)
     time = swing.time - swing.time[0]
-    given = (pendulum, jnp.asarray(time), jnp.asarray(swing.angle))
+    arguments = (pendulum, jnp.asarray(time), jnp.asarray(swing.angle))
     steps, swinging = steps_for(start, time), np.where(swing.time <= until, 1.0, 0.0)
     if np.sum(swinging) < len(jax.tree.leaves(start)) + 2:
         raise InputError(record.name, f"swings for {until - swing.time[0]:.3g} s before it rests; record more of the swing")
     large = np.where(swing.time <= min(_still_large(turns), until), 1.0, 0.0)
     if dry and np.sum(large) < np.sum(swinging):
-        # The place in the dead zone at which the pendulum comes to rest depends on the last digits of the friction: a fit to
-        # the samples at rest from distant initial values converges to the wrong half swing.
-        start = fit_swing(*given, jnp.asarray(large), start, width, steps).unknowns
-    fit = fit_swing(*given, jnp.asarray(swinging), start, width, steps)
+        # The position at which the pendulum comes to rest depends on the last digits of the friction. From distant initial
+        # values, a fit that includes the samples at rest converges to the wrong half swing.
+        start = fit_swing(*arguments, jnp.asarray(large), start, width, steps).unknowns
+    fit = fit_swing(*arguments, jnp.asarray(swinging), start, width, steps)
     found = _interpret_fit(pendulum, swing, turns, fit, float(width), instrument, until)
     if throw and bool(found.status == IdentifyStatus.not_converged):
         raise ComputationError("not_converged", f"{record.name}: {found.message}")
@@ -176,7 +179,8 @@ def identify_bearing(
 
 
 def _still_large(turns: TurningPoints) -> float:
-    """Return the time of the last turning point before the swing has decayed to a tenth; infinite if it stays larger."""
+    """Return the time at which the swing has decayed to a tenth, at least that of the fifth turning point; infinite if
+    never."""
     small = np.flatnonzero(turns.amplitude < 0.1 * turns.amplitude[0])
     return float(turns.time[max(small[0], 4)]) if small.size else math.inf
 
@@ -195,9 +199,9 @@ def _interpret_fit(
     angle, rate, offset, frequency = plain[:4]
     viscous, *more = (interval(v, float(e), quantile, instrument) for v, e in zip(values[4:], errors[4:], strict=True))
     dry = more[0] if more else None
-    left = np.asarray(fit.residual)[used]
-    pattern = float(np.sum(left[1:] * left[:-1]) / np.sum(left**2)) if np.any(left) else 0.0
-    structure, chance = _structure(record.time[used], left, turns, len(values))
+    residuals = np.asarray(fit.residual)[used]
+    pattern = float(np.sum(residuals[1:] * residuals[:-1]) / np.sum(residuals**2)) if np.any(residuals) else 0.0
+    structure, chance = _structure(record.time[used], residuals, turns, len(values))
     correlation = float(covariance[4, 5] / (errors[4] * errors[5])) if dry is not None else math.nan
 
     is_long = turns.amplitude.size > 20
@@ -224,7 +228,7 @@ def _interpret_fit(
         record=record,
         pendulum=pendulum,
     )
-    is_patterned = abs(pattern) > 4.0 / math.sqrt(samples) or chance < _STRUCTURE
+    is_patterned = abs(pattern) > 4.0 / math.sqrt(samples) or chance < _PATTERN_PROBABILITY
     is_patterned = is_patterned and found.noise > 10.0 * TOLERANCE
     has_converged = bool(fit.converged) and found.noise <= 0.5 * float(np.std(record.angle[used]))
     status = _status(found, has_converged=has_converged, is_patterned=is_patterned, instrument=instrument)
@@ -264,17 +268,17 @@ def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
                 else f"{name} cannot be distinguished from 0 in this record"
             )
     if math.isfinite(found.stopped_at):
-        yield f"dry friction stops the pendulum at {found.stopped_at:.4g} s on"
+        yield f"dry friction stops the pendulum at {found.stopped_at:.4g} s"
     if np.any(found.record.time > found.until):
-        yield f"the record after {found.until:.4g} s is left out: the pendulum rests, or its swing is below the noise"
+        yield f"the record after {found.until:.4g} s is residuals out: the pendulum rests, or its swing is below the noise"
     if is_patterned:
         yield "the residuals of the fit are not noise: the intervals include noise only and are too narrow"
     if decrement is not None and decrement.is_drifting:
-        yield "the formula of ten periods is for viscous friction only: its interval does not contain mu1 here"
+        yield "the formula of ten periods assumes viscous friction only: here its interval does not contain mu1"
 
 
-def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:
-    """Return the F statistic of n residuals after a fit of `found` numbers, and its probability if they are noise.
+def _structure(time: np.ndarray, residuals: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:
+    """Return the F statistic of n residuals after a fit of `found` parameters, and its probability if they are noise.
 
     The residuals are compared with slow changes of the zero, and with slowly changing vibrations at one, two and three times
     the frequency of the swing. Another law of friction, a torque or another restoring force leaves such residuals.
@@ -290,8 +294,8 @@ def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: 
         columns += [slow[:, :order] * np.cos(k * phase)[:, None], slow[:, :order] * np.sin(k * phase)[:, None]]
     basis, _ = np.linalg.qr(np.concatenate(columns, axis=1))
     known, free = basis.shape[1] - found, time.size - basis.shape[1]
-    if free < 8 or not np.any(left):
+    if free < 8 or not np.any(residuals):
         return 1.0, 1.0
-    explained = float(np.sum((basis.T @ left) ** 2))
-    statistic = explained / known / ((float(np.sum(left**2)) - explained) / free)
+    explained = float(np.sum((basis.T @ residuals) ** 2))
+    statistic = explained / known / ((float(np.sum(residuals**2)) - explained) / free)
     return statistic, float(fdtrc(known, free, statistic))

@@ -14,7 +14,7 @@ from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number, number
 
 _FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "from": "from_", "until": "until"}
-"""Names of a record's fields in a file, and in Python, in which `from` is a keyword."""
+"""Names of the fields of a record in a file, and in Python, where `from` is a keyword."""
 
 
 class Measurement(NamedTuple):

@@ -32,11 +32,11 @@ class Record(eqx.Module):
 
     - `time` (n,), s, ascending, at least 16 samples; steps need not be equal; typical: 25 to 200 samples per second over 10 to
       60 s
-    - `angle` (n,), rad, from any zero; typical: 0.05 to 1
+    - `angle` (n,), rad, relative to any position; typical: 0.05 to 1
     - `name` for messages
 
     **Raises** `InputError` for lengths that differ, fewer than 16 samples, times that do not ascend, values that are not
-    finite, and angles that no swing has, which are probably degrees.
+    finite, and angles with a range above one full turn, which are probably degrees.
 
     >>> import numpy as np, jaxvib as jv
     >>> t = np.arange(0.0, 10.0, 0.04)
@@ -83,7 +83,7 @@ class Record(eqx.Module):
 
     @validated
     def between(self, start: float, stop: float) -> Record:
-        """Return the part of the record from `start` to `stop`, s. **Raises** `InputError` if too little is left."""
+        """Return the part of the record from `start` to `stop`, s. **Raises** `InputError` if it has too few samples."""
         kept = (self.time >= start) & (self.time <= stop)
         if np.count_nonzero(kept) < _MIN_SAMPLES:
             span = f"{self.time[0]:g} s to {self.time[-1]:g} s"
@@ -98,16 +98,16 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
     """Read a record from a table of text: CSV, or columns between semicolons, tabs or blanks.
 
     - Lines that begin with # and empty lines are skipped
-    - A first line of names may carry units, `time (s), angle (deg)`, `t [ms]`, `ANGLE_DEG`, or the line below it may; letters
-      of any size
-    - Columns called time and angle (t, phi, theta, ...) without a unit are s and rad; any other column needs a unit
-    - Between semicolons, tabs or blanks numbers may have a decimal comma
+    - The first line may have names, with units in it or in the next line: `time (s), angle (deg)`, `t [ms]`, `ANGLE_DEG`;
+      capital and small letters are equal
+    - Columns with the names time and angle (t, phi, theta, ...) without a unit are in s and rad; other columns need a unit
+    - If columns are separated by semicolons, tabs or blanks, numbers may have a decimal comma
 
     **Arguments**
 
     - `path` of the file; typical: 250 to 10,000 lines
-    - `columns`: names of the columns of time and angle, with or without their units, if they are not called time and angle
-    - `angle_unit`: "rad", "mrad", "deg", "gon" or "turn", in place of the header's
+    - `columns`: names of the columns of time and angle, with or without their units, if these names are not time and angle
+    - `angle_unit`: "rad", "mrad", "deg", "gon" or "turn", in place of the unit in the header
 
     **Returns** `Record`. **Raises** `InputError` with the wrong line, or the column without a known unit.
 

@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 
 
 class BearingPendulum(eqx.Module):
-    """Pendulum on a bearing at rest, its angle f counted from hanging.
+    """Pendulum on a stationary bearing; its angle f is measured from the hanging position.
 
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) sign(f'),      J = m l^2 + J_C,      N = m (l f'^2 + g cos f)
 
-    mu1 and mu2 are the bearing's viscous and dry friction; N is its radial load, along the rod.
+    mu1 and mu2 are the viscous and dry friction of the bearing; N is its radial load, along the rod.
 
     **Arguments** (SI, or strings with a unit)
 
     - `mass` m, kg; typical: 0.1 to 1
-    - `length` l from the bearing's axis to the mass centre, m; typical: 0.1 to 0.5
+    - `length` l from the axis of the bearing to the mass centre, m; typical: 0.1 to 0.5
     - `inertia` J_C about the mass centre, kg m^2 (default 0: a point mass; a rod of length L has m L^2/12); typical: 1e-3 to
       0.05
     - `bearing`: its diameter d, m, needed for dry friction only; typical: 0.005 to 0.02
@@ -53,7 +53,7 @@ class BearingPendulum(eqx.Module):
     >>> round(float(rod.total_inertia), 6), round(float(rod.frequency), 4)
     (0.025, 5.4249)
 
-    Source: Artyunin, Sumenkov 2019, figure 2, with the swing not small and with dry friction.
+    Source: Artyunin, Sumenkov 2019, figure 2; here also for large swings and with dry friction.
     """
 
     mass: Array
@@ -98,7 +98,7 @@ class SwingStatus(eqx.Enumeration):
     swinging = "the pendulum still swings at the last time"
     stopped = "dry friction stopped the pendulum"
     max_steps_reached = "the swing needs more steps than max_steps to reach its last time"
-    no_start = "the swing does not exist: one of its numbers is not finite, or the pendulum would not hang"
+    no_start = "the swing does not exist: one of its parameters is not finite, or the pendulum would not hang"
 
 
 class Swing(Result):
@@ -174,10 +174,11 @@ def swing(
       needs more steps
     - `stepsize_controller`: `Tolerance` of a step, relative, and in rad; typical: 1e-6 to 1e-9 (the default; in single
       precision 1e-5). Or a controller of diffrax
-    - `solver`, `adjoint`, `max_steps`: those of diffrax
-    - `throw`: raise if the steps do not suffice; otherwise, and under a JAX transformation, the status shows it
+    - `solver`, `adjoint`, `max_steps`: as in diffrax
+    - `throw`: raise if `max_steps` is too small; otherwise, and under a JAX transformation, the status shows it
 
-    **Returns** `Swing`; gradients, forward (with `adjoint=diffrax.ForwardMode()`) and reverse, `jit` and `vmap` go through it.
+    **Returns** `Swing`. Derivatives in reverse mode, and in forward mode (with `adjoint=diffrax.ForwardMode()`), `jit` and
+    `vmap` are supported.
 
     **Raises** `InputError` for wrong values and for dry friction without the bearing's diameter; `ComputationError`.
 
@@ -250,7 +251,7 @@ def swing_states(
     """Compute a `swing` without validation of its arguments; `dry` may be negative, which happens in a fit to noise."""
     given = (pendulum.frequency, angle, rate, viscous) if dry is None else (pendulum.frequency, angle, rate, viscous, dry)
     exists = jnp.all(jnp.isfinite(jnp.stack(jnp.broadcast_arrays(*given))))
-    # A swing that does not exist (after a step of a fit out of range, in a batch) must not fail the others' search for stops.
+    # A swing of a batch that does not exist (a step of a fit left the allowed range) must not disturb the other swings.
     angle, rate, viscous = (jnp.where(exists, value, 0.0) for value in (angle, rate, viscous))
     dry = None if dry is None else jnp.where(exists, dry, 0.0)
     pendulum = eqx.tree_at(lambda p: p.g, pendulum, jnp.where(exists, pendulum.g, 1.0))
@@ -274,8 +275,8 @@ def swing_states(
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
-        # `flip=True` states that the slowness falls through 0. Without it the search would fail if the last step ends just
-        # before the root and both of its ends have the same sign by rounding.
+        # `flip=True` states that the function decreases through 0. Without it the search would fail if the last step ends just
+        # before the root and, by rounding, the function has the same sign at both ends of the step.
         event=None if slowness is None else diffrax.Event(slowness, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
     )
     assert solution.ts is not None and solution.ys is not None
@@ -309,7 +310,7 @@ _Pair: TypeAlias = tuple[Array, Array]
 def _slowness(pendulum: BearingPendulum, frequency: Array, dry: Array, width: Array) -> Callable[..., Array]:
     """Return a function of the motion that becomes negative when the pendulum is slow within the dead zone.
 
-    The smoothed sign of dry friction would let it creep there.
+    There the integration ends, because with the smoothed sign of dry friction the pendulum would creep.
     """
 
     def moving(t: RealScalarLike, y: _Pair, args: None, **_: object) -> Array:
@@ -339,8 +340,8 @@ def _rates(
 def _last_part(pendulum: BearingPendulum, dry: Array, times: Array, last: Array, y: _Pair) -> tuple[Array, _Pair]:
     """Return the time at which a slow pendulum comes to rest, and its angles and rates until then.
 
-    It starts from the state `y` at the time `last`. With the exact sign of dry friction the motion is harmonic about the end of
-    the dead zone that the pendulum moves away from.
+    The motion continues from the state `y` at the time `last`. With the exact sign of dry friction it is a harmonic motion
+    about the end of the dead zone from which the pendulum moves away.
     """
     (end, end_slip), frequency = y, pendulum.frequency
     way = jnp.where(end_slip < 0.0, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Capture of balls over their initial speed: captured fractions and the threshold."""
+"""Capture of balls as a function of their initial speed: captured fractions and the threshold."""
 
 from __future__ import annotations
 
@@ -52,25 +52,26 @@ class CaptureStatus(eqx.Enumeration):
 
 
 class Capture(Result):
-    """Captures from initial speeds of the loads relative to the rotor.
+    """Captures as a function of the initial speed of the loads relative to the rotor.
 
     Returned by `capture`.
 
-    **Attributes** (S speeds, each tried from `starts` perturbed positions)
+    **Attributes** (S speeds, each with `starts` initial positions)
 
     - `status`: a `CaptureStatus`
-    - `speed` (S,), ascending, (psi')/w: -1 for loads at rest in space, 0 for loads that turn with the rotor
+    - `speed` (S,), ascending: psi'/w, -1 for loads at rest in space, 0 for loads that turn with the rotor
     - `captured` (S, starts): True if all loads turned with the rotor at the end
     - `finite` (S, starts): True if the motion stayed finite
     - `detached` (S, starts): True if a load lost contact with its wall at some time; the equations keep it on the wall
-    - `threshold`: the least speed from which on all starts were captured, halfway to the next lower speed that was tried
-    - `uncertainty`: half the distance to that speed or to the highest speed at which half of the starts fail, whichever is
-      more, and at least the move; NaN if there is no threshold
+    - `threshold`: midpoint between the lowest speed from which all starts at this and all higher speeds were captured, and the
+      next lower computed speed
+    - `uncertainty` of the threshold: the largest of half the distance between these two speeds, half the distance from the
+      threshold to the highest speed at which half of the starts or more fail, and `last_change`; NaN if there is no threshold
     - `last_change`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN
       without a doubling
-    - `steps` and `turns` of the rotor that each run took
+    - `steps`, and `turns` of the rotor, of each run
 
-    Below the threshold outcomes may be chaotic, captures standing alone among failures: there `fraction` gives their share.
+    Below the threshold outcomes may be chaotic, with single captures among failures; `fraction` gives their share.
     """
 
     speed: np.ndarray = eqx.field(metadata=in_unit("", "speed"))
@@ -86,7 +87,7 @@ class Capture(Result):
 
     @property
     def fraction(self) -> np.ndarray:
-        """Share of starts captured at each speed, (S,)."""
+        """Share (S,) of starts that are captured, for each speed."""
         return np.mean(self.captured, axis=1)
 
     @property
@@ -96,13 +97,13 @@ class Capture(Result):
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Standard error of the fraction, (S,), by Agresti and Coull: it is not 0 if all starts, or none, were captured."""
+        """Standard error (S,) of the fraction, by Agresti and Coull; it is not 0 if all starts, or none, were captured."""
         n = self.captured.shape[1]
         share = (np.sum(self.captured, axis=1) + 2.0) / (n + 4.0)
         return np.sqrt(share * (1.0 - share) / (n + 4.0))
 
     def summary(self) -> str:
-        """Return the threshold with its uncertainty, and the outcomes below it, as text."""
+        """Return the threshold with its uncertainty, and the share of captures below it, as text."""
         n = self.captured.shape[1]
         head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
         doubled = (
@@ -124,9 +125,9 @@ class Capture(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the share of starts captured over the initial speed, and the threshold, onto the axes `ax` if given.
+        """Plot the share of captured starts over the initial speed, and the threshold, onto the axes `ax` if controller.
 
-        **Returns** a matplotlib figure, or the given `ax`.
+        **Returns** a matplotlib figure, or the controller `ax`.
         """
         from jaxvib.draw.capture import threshold_chart  # slow import
 
@@ -134,12 +135,12 @@ class Capture(Result):
 
 
 def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
-    """Return the state with the carrier at rest and the loads side by side at the bottom of the tube, with one relative speed.
+    """Return the state with the carrier at rest, and the loads side by side on the equator of the tube with a common speed.
 
-    **Arguments**: `speed` psi'/w relative to the rotor, -1 for loads at rest in space; `shift` rad of the loads along the ring,
-    one number or (count,). Neighbouring loads are 2 atan(r/R) apart, as in the paper.
+    **Arguments**: `speed` psi'/w relative to the rotor, -1 for loads at rest in space; `shift`, rad, of the loads along the
+    ring, a scalar or (count,). The angle between neighbouring loads is 2 atan(r/R), as in the paper.
 
-    **Returns** `State`. **Raises** `InputError` for loads that do not run in a torus.
+    **Returns** `State`. **Raises** `InputError` for loads that are not in a torus.
 
     >>> from jaxvib.machine.files import TEMPLATES, scene_from_toml
     >>> state = moving_state(scene_from_toml(TEMPLATES["torus"]), -0.5)
@@ -169,38 +170,38 @@ def capture(
     doublings: int = DOUBLINGS,
     equations: Equations = vector_field,
 ) -> Capture:
-    """Find the initial speeds from which the balls of a torus reach the speed of the rotor, and the least such speed.
+    """Find the initial speeds from which the balls of a torus reach the speed of the rotor, and the threshold of these speeds.
 
-    - Each speed is tried from `starts` positions of the loads along the ring, and each run goes to its end: a run without
-      progress may still be captured late, so none is cut short
-    - With a `resolution` the range between the threshold and the next lower speed is tried again, finer and finer. The range
-      above the threshold of the first speeds is not refined: an island of failures narrower than their distance stays unseen
-    - All of it is repeated with twice the steps until the threshold moves by no more than the resolution, or the distance of
-      the `speeds`
+    - For each speed, runs start from `starts` positions of the loads along the ring. Each run is integrated to its end, because
+      a capture may occur late
+    - With a `resolution`, the interval between the threshold and the next lower speed is divided by further speeds until it is
+      small enough. The range above the first threshold is not refined: failures in an interval that is narrower than the
+      distance of the first speeds may remain undetected
+    - The scan is repeated with twice as many steps until the threshold changes by no more than the resolution, or the distance
+      of the `speeds`
 
     **Arguments**
 
     - `scene` with `torus_balls` and an ideal drive
-    - `speeds`: initial speeds relative to the rotor's, ascending, from -1 (at rest in space) to 0; typical: 32 of them (the
-      default)
-    - `turns` of the rotor that each run takes; typical: 1000 to 3000 (default 2000). A capture that needs more counts as a
-      failure, and the time grows in proportion
-    - `starts` for each speed; typical: 1 (the default) to 32. In all but the first each load is moved along the ring by a
-      separate angle of up to `spread`
+    - `speeds`: initial speeds relative to the rotor, in units of the rotor speed, ascending, from -1 (at rest in space) to 0;
+      typical: 32 speeds (the default)
+    - `turns`: length of each run in turns of the rotor; typical: 1000 to 3000 (default 2000). A capture that needs more turns
+      counts as a failure. The time is proportional to it
+    - `starts` for each speed; typical: 1 (the default) to 32. In all starts except the first, each load is shifted along the
+      ring by its own random angle of up to `spread`
     - `spread`, rad; typical: 1e-3 (the default)
-    - `seed` of these moves
-    - `resolution` of the threshold, relative to the rotor's speed; typical: 1e-2 to 1e-4. Each refinement takes a run of all
-      starts
-    - `rotation`: "rolling", for balls that roll from the start, or "none", for balls that are thrown without turning, so that
-      they slide until they roll; it needs the effect `Sliding`
-    - `stepsize_controller`: `EqualSteps(n)` for the whole run, which are not doubled; the default begins with a step for each
-      radian of the fastest motion, two if that is a contact between balls or the end of a slip, and a third for a time constant
-      of the fastest decay; typical: 200 for each turn
-    - `doublings` of the default steps at most; typical: 2 (the default); 0 takes the first answer. One doubling takes three
-      times the work of none
-    - `equations`: as `ensemble`
+    - `seed` of these angles
+    - `resolution` of the threshold, relative to the rotor speed; typical: 1e-2 to 1e-4. Each refinement is another scan
+    - `rotation`: "rolling", for balls that roll from the start, or "none", for balls that do not rotate at the start and
+      therefore slide until they roll; "none" needs the effect `Sliding`
+    - `stepsize_controller`: `EqualSteps(n)` for the whole run, without doubling. By default the first scan has 1 step for each
+      radian of the fastest vibration, 2 for each radian of a faster contact between balls or end of a slip, and 1 step for
+      three time constants of the fastest decay; typical: 200 for each turn
+    - `doublings`: largest number of times that the default steps are doubled; typical: 2 (the default); 0 for a single scan.
+      With one doubling the work is three times that of a single scan
+    - `equations`: as for `ensemble`
 
-    **Returns** `Capture`. **Raises** `InputError` for loads that are not in a torus, a motor, and numbers that are not allowed.
+    **Returns** `Capture`. **Raises** `InputError` for loads that are not in a torus, a motor, and values that are not allowed.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -209,7 +210,7 @@ def capture(
     >>> found.fraction.tolist(), found.status_name
     ([0.0, 1.0], 'found')
 
-    Source: Strautmanis et al. 2018, section 3, where each speed has one start.
+    Source: Strautmanis et al. 2018, section 3, with one start for each speed.
     """
     scene = validate_scene(scene)
     in_torus(scene.loads, "capture")
@@ -222,23 +223,28 @@ def capture(
     if rotation == "none" and not has_term(scene.all_effects, SlipRelease):
         problem = "is 'none', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
         raise InputError("rotation", problem)
-    tried = np.linspace(-1.0, 0.0, _SCAN_SPEEDS + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
-    allowed = tried.ndim == 1 and tried.size > 0 and np.all(np.isfinite(tried)) and np.all(np.diff(tried) > 0.0)
-    if not allowed or tried[0] < -1.0 or tried[-1] > 0.0:
+    first_speeds = np.linspace(-1.0, 0.0, _SCAN_SPEEDS + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
+    allowed = (
+        first_speeds.ndim == 1
+        and first_speeds.size > 0
+        and np.all(np.isfinite(first_speeds))
+        and np.all(np.diff(first_speeds) > 0.0)
+    )
+    if not allowed or first_speeds[0] < -1.0 or first_speeds[-1] > 0.0:
         raise InputError("speeds", f"is {quoted(speeds)}; ascending numbers from -1 to 0 are needed")
     end = 2.0 * np.pi * count(turns, "turns") / float(scene.drive.speed)
     width = float(number(spread, "rad", "spread", low=0.0))
     shifts = random_numbers(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
     shifts[0] = 0.0
-    given, most = stepsize_controller, count(doublings, "doublings", low=0)
-    first = given.number if given is not None else max(16, math.ceil(end * steps_per_second(scene, equations)))
+    controller, largest_doublings = stepsize_controller, count(doublings, "doublings", low=0)
+    first = controller.number if controller is not None else max(16, math.ceil(end * steps_per_second(scene, equations)))
 
     def outcomes(which: np.ndarray, steps: int) -> list[np.ndarray]:
         """Return three Boolean arrays (speeds, starts): True for runs that are captured, stay finite, or lose contact with the
         wall."""
-        lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
-        shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
-        values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
+        cases = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
+        shared = eqx.filter_vmap(lambda _: cases[0])(jnp.arange(cases[1].size))
+        values = (shared, jnp.asarray(cases[1]), jnp.asarray(cases[2]))
         make = _rolling_start if rotation == "rolling" else _sliding_start
         ran = ensemble(make, values, end, stepsize_controller=EqualSteps(steps), estimate=False, equations=equations)
         slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
@@ -247,10 +253,10 @@ def capture(
         return [each.reshape(which.size, starts) for each in found]
 
     def scan(_: np.ndarray, multiple: int) -> list[Capture]:
-        speed, steps = tried, first * multiple
+        speed, steps = first_speeds, first * multiple
         parts = outcomes(speed, steps)
         while resolution is not None:
-            least = _least(parts[0])
+            least = _threshold_index(parts[0])
             if least in (0, speed.size) or speed[least] - speed[least - 1] <= resolution:
                 break
             finer = np.linspace(speed[least - 1], speed[least], max(4, _SCAN_SPEEDS // starts) + 2)[1:-1]
@@ -260,9 +266,9 @@ def capture(
         captured, finite, detached = parts
         return [_summarize_captures(speed, captured, finite, detached, turns, steps)]
 
-    # A threshold close to one of the speeds may fall into the interval on either side of it.
-    tolerance = 1.001 * max(np.max(np.diff(tried), initial=0.0) if resolution is None else resolution, 1e-12)
-    found = refine(scan, lambda result: np.array([result.border]), 1, tolerance, most if given is None else 0)
+    # A threshold close to one of the speeds may be in the interval below or above it, depending on the steps.
+    tolerance = 1.001 * max(np.max(np.diff(first_speeds), initial=0.0) if resolution is None else resolution, 1e-12)
+    found = refine(scan, lambda result: np.array([result.border]), 1, tolerance, largest_doublings if controller is None else 0)
     (result,), last_change = found.results, float(found.last_change[0, 0])
     uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
     status = CaptureStatus.not_converged if last_change > tolerance else result.status
@@ -279,8 +285,8 @@ def _sliding_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
     return scene, with_spin(scene, state, "none")
 
 
-def _least(captured: np.ndarray) -> int:
-    """Return the index of the least speed from which on all starts are captured, or the number of speeds if there is none."""
+def _threshold_index(captured: np.ndarray) -> int:
+    """Return the index of the lowest speed from which on all starts are captured, or the number of speeds if there is none."""
     failing = np.flatnonzero(~np.all(captured, axis=1))
     return 0 if failing.size == 0 else int(failing[-1]) + 1
 
@@ -288,7 +294,7 @@ def _least(captured: np.ndarray) -> int:
 def _summarize_captures(
     speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, detached: np.ndarray, turns: int, steps: int
 ) -> Capture:
-    least = _least(captured)
+    least = _threshold_index(captured)
     threshold, uncertainty, status = math.nan, math.nan, CaptureStatus.found
     if least == 0:
         status = CaptureStatus.all_captured
@@ -314,14 +320,14 @@ def _summarize_captures(
 
 
 def capture_time(run: Run, within: float = 0.05) -> Array:
-    """Return the time, s, at which the last load comes to within a share of the rotor speed and stays there.
+    """Return the time, s, from which on all load speeds stay within a band around the rotor speed.
 
-    It is the last time in the run's trajectory at which a load's speed differs from the rotor's by more than `within` times the
-    rotor's speed, interpolated linearly between the stored states. It has forward and reverse derivatives. They are valid as
-    long as the same passage of the same load is the last one: if another passage becomes the last one, the time jumps, and the
-    derivatives do not show the jump.
+    It is the last time in the trajectory of the run at which the speed of a load differs from the rotor speed by more than
+    `within` times the rotor speed, interpolated linearly between the stored states. Forward and reverse derivatives exist. They
+    are valid as long as the same entry of the same load into the band is the last one. If another entry becomes the last one,
+    the time jumps, and the derivatives do not show this jump.
 
-    **Returns** a scalar: 0 if all loads are within the share from the beginning, infinite if one is not at the end.
+    **Returns** a scalar: 0 if all loads are within the band from the beginning, infinite if one of them is outside at the end.
     **Raises** `InputError` for a run without a trajectory.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)

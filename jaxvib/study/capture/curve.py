@@ -1,4 +1,4 @@
-"""Capture thresholds over a number of the machine."""
+"""Capture thresholds over a parameter of the machine."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class ThresholdCurve(Result):
 
     **Attributes** (V values)
 
-    - `value` (V,) of that number
-    - `threshold` and `uncertainty` (V,): those of `Capture` at each value: -1 if every start was captured, NaN if not every
-      start at the highest speed was
-    - `least` (V,): the least speed at which any start was captured, NaN if none was. Between both, captures and failures
-      alternate
+    - `value` (V,) of the parameter
+    - `threshold` and `uncertainty` (V,): see `Capture`; the threshold is -1 if every start was captured, and NaN if not every
+      start at the highest speed was captured
+    - `least` (V,): the lowest speed at which a start was captured, NaN if there is none. Between this speed and the threshold,
+      captures and failures alternate
     - `last_change` (V,): change of the threshold by the last doubling of the steps
-    - `turns` of the rotor that each run took
+    - `turns` of the rotor of each run
     """
 
     status = Computed.done
@@ -67,7 +67,7 @@ class ThresholdCurve(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot thresholds with their uncertainty over the values, and the least captured speeds.
+        """Plot thresholds with their uncertainty, and the lowest captured speeds, over the values.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -90,16 +90,15 @@ def threshold_curve(
     rotation: Rotation = "rolling",
     equations: Equations = vector_field,
 ) -> ThresholdCurve:
-    """Return the capture thresholds of scenes that differ in one number.
+    """Compute the capture thresholds of scenes that differ in one parameter, by `capture`.
 
     **Arguments**
 
-    - `make`: a function that returns the scene of a value
-    - `values` (V,) of the number; typical: 5 to 20
-    - `speeds`, `turns`, `starts`, `spread`, `seed`, `resolution`, `rotation`, `equations`: as `capture`, which computes each
-      value
+    - `make`: a function that returns the scene for a value of the parameter
+    - `values` (V,) of the parameter; typical: 5 to 20
+    - `speeds`, `turns`, `starts`, `spread`, `seed`, `resolution`, `rotation`, `equations`: as for `capture`
 
-    **Returns** `ThresholdCurve`. **Raises** `InputError` for no values, and as `capture`.
+    **Returns** `ThresholdCurve`. **Raises** `InputError` if there are no values, and the errors of `capture`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -115,7 +114,7 @@ def threshold_curve(
     """
     numbers = np.asarray(values, dtype=float)
     if numbers.ndim != 1 or numbers.size == 0 or not np.all(np.isfinite(numbers)):
-        raise InputError("values", f"is {quoted(values)}; one finite number at least is needed, in a row")
+        raise InputError("values", f"is {quoted(values)}; it must be a list of at least one finite number")
     found = [
         capture(
             make_scene(make, float(value)),

@@ -1,8 +1,8 @@
-"""Steps of runs whose outcomes are compared: resolved rates, and doubling until the result no longer changes.
+"""Number of steps in scans for capture: the first scan resolves all rates, then steps are doubled until the result is constant.
 
-Agreement of two scans proves nothing if both leave a rate unresolved: with a third of the steps that a friction needs, no ball
-is captured, and with two thirds none is captured either. Therefore the first scan already resolves every rate of the equations
-of motion at the state in which the balls turn with the rotor; the steps are doubled from there.
+Two scans can agree although both have too few steps: with one third of the steps that a friction needs, no ball is captured,
+and with two thirds no ball is captured either. Therefore the first scan already resolves every rate of the equations of motion
+at the state in which the balls turn with the rotor. The number of steps is then doubled.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from jaxvib.motion.start import with_spin
 from jaxvib.runtime.programs import cached
 
 DOUBLINGS = 2
-"""Default number of times that steps are doubled at most."""
+"""Default of the largest number of doublings of the steps."""
 
 _STEPS_PER_RADIAN = 1.0
-"""Steps per radian of the fastest oscillation, that of balls across their tube. The errors are far below the statistical error
-of captured fractions."""
+"""Number of steps per radian of the fastest oscillation, which is that of balls across their tube. The errors are far below the
+statistical error of captured fractions."""
 
 _STEPS_PER_ADDED_RADIAN = 2.0
-"""Steps per radian of contacts between balls and of slips (`Effect.fastest_rate`): six for a collision."""
+"""Number of steps per radian of contacts between balls and of slips (`Effect.fastest_rate`), that is, six steps in a
+collision."""
 
 _DECAY_PER_STEP = 3.0
 """Largest product of decay rate and step. The method of order 8 is stable up to 5.2; the margin is needed because normal forces
@@ -95,9 +96,10 @@ def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def steps_per_second(scene: Scene, equations: Equations = vector_field) -> float:
     """Return the number of equal steps per second that resolve the motion of balls in a torus at a constant rotor speed.
 
-    Oscillations and decays are the eigenvalues of the linearized `equations` with the balls on the equator, turning with the
-    rotor. Friction overdamps the balls there but saturates elsewhere; therefore their natural frequency without friction counts
-    too. Contacts and slips do not act there; their rates are the `Effect.fastest_rate` of the effects.
+    Rates of oscillation and decay are the eigenvalues of the `equations`, linearized about balls on the equator that turn with
+    the rotor. In this state friction overdamps the balls, but it saturates at larger speeds; therefore the natural frequency
+    without friction is resolved too. Contacts and slips do not act in this state; their rates are given by
+    `Effect.fastest_rate`.
     """
     values = np.linalg.eigvals(np.asarray(_jacobian(scene, equations)))
     own = scene.loads.natural_frequency(scene.drive.speed)

@@ -31,13 +31,13 @@ class CriterionMap(Result):
 
     **Attributes** (D drags, M masses, S speeds, B boundaries 2 nd - 1)
 
-    - `speeds` (S,), rad/s; `mass_factor` (M,), `drag_factor` (D,): times the scene's own
+    - `speeds` (S,), rad/s; `mass_factor` (M,) and `drag_factor` (D,): factors on the mass and drag of the scene's loads
     - `predicted` (M, S): True if the criterion predicts stable auto-balancing (it does not depend on the drag)
     - `growth` (D, M, S), 1/s: exact growth rate, stable if negative
     - `right` (D, M): share of the speeds at which both agree
     - `boundary` (M, B), rad/s: the criterion's boundaries, ascending, NaN for an absent one
-    - `shift` (D, M, B): (exact - predicted)/predicted, exact being the end of the exact interval that shares most with the
-      criterion's; NaN if there is none in the range of speeds
+    - `shift` (D, M, B): (exact - predicted)/predicted, where the exact boundary is the end of that exact interval of stability
+      that overlaps most with the interval of the criterion; NaN if there is none in the range of speeds
     """
 
     status = Computed.done
@@ -52,7 +52,7 @@ class CriterionMap(Result):
     shift: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor", "end"))
 
     def summary(self) -> str:
-        """Return a table in text: the share of speeds at which both agree, and the mean modulus of the boundaries' shift."""
+        """Return a table as text: the share of speeds at which both agree, and the mean modulus of the shift of boundaries."""
         lines = ["share of rotor speeds with the right prediction (mean shift of the boundaries)"]
         lines.append("drag x \\ mass x " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
         for d, factor in enumerate(self.drag_factor):
@@ -65,9 +65,9 @@ class CriterionMap(Result):
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot agreement and disagreement of the criterion over rotor speed in `unit` and load mass, one panel for each drag,
-        onto as many axes `ax` if given.
+        onto as many axes `ax` if circular.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
+        **Returns** a matplotlib figure, or the circular `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         from jaxvib.draw.criterion import agreement_maps  # slow import
 
@@ -86,11 +86,12 @@ def criterion_map(
     - `scene`; its loads are in the first arrangement of `balanced_states`
     - `speeds`, rad/s, ascending; typical: 50 to 200 from half the lowest to twice the highest resonance
     - `mass` and `drag`: factors greater than 0, times the mass and the drag of the scene's loads; typical: 0.1 to 10
-    - `steps` as `balanced_stability`; default: as many as the natural frequencies need. The time grows in proportion
+    - `steps`: as for `balanced_stability`; default: the number that the natural frequencies need. The time is proportional to
+      it
 
     **Returns** `CriterionMap`.
 
-    **Raises** `InputError` for values that are not positive or not ascending, and as `balanced_stability`.
+    **Raises** `InputError` for values that are not positive or not ascending, and the errors of `balanced_stability`.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -109,10 +110,10 @@ def criterion_map(
             raise InputError(name, "must be a list of numbers greater than 0, one at least, ascending")
     grid, mass_factor, drag_factor = values.values()
 
-    given = circular_loads(scene)
+    circular = circular_loads(scene)
 
     def loaded(m: jax.Array, d: float = 1.0) -> Scene:
-        loads = eqx.tree_at(lambda x: (x.mass, x.drag), given, (given.mass * m, given.drag * d))
+        loads = eqx.tree_at(lambda x: (x.mass, x.drag), circular, (circular.mass * m, circular.drag * d))
         return eqx.tree_at(lambda s: s.loads, scene, loads)
 
     results = [criterion(loaded(jnp.asarray(m))) for m in mass_factor]
@@ -137,10 +138,10 @@ def criterion_map(
 
 
 def _shifts(exact: np.ndarray, grid: np.ndarray, boundary: np.ndarray) -> np.ndarray:
-    """Return the distances of the ends of each interval of the criterion from those of the exact interval that overlaps most.
+    """Return the relative shifts of the ends of each interval of the criterion, compared with the exact interval that overlaps
+    most with it.
 
-    The largest overlap decides, because a short interval of stability can remain at a resonance when the interval itself has
-    moved away from it.
+    The interval with the largest overlap is used, because a second, short interval of stability can exist at a resonance.
     """
     shifts = np.full(boundary.shape, np.nan)
     low, high = np.nan_to_num(exact[:, 0], nan=grid[0]), np.nan_to_num(exact[:, 1], nan=grid[-1])

@@ -1,4 +1,4 @@
-"""Run-ups of one scene: final motions of its loads over their drag and their initial angles."""
+"""Run-ups of a scene: final motions of its loads as functions of drag and initial angles."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _TOLERANCE = Tolerance(1e-7)
 """Tolerance of a step in double precision, which is small enough to determine the regime."""
 
 _MIN_ALLOWED_STEPS = 2**20
-"""Smallest limit of the number of steps; with it run-ups of any usual length share one program."""
+"""Smallest default of `max_steps`. It is so large that run-ups of any usual length share one program."""
 
 
 class RunUps(Result):
@@ -53,7 +53,7 @@ class RunUps(Result):
     **Attributes**
 
     - `drag` (nd,): b_W, N s/m
-    - `angle` (ns, count), rad, at which the loads started
+    - `angle` (ns, count): initial angles of the loads, rad
     - `regime`: a `Regime` whose arrays have the leading axes (nd, ns)
     - `kind` (nd, ns): short name of the regime, or "failed" if the run did not reach its end
     - `omega` (nd, ns): mean speed of the loads, rad/s, NaN if it failed
@@ -102,7 +102,7 @@ class RunUps(Result):
 
 
 def _span(values: np.ndarray) -> str:
-    """Return text with one number if all are equal to a thousandth, otherwise with the smallest and the largest."""
+    """Return one speed as text if all speeds agree within a thousandth, otherwise the smallest and the largest."""
     low, high = float(np.min(values)), float(np.max(values))
     return speed_text(low if high - low < 1e-3 * high else [low, high], 4, " .. ")
 
@@ -121,26 +121,26 @@ def run_ups(
     batch: int = 16,
     max_steps: int | None = None,
 ) -> RunUps:
-    """Run the scene up from rest, at each drag from each of many initial angles of its loads, and name the regimes at the end.
+    """Compute run-ups of a scene for each drag and each set of initial angles of its loads, and the regimes at their ends.
 
     **Arguments**
 
     - `scene`, with a drive that starts from rest for a run-up
-    - `until`: end time, s or text; regimes are named over the last turns before it (see `simulate`); typical: 5 to 20
-    - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; default: the scene's; typical: 5 to 20 values from 0.05
-      to 5
-    - `starts`: number of sets of random angles, uniform over the circle, by `seed`; typical: 32 to 1000. From few starts a
-      share is known to 1 / sqrt(starts) only
+    - `until`: end time, s or text; the regime is that of the last turns of the run (see `simulate`); typical: 5 to 20
+    - `drag`: values of the drag b_W of all loads, N s/m; default: the value of the scene; typical: 5 to 20 values from 0.05 to
+      5
+    - `starts`: number of sets of random angles, uniform over the circle; typical: 32 to 1000. The error of a share is about
+      1 / sqrt(starts)
     - `seed` of the random angles
-    - `angles`: the sets themselves, (ns, count) rad, in place of `starts`. Default: one set, at the bottom with the
-      `separation` of `simulate`
-    - `separation`: angle between neighbouring loads of that set, rad; typical: 0.02
-    - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-7)`, in single precision 1e-5
-    - `batch`: number of runs that go side by side on each core; typical: 16 (the default)
-    - `max_steps`: a run fails after this number of steps; default: as `simulate`, 2^20 at least
+    - `angles` (ns, count), rad: sets of angles in place of random ones. Without `starts` and `angles` there is one set, at the
+      bottom of the track with the `separation` of `simulate`
+    - `separation`: angle between neighbouring loads of this one set, rad; typical: 0.02
+    - `stepsize_controller`: as for `simulate`, except `Accuracy`; default: `Tolerance(1e-7)`, in single precision 1e-5
+    - `batch`: number of runs that advance run_batch on each core; typical: 16 (the default)
+    - `max_steps`: a run fails after this number of steps; default: as for `simulate`, but at least 2^20
 
-    **Returns** `RunUps`, whose `fraction` gives the share of the starts that came to a kind of motion. A run that fails raises
-    nothing: it is counted as "failed".
+    **Returns** `RunUps`; its `fraction` gives the share of the starts that end in a kind of motion. A run that fails raises no
+    error; it is counted as "failed".
 
     **Raises** `InputError` for values that are not allowed.
 
@@ -156,7 +156,7 @@ def run_ups(
     drag 0.05 N s/m: 100 % unsettled
     drag 5 N s/m: 100 % jammed at 39... rpm
 
-    Source: Artyunin 2013, section V, where one set of angles stands for all.
+    Source: Artyunin 2013, section V, with a single set of angles.
     """
     scene = validate_scene(scene)
     if not scene.loads.circular:
@@ -198,11 +198,11 @@ def run_ups(
     if max_steps is None:
         max_steps = max(_MIN_ALLOWED_STEPS, enough_steps(frequency_bounds(scene)[0], end))
 
-    def together(drags: Array, angles: Array) -> tuple[Regime, Array, Array]:
-        return _together(scene, end, drags, angles, stepsize_controller, max_steps)
+    def run_batch(drags: Array, angles: Array) -> tuple[Regime, Array, Array]:
+        return _run_batch(scene, end, drags, angles, stepsize_controller, max_steps)
 
     cases = np.repeat(drags, len(sets)), np.tile(np.asarray(sets, drags.dtype), (len(drags), 1))
-    named, omega, finished = in_chunks(size, together, *cases)
+    named, omega, finished = in_chunks(size, run_batch, *cases)
     (code,) = jax.tree.leaves(named.name)
     kind = np.where(finished, np.asarray(REGIMES)[code], _FAILED)
 
@@ -220,7 +220,7 @@ def run_ups(
 
 
 @cached
-def _together(
+def _run_batch(
     scene: Scene, until: Array, drags: Array, angles: Array, chosen: StepChoice | None, max_steps: int
 ) -> tuple[Regime, Array, Array]:
     """Return the regime of each run-up of a batch, the mean speed of its loads, and True if it reached its end."""

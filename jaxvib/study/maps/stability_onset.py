@@ -1,4 +1,4 @@
-"""Stability over a design number: ranges of stable jams, and the value at which a bifurcation appears."""
+"""Stability over a design parameter: ranges of stable jams, and the value at which a bifurcation appears."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 
 class StabilityMap(Result):
-    """Exact jams over a design number x.
+    """Exact jams over a design parameter x.
 
-    **Attributes**
+    **Attributes** (n values, P load speeds)
 
     - `value` (n,) of x
     - `omega` (n, P): load speeds, rad/s
-    - `stable` (n, P): True if the jam is stable for every load
+    - `stable` (n, P): True if the jam is stable, also against separation of the loads
     - `special` (n,): the special points of each diagram
     """
 
@@ -55,7 +55,8 @@ class StabilityMap(Result):
         return "\n".join(lines)
 
     def plot(self, *, label: str = "x", unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot stable jams as shaded areas over the load speed in `unit` and x, special points as marks; `label` is x's name.
+        """Plot stable jams as shaded areas over the load speed in `unit` and x, with special points as marks; `label`: name of
+        x.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -74,16 +75,16 @@ class StabilityMap(Result):
 def stability_map(
     make: Callable[[float], Scene], values: Sequence[float], *, omega: tuple[float, float], points: int = 300
 ) -> StabilityMap:
-    """Map the stability of exact jams over a design number, such as the mass of the loads.
+    """Map the stability of exact jams over a design parameter x, such as the mass of the loads.
 
     **Arguments**
 
-    - `make`: a function that returns the scene at x
+    - `make`: a function that returns the scene for a value of x
     - `values` of x, ascending; typical: 5 to 20
     - `omega`: the range of load speeds, rad/s
-    - `points` of each diagram; typical: 60 to 300 (the default). The time grows in proportion
+    - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
 
-    **Returns** `StabilityMap`. **Raises** `InputError` for no values, or values that do not ascend.
+    **Returns** `StabilityMap`. **Raises** `InputError` if has_point are no values, or if they do not ascend.
 
     >>> import jaxvib as jv
     >>> def machine(eps):
@@ -123,21 +124,22 @@ def stability_onset(
     points: int = 300,
     accuracy: float = 1e-3,
 ) -> float:
-    """Return the smallest value x at which the exact diagram of `make(x)` has a special point of the kind, by halving in log x.
+    """Return the smallest x at which the exact diagram of `make(x)` has a special point of a kind, by bisection in log x.
 
-    "Odd jam modes are stable on their whole range" is true of light loads. This function finds the load mass from which on a
-    torus bifurcation replaces a fold, or the half-turn symmetry breaks.
+    Odd jam modes of light loads are stable on their whole range. This function finds, for example, the load mass above which a
+    torus bifurcation ends the stable range before the fold, or above which the half-turn symmetry breaks.
 
     **Arguments**
 
-    - `make`: a function that returns the scene at x
-    - `kind` as in `SpecialPoint`
-    - `between`: two positive values, without such a point and with one
+    - `make`: a function that returns the scene for a value of x
+    - `kind` of the special point, see `SpecialPoint`
+    - `between`: two positive values of x, the lower without such a point, the upper with one
     - `omega`: the range of load speeds of the search, rad/s
-    - `points` of each diagram; typical: 60 to 300 (the default). The time grows in proportion
+    - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
     - `accuracy` of x, relative; typical: 0.1 to 1e-3 (the default). Each diagram halves the range
 
-    **Returns** x, too large by `accuracy` at most. **Raises** `InputError` if the ends do not differ.
+    **Returns** x, which is too large by at most `accuracy`. **Raises** `InputError` if both values of `between` have such a
+    point, or neither.
 
     >>> import jaxvib as jv
     >>> def machine(eps):
@@ -149,7 +151,7 @@ def stability_onset(
     Source: ours, on the diagrams of `exact_branches`.
     """
 
-    def there(x: float) -> bool:
+    def has_point(x: float) -> bool:
         diagram = exact_branches(make_scene(make, x), points=points, least=omega[0], most=omega[1])
         return any(point.kind == kind for point in diagram.special)
 
@@ -160,7 +162,7 @@ def stability_onset(
     if not 0.0 < low < high:
         raise InputError("between", f"is {quoted(between)}; it must be two positive values, the lower one first")
     for x, is_required in ((low, False), (high, True)):
-        if there(x) != is_required:
+        if has_point(x) != is_required:
             found, required = ("no", "a") if is_required else ("a", "no")
             raise InputError(
                 "between",
@@ -169,5 +171,5 @@ def stability_onset(
             )
     while high / low > 1.0 + accuracy:
         middle = (low * high) ** 0.5
-        low, high = (low, middle) if there(middle) else (middle, high)
+        low, high = (low, middle) if has_point(middle) else (middle, high)
     return high
