@@ -26,10 +26,10 @@ def main() -> None:
             prepare()
         from jaxvib.cli.app import run
 
-        gc.freeze()  # garbage collection of the modules would take a fifth of the time of a short command
+        gc.freeze()  # garbage collection of the modules would take one fifth of the time of a short command
         gc.enable()
         code = run(sys.argv[1:])
-    except KeyboardInterrupt:  # before the command began, or a second one during the handling of the first
+    except KeyboardInterrupt:  # an interrupt before the command began, or a second one during the handling of the first
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
@@ -41,8 +41,8 @@ def main() -> None:
 def _exit_at_once(code: int) -> None:
     """Exit without cleanup of the interpreter.
 
-    Threads may still be compiling. An orderly exit would destroy XLA while they use it, because CPython before 3.13 takes a
-    thread for finished, and does not wait for it, if an earlier join was interrupted.
+    Threads may still be compiling. A normal exit would destroy XLA while they use it: if an earlier join of a thread was
+    interrupted, CPython before 3.13 regards the thread as finished and does not wait for it.
     """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
@@ -61,5 +61,5 @@ def prepare() -> None:
     jax.config.update("jax_enable_x64", True)
     for warning in found:
         print(f"jaxvib: {warning.message}", file=sys.stderr)
-    if found:  # a folder that was refused must not become JAX's cache either
+    if found:  # JAX must not use a folder that was rejected as its cache
         jax.config.update("jax_compilation_cache_dir", None)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 @app.command("animate")
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--until", help="Duration of the simulation, if SOURCE is a scene file, such as 20s.")
-@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state of that simulation [rest].")
-@click.option("--mode", type=int, help="Number of the jam mode; without --until, the film shows its exact motion.")
+@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state of the simulation [rest].")
+@click.option("--mode", type=int, help="Number of the jam mode; without --until, the film shows the exact motion of this mode.")
 @click.option("--begin", help="First time of the film, such as 4.5s [four vibration periods before the end].")
 @click.option("--end", help="Last time of the film [end of the run].")
 @click.option("--seconds", help="Duration of the film, s [10 frames for each turn of the rotor].")
@@ -45,7 +45,7 @@ def animate(
         source = source / "run.npz"
     if source.suffix == ".npz":
         if until is not None or start is not None or mode is not None:
-            raise InputError("--until", "and --start and --mode are for a scene file; a saved run already has its own")
+            raise InputError("--until", "and --start and --mode apply to a scene file; they cannot be used with a saved run")
         motion, scene = jv.Run.load(source), None
     else:
         loaded = loaded_scene(source)
@@ -70,6 +70,6 @@ def animate(
 @click.argument("scene", type=click.Path(path_type=Path))
 @shared
 def sketch(scene: Path, output: Output) -> None:
-    """Draw SCENE with its numbers: sketch.png, in --out or the current folder."""
+    """Draw SCENE with the values of its parameters: sketch.png, in --out or the current folder."""
     jv.sketch(loaded_scene(scene)).savefig(output.made("sketch.png"))
     output.done({"status": "done"}, lambda: "a sketch of the machine", "sketch")

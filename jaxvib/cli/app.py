@@ -28,7 +28,7 @@ __all__ = ["SPEED", "TOLERANCE", "WITHOUT", "Output", "app", "loaded_scene", "ru
 def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
     """Load the scene of a file, and change its effects and its drive.
 
-    **Arguments**: `path` of the file; `without`, kinds of effects to leave out; `speed`, constant rotor speed in place of the
+    **Arguments**: `path` of the file; `without`: kinds of effects to leave out; `speed`: constant rotor speed that replaces the
     drive; `constant`: True to replace a run-up by its final speed, with a message on stderr.
 
     **Raises** `InputError` for an effect that the scene does not have, and for a string that is not a speed.
@@ -56,7 +56,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
 
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
-"""Option of commands that do not include every effect."""
+"""Option of commands that do not support every effect."""
 
 
 class _SpeedType(click.ParamType):
@@ -176,7 +176,7 @@ class _Lazy(click.Group):
         return sorted(_HOMES)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands with their summaries, which are read from the source files: importing all would take a second."""
+        """List the commands with their summaries, read from the source files, because importing all would take a second."""
         widest = max(map(len, _HOMES))
         for title, group in _GROUPS.items():
             with formatter.section(title):
@@ -223,7 +223,8 @@ def app() -> None:
 
 
 def shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options --json, --out, --report, --title, --author and --unit to a command, which gets them as one `Output`."""
+    """Add the options --json, --out, --report, --title, --author and --unit to a command, which receives them as an
+    `Output`."""
 
     @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
     @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write figures and data into this folder.")
@@ -256,7 +257,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
 
 
 _NO_ARGUMENTS: type[click.UsageError] | tuple[()] = getattr(click.exceptions, "NoArgsIsHelpError", ())
-"""Raised to print the help text of a command without arguments; click below 8.2 prints it itself."""
+"""Exception with the help text of a command without arguments; click before 8.2 prints this text without an exception."""
 
 
 def run(arguments: list[str]) -> int:
@@ -300,7 +301,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _of_command_line(arguments: list[str], error: InputError) -> InputError:
-    """Return an error of a function in the words of the command line: options in place of arguments of the function."""
+    """Return an error of a function for the command line, with options in place of arguments of the function."""
     command = app.commands.get(arguments[0]) if arguments else None
     options = [] if command is None else [each for each in command.params if isinstance(each, click.Option)]
     names = {each.name: each.opts[-1] for each in options}
@@ -313,7 +314,7 @@ def _of_command_line(arguments: list[str], error: InputError) -> InputError:
 
 
 def _way_out(arguments: list[str], error: InputError) -> str:
-    """Return a hint at the option that removes a refused effect or replaces a refused drive; an empty text for other errors."""
+    """Return a hint to the option that removes an excluded effect or replaces an excluded drive; empty for other errors."""
     table, _, name = error.field.partition(".")
     command = app.commands.get(arguments[0]) if arguments else None
     options = [] if command is None else [option.name for option in command.params]

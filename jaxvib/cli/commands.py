@@ -14,13 +14,11 @@ from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
-_START_HELP = (
-    "Initial state: the machine at rest while the drive turns at its speed; a jam (with --mode); or a smooth spin-up from rest."
-)
+_START_HELP = "Initial state: rest (the machine is at rest, the drive turns at its speed), jam (with --mode), or spin_up (smooth, from rest)."
 
 _SCREENS = ("linear-screen", "circular-screen", "feeder")
 _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus", *_SCREENS)
-"""Names of `TEMPLATES` and `SCREENS` in `jaxvib.machine`, repeated here because that import is slow."""
+"""Names of `TEMPLATES` and `SCREENS` in `jaxvib.machine`, repeated here because their import is slow."""
 
 
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
@@ -56,13 +54,13 @@ def new(kind: str, output: Output) -> None:
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time, such as 20s or '0.5 min'.")
 @click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help=_START_HELP)
-@click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
+@click.option("--mode", type=int, help="Number of the jam mode, with --start jam.")
 @SEPARATION
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, help="Allowed error of one time step [1e-8].")
 @click.option("--accuracy", type=float, help="Allowed error of the final state, in place of a tolerance.")
 @click.option("--max-steps", type=int, help="Largest number of time steps.")
-@click.option("--window", is_flag=True, help="Save no trajectory, only the measurements over the last turns.")
+@click.option("--window", is_flag=True, help="Save only the measurements over the last turns, and no trajectory.")
 @CSV
 @shared
 def simulate(
@@ -97,7 +95,7 @@ def simulate(
 
 
 def _long(scene: jv.Scene, until: str) -> bool:
-    """True if a run is so long that a progress bar is more useful than a cached program, which cannot have one."""
+    """Return True for a run that is so long that a progress bar is useful; a program with a progress bar cannot be stored."""
     from jaxvib.units import number
 
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)

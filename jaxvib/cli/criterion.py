@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 @WITHOUT
 @shared
 def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output) -> None:
-    """List the speeds at which coincident loads of SCENE stay together, and at which they spread and balance the rotor, by the
-    empirical criterion."""
+    """List the rotor speeds at which the loads of SCENE gather, and those at which they spread and balance the rotor, according
+    to the empirical criterion."""
     from jaxvib.steady.balance.criterion import criterion_table  # slow import, which --help does not need
     from jaxvib.steady.balance.states import balanced_intervals
 

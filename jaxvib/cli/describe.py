@@ -62,7 +62,7 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
 
 
 def _argument(argument: Argument) -> str:
-    """Return an argument as a line with its unit, default and allowed values, and its meaning below."""
+    """Return an argument as a line with its unit, default and allowed values, followed by its meaning."""
     default = "needed" if argument.needed else f"default {argument.default or 'none'}"
     facts = [argument.unit, default, ", ".join(argument.allowed) or argument.bounds]
     head = _wrapped(f"{argument.name}: {'; '.join(filter(None, facts))}", "  ")

@@ -1,4 +1,4 @@
-"""Common parts of commands that integrate: choice of steps, JSON documents of runs."""
+"""Common parts of commands with time integration: choice of steps, JSON documents of runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SEPARATION = click.option(
 def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:
     """Return the step-size controller of the options. **Raises** `InputError` if both options are present."""
     if tolerance is not None and accuracy is not None:
-        raise InputError("accuracy", "is given together with tolerance; give one of them")
+        raise InputError("accuracy", "cannot be combined with tolerance; give one of them")
     if accuracy is not None:
         return jv.Accuracy(accuracy)
     return None if tolerance is None else jv.Tolerance(tolerance)
@@ -40,7 +40,7 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
 
 
 def run_document(run: jv.Run) -> dict[str, object]:
-    """Return a run's quantities over its last turns, its error and its cost."""
+    """Return the quantities of a run over its last turns, its error and its cost."""
     return {
         **measured_document(run, run.scene),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
@@ -50,7 +50,7 @@ def run_document(run: jv.Run) -> dict[str, object]:
 
 
 def _regime(found: jv.Regime) -> dict[str, object]:
-    """Return the regime and its evidence, with the names of `RegimeName` and `PhasePattern`."""
+    """Return the regime and the quantities from which it follows, with the names of `RegimeName` and `PhasePattern`."""
     return {
         "name": found.label,
         "pattern": found.pattern_label,

@@ -17,8 +17,8 @@ from jaxvib.cli.app import app, loaded_scene
 def explore(scene: Path, port: int, no_browser: bool) -> None:
     """Open a local page with sliders for SCENE; the diagrams follow the sliders, and the machine can be saved as TOML.
 
-    The page runs until it is interrupted (Ctrl-C). Its address, which is printed, contains a random token; other computers, and
-    other sites in your browser, cannot reach it. Needs: pip install '.[explore]' in the folder of jaxvib's sources"""
+    The command ends with Ctrl-C. It prints the address of the page, which contains a random token: other computers, and other
+    sites in your browser, cannot open the page. Needs: pip install '.[explore]' in the source folder of jaxvib"""
     from jaxvib.explore.pictures import prepare, prepare_counts
     from jaxvib.explore.serve import require_free, require_marimo, serve  # slow import
 

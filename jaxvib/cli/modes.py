@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @app.command("modes")
 @click.argument("scene", type=click.Path(path_type=Path))
 @SPEED
-@click.option("--exact", is_flag=True, help="Compute exact periodic motions of the full equations in place of light-load jams.")
+@click.option("--exact", is_flag=True, help="Compute exact periodic motions of the full equations instead of light-load jams.")
 @click.option(
     "--phases", is_flag=True, help="Compute light-load jams with unequal phases (default for a rotor without --exact)."
 )
@@ -38,11 +38,11 @@ def modes(
     csv: Path | None,
     output: Output,
 ) -> None:
-    """List every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
+    """List all jam modes of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
 
-    For a rotor, or with --phases, the list has the jams of light loads at any phases, and --out plots them over the drag of the
-    loads. --exact is available for platforms and for rotors without tilt, if no load has its own station and the rotor is
-    balanced."""
+    For a rotor, or with --phases, the list contains the jams of light loads with any phases, and --out plots them over the drag
+    of the loads. --exact is available for platforms and for rotors without tilt, if all loads have the same station and the
+    rotor is balanced."""
     loaded = loaded_scene(scene, without, speed)
     if exact and phases:
         raise InputError(
@@ -64,7 +64,7 @@ def modes(
 
 
 def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], output: Output) -> None:
-    """Print the jams of light loads that stay together, and their folds."""
+    """Print the jams of light, coincident loads, and their folds."""
     import jax  # slow imports, which --help does not need
     import numpy as np
 
@@ -167,8 +167,8 @@ def _measures_document(jam: jv.Jam, measures: jv.VibrationMeasures) -> dict[str,
 
 
 def _stays(jam: jv.Jam, growth: float) -> str:
-    """Return a text about the stability of a jam, from its slope and the growth rate of disturbances of loads that can
-    separate."""
+    """Return a text about the stability of a jam, from its slope and from the growth rate of disturbances that separate
+    loads."""
     if jam.judgement == "loads cannot stay together":
         return "no: the loads differ too much"
     if not bool(jam.stable):
@@ -182,7 +182,9 @@ def _left_out(scene: jv.Scene) -> list[str]:
     from jaxvib.machine.effects.terms import RotorImbalance
 
     named = " and ".join(effect.kind.replace("_", " ") for effect in scene.all_effects if has_term([effect], RotorImbalance))
-    return [f"amplitudes and forces are the loads' alone: the {named} adds a vibration at the rotor speed"] if named else []
+    return (
+        [f"amplitudes and forces are those of the loads only: the {named} adds a vibration at the rotor speed"] if named else []
+    )
 
 
 def _phases(scene: jv.Scene, output: Output) -> None:
@@ -233,7 +235,7 @@ def _phases(scene: jv.Scene, output: Output) -> None:
 
 
 def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
-    """Print the exact jams, with those that do not exist for light loads, and the special points."""
+    """Print all exact jams, also those that do not exist for light loads, and the special points."""
     from jaxvib.steady.orbits.search import exact_mode_speeds  # slow import: it needs the time integrator
 
     light = jv.jam_modes(scene)

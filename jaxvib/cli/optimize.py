@@ -36,8 +36,8 @@ def optimize(
     tolerances: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Search for the machine that DESIGN describes; --out saves its scene file, the search, the pictures and the motion of the
-    verification. Ctrl-C ends the search with the best machine so far; --resume continues it."""
+    """Search for the best machine of a DESIGN file; --out saves its scene file, the search, the figures and the motion of the
+    verification. Ctrl-C ends the search with the best machine found so far; --resume continues the search."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -111,7 +111,7 @@ def _text(best: Synthesis) -> str:
     heads = ["", "before", "after", "exact", "verified"]
     columns = [k for k in range(len(heads)) if k < 3 or any(row[k] for row in rows)]
     drawn = table(objective_text(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
-    checked = "verified on the full equations, integrated until the motion settled"
+    checked = "verified by the full equations, integrated until the motion settled"
     if best.verified is None:
         checked = f"not verified: {best.unverified}"
     return "\n".join([f"{best.message}\n{counted}", drawn, *(line.strip() for line in best.findings()), checked])

@@ -1,4 +1,4 @@
-"""Outputs of commands: stdout, files in a folder, a report."""
+"""Output of commands: text or JSON on stdout, files in a folder, a report."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def fields_of(result: object, *names: str) -> dict[str, object]:
 
 
 class Output:
-    """Destination of the results of a command: a JSON document or text on stdout, files in a folder, a report of one HTML page.
+    """Output of a command: a JSON document or text on stdout, files in a folder, and a report as an HTML page.
 
-    **Arguments**: `as_json`: True for JSON on stdout; `folder` of `--out`; `report`, the file of `--report`; `scene`, the scene
-    file of the command; `title` and `author` of the report.
+    **Arguments**: `as_json`: True for JSON on stdout; `folder`: the folder of `--out`; `report`: the file of `--report`;
+    `scene`: the scene file of the command; `title` and `author` of the report.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Output:
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[None]:
-        """Show the elapsed time on the last line of a terminal, from the first second until the command prints something."""
+        """Show the elapsed time on the last line of a terminal, after one second and until the command prints something."""
         if sys.stderr.isatty():
             threading.Thread(target=self._show_elapsed_time, daemon=True).start()
         try:
@@ -89,7 +89,7 @@ class Output:
 
     @staticmethod
     def _make(folder: Path, option: str) -> None:
-        """Create a folder before anything is computed, because a result that cannot be written would be lost."""
+        """Create a folder before the computation, because a result that cannot be written would be lost."""
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -103,7 +103,7 @@ class Output:
         return self.folder / name
 
     def keep(self, name: str, result: Result) -> None:
-        """Save a result to a file with that name if --out is used."""
+        """Save a result to the file `name` if --out is used."""
         path = self.file(name)
         if path is not None:
             result.save(path)
@@ -115,7 +115,7 @@ class Output:
         return path
 
     def picture(self, name: str, draw: Callable[[], Figure]) -> None:
-        """Draw a figure and save it to the file with that name (--out) and to the report (--report)."""
+        """Draw a figure, and save it to the file `name` (--out) and in the report (--report)."""
         path = self.file(name)
         if path is None and self.report is None:
             return
@@ -136,9 +136,9 @@ class Output:
         self.files.append(str(path))
 
     def done(self, document: Mapping[str, object], text: Callable[[], str], name: str, result: Result | None = None) -> None:
-        """Print the document or the text, and write the document to NAME.json in the folder, and the report.
+        """Print the document or the text; write the document to NAME.json in the folder, and write the report.
 
-        `result` is the source of the document's numbers; its fields determine their units in the report.
+        **Arguments**: `result`: the source of the values in the document; its fields define their units in the report.
         """
         self.end_waiting()
         path = self.file(f"{name}.json")

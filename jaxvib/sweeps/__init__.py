@@ -1,1 +1,1 @@
-"""Studies of many cases of a scene: labelled results on disk, resumable, on one machine or several."""
+"""Studies of many cases of a scene, with labelled results on disk; they can be continued, and use one machine or several."""

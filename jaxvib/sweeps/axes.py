@@ -1,4 +1,4 @@
-"""Axes of a study: parameters of the scene and of the initial state whose values come from lists, ranges or samples."""
+"""Axes of a study: parameters of the scene or of the initial state, with values from lists, ranges or samples."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SAMPLE = "sample"
 """Name of the dimension of the samples."""
 
 _START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s"}
-"""Numbers of a start, as in `State`, and their units."""
+"""Parameters of an initial state, with the names of `State`, and their units."""
 
 _KEYS = ["from", "to", "count", "scale"]
 
@@ -31,11 +31,11 @@ _MAX_AXES_WITH_CORNERS = 10
 """Maximum number of axes for which all corners are checked; with more axes only two opposite corners are checked."""
 
 AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int | str]
-"""A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the number is sampled."""
+"""A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the parameter is sampled."""
 
 
 class Target(NamedTuple):
-    """Target of an axis: the parameter `number` of the scene or, if it is None, the entry `entry` (None: all entries) of the
+    """Target of an axis: the parameter `number` of the scene. If this is None: the entry `entry` (None: all entries) of the
     field `field` of the initial state."""
 
     number: NamedNumber | None
@@ -44,7 +44,7 @@ class Target(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """Axis of a study: one or several parameters with one name, whose value changes from case to case.
+    """Axis of a study: one or several parameters with a common name, whose value changes from case to case.
 
     **Attributes**
 
@@ -69,10 +69,10 @@ class Axis(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """All cases of a study: every combination of the values of the axes, and every sample for each of them.
+    """All cases of a study: all combinations of the values of the axes, and for each combination all samples.
 
-    **Attributes**: `axes`; number of `samples`, 0 without sampled axes; `seed`, `sampling` as in `samples`; `tile`: number of
-    cases of a chunk along each dimension.
+    **Attributes**: `axes`; `samples`: number of samples, 0 without sampled axes; `seed` and `sampling`: see `samples`; `tile`:
+    number of cases of a chunk along each dimension.
     """
 
     axes: tuple[Axis, ...]
@@ -112,7 +112,7 @@ class Grid(NamedTuple):
         return tuple(slice(int(a), min(int(a) + t, n)) for a, t, n in zip(first, self.tile, self.shape, strict=True))
 
     def values(self, chunk: int) -> np.ndarray:
-        """Return the values of the axes in the cases of a chunk, in C order, (cases, axes), SI."""
+        """Return the values (cases, axes), SI, of the axes in the cases of a chunk, in C order."""
         region = self.region(chunk)
         index = np.indices([s.stop - s.start for s in region]).reshape(len(region), -1)
         drawn = self.sampled_values(region[-1]) if self.samples else np.zeros((0, 0))
@@ -127,7 +127,7 @@ class Grid(NamedTuple):
         return np.stack(columns, axis=1)
 
     def sampled_values(self, which: slice) -> np.ndarray:
-        """Return the values of the sampled axes for a slice of the samples, (samples, sampled axes), SI."""
+        """Return the values (samples, sampled axes), SI, of the sampled axes for a slice of the samples."""
         axes = [axis for axis in self.axes if axis.values is None]
         shares = samples(which.start, which.stop, len(axes), self.seed, self.sampling)
         return np.stack([axis.at(shares[:, k]) for k, axis in enumerate(axes)], axis=1)
@@ -177,7 +177,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
 
 
 def _where(scene: Scene, name: str) -> tuple[Target, str]:
-    """Return the place of the numbers with that name, in the scene or in the start, and their unit."""
+    """Return the parameters with this name, in the scene or in the initial state, and their unit."""
     if not str(name).startswith("start."):
         found = find_number(scene, name, "axes")
         return Target(found, "", None), found.unit
@@ -221,8 +221,10 @@ def put(scene: Scene, targets: Sequence[Target], values: Array) -> Scene:
 
 
 def put_start(state: State, targets: Sequence[Target], values: Array) -> State:
-    """Return the initial state with the values (axes,) of the axes in a case. One value for all angles sets the mean angle of
-    the loads; their differences stay."""
+    """Return the initial state with the values (axes,) of the axes in a case.
+
+    A common value for all angles sets the mean angle of the loads and keeps their differences.
+    """
     for k, (found, field, entry) in enumerate(targets):
         if found is None:
             old = getattr(state, field)
@@ -238,7 +240,7 @@ def put_start(state: State, targets: Sequence[Target], values: Array) -> State:
 
 
 def corners(axes: Sequence[Axis]) -> np.ndarray:
-    """Return the corners of the box that the axes span, (corners, axes), SI."""
+    """Return the corners (corners, axes), SI, of the range of all axes."""
     ends = np.asarray([[axis.low, axis.high] for axis in axes])
     if len(axes) > _MAX_AXES_WITH_CORNERS:
         return ends.T
@@ -263,12 +265,11 @@ SAMPLINGS = ("low_discrepancy", "random")
 
 
 def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.ndarray:
-    """Return the samples `first` to `last` - 1 of a sequence in the unit cube of `size` dimensions, (last - first, size), in
-    [0, 1).
+    """Return the samples `first` to `last` - 1 of a sequence in [0, 1)^size, as an array (last - first, size).
 
     "low_discrepancy" is the additive sequence x_k = frac(x_0 + k a) with a_j = g^-j, where g > 1 solves g^(size+1) = g + 1 and
-    x_0 is random with the seed `seed`. It is computed with 64-bit integers; therefore even the billionth sample has full
-    precision. "random" samples are the numbers of a counter-based generator (Philox) with the key `seed`.
+    x_0 is random with the seed `seed`. It is computed with 64-bit integers, so that even the billionth sample has full
+    precision. "random" samples come from a counter-based generator (Philox) with the key `seed`.
 
     >>> samples(0, 4, 1, 0, "low_discrepancy").round(3).ravel().tolist()
     [0.012, 0.63, 0.248, 0.866]

@@ -1,4 +1,4 @@
-"""Chunks computed by Dask workers: processes on this machine, or a cluster at a scheduler's address."""
+"""Computation of chunks by Dask workers: processes on this machine, or a cluster with a scheduler at an address."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ _STUDIES: dict[str, Study] = {}
 def on_a_cluster(
     study: Study, todo: Iterable[int], *, workers: int | None, scheduler: str | None, timeout: Number
 ) -> Generator[tuple[int, Chunk], None, None]:
-    """Compute the chunks by workers; yield each finished chunk with its number. Only this process writes.
+    """Compute chunks by workers; yield each finished chunk with its number. Only the calling process writes.
 
-    The chunks of a worker that dies are computed by others. If several workers have died with a chunk, its cases are "lost".
+    If a worker terminates, other workers compute its chunks. If several workers have terminated while they computed the same
+    chunk, the cases of this chunk are "lost".
 
     **Raises** `InputError` if Dask is not installed, the scheduler does not answer, no worker connects, or a worker has other
     versions.
@@ -58,7 +59,7 @@ def on_a_cluster(
             problem = f"is {scheduler!r}, and no scheduler with workers answers there within {seconds:g} s"
             advice = "start one with: dask scheduler; dask worker ADDRESS"
             raise InputError("scheduler", f"{problem} ({_first_line(error)}); {advice}") from error
-        # Arrays that a worker unpacks before double precision is enabled would lose half their digits.
+        # NumPy arrays, because a worker that unpacks JAX arrays before it enables double precision loses half their digits.
         plain = dataclasses.replace(study, scene=jax.tree.map(np.asarray, study.scene))
         precise, chunks = jnp.result_type(float) == np.float64, iter(todo)
         running, numbers = as_completed(loop=client.loop), {}
@@ -86,7 +87,7 @@ def on_a_cluster(
 
 
 def _remote(study: Study, chunk: int, key: str, expected_versions: dict[str, str], precise: bool) -> Chunk | str:
-    """Compute the cases of a chunk on a worker, or return the reason for a refusal: versions that differ from the store's."""
+    """Compute the cases of a chunk on a worker; return a text if versions differ from those in the store."""
     for name, version in versions().items():
         if expected_versions[name] != version:
             return f"has {name} {version}, but the store was created with {expected_versions[name]}: digits would differ"

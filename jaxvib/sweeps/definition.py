@@ -25,11 +25,11 @@ _OPTIONS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_p
 
 
 PYTHON = "calls Python"
-"""Begin of the digest of a program that cannot be compared with others."""
+"""First words of the digest of a program that cannot be compared with other programs."""
 
 
 class CaseStatus(eqx.Enumeration):
-    """Outcomes of a case. The value of each member is the message shown to the user. Their order is part of the store's
+    """Outcomes of a case. The value of each member is the message shown to the user. The order is part of the store's
     format."""
 
     missing = "the case has not been computed yet"
@@ -55,9 +55,9 @@ class SweepStatus(eqx.Enumeration):
 class Study:
     """Validated study, see `study`.
 
-    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures`; `plan` of the runs, None if there are none; their
-    `start` and `mode`; `tier`; `specs`, the values of the axes as the user wrote them; `forms`, shape and type of each measure
-    in one case; `program`, the digest of the program of a case when the study was built.
+    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures`; `plan` of the runs, None without runs; `start` and
+    `mode` of the runs; `tier`; `specs`: the values of the axes as the user wrote them; `forms`: shape and type of each measure
+    in one case; `program`: the digest of the program of a case when the study was created.
     """
 
     scene: Scene
@@ -84,13 +84,15 @@ class Study:
 
     @property
     def size(self) -> int:
-        """Number of cases in one call of the program. It is a multiple of the batch size, because a partial batch would be
-        computed by different instructions, with other rounding errors."""
+        """Number of cases in one call of the program.
+
+        It is a multiple of the batch size, because other instructions, with other rounding errors, compute a partial batch.
+        """
         return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // BATCH_SIZE) * BATCH_SIZE
 
     @property
     def record(self) -> dict[str, Plain]:
-        """Identity of the study: every value on which its results depend, ready for JSON."""
+        """Identity of the study: all values on which its results depend, as plain data for JSON."""
         options: dict[str, Plain] = {name: str(getattr(jax.config, name)) for name in _OPTIONS}
         return {
             "scene": scene_to_toml(self.scene),

@@ -1,4 +1,4 @@
-"""Chunks computed one after another on the cores of this process, and their progress."""
+"""Computation of chunks on all cores of this process, and the report of the progress."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Report = Callable[[Progress], None]
 
 
 def in_this_process(study: Study, todo: Iterable[int]) -> Generator[tuple[int, Chunk], None, None]:
-    """Compute chunks on all cores by one program that all threads share; yield each finished chunk with its number."""
+    """Compute chunks on all cores; all threads share one program. Yield each finished chunk with its number."""
     return in_parallel(lambda chunk: compute(study, chunk), todo)
 
 

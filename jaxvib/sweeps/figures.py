@@ -1,4 +1,4 @@
-"""Figures of the stored results of a sweep; the axes of the sweep determine their kind. The memory is bounded."""
+"""Figures of the stored results of a sweep. The axes determine the kind of figure; large stores are read in parts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MAX_DOTS = 1500
 """Maximum number of cases along an axis of a figure; if there are more, only every k-th case is drawn."""
 
 _ROWS = 9
-"""Number of values of the axis that is not the rotor speed, at which folds and torus bifurcations are computed."""
+"""Number of values, along the axis that is not the rotor speed, for which folds and torus bifurcations are computed."""
 
 _BINS = 60
 
@@ -35,7 +35,7 @@ _SPEED = "drive.speed"
 
 
 class _Labels(NamedTuple):
-    """Labels of cases: `codes` (cases ...) are indices into `names`, -1 for no label."""
+    """Labels of cases: `codes` (cases ...) are indices of `names`, or -1 without a label."""
 
     codes: np.ndarray
     names: list[str]
@@ -44,7 +44,7 @@ class _Labels(NamedTuple):
 def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
     """Return Wilson's confidence interval (default: 95 %) of the share `hits` / `cases`; 0 to 1 if there are no cases.
 
-    It is the set of shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
+    It contains all shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
 
     >>> [round(float(end), 4) for end in wilson(np.asarray(0), np.asarray(10))]
     [0.0, 0.2775]
@@ -90,7 +90,7 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
 def figures(
     store: str | Path, measure: str | None = None, *, x: str | None = None, y: str | None = None, theory: bool = True
 ) -> Iterator[tuple[str, Figure]]:
-    """Yield the figures that suit the axes of a study, with their names: "map", "shares", "distribution", "tornado".
+    """Yield the figures that suit the axes of a study, each with its name: "map", "shares", "distribution" or "tornado".
 
     The arguments are those of `plot_map`.
 
@@ -124,10 +124,10 @@ def plot_map(
 
     **Arguments**
 
-    - `measure`: its name in the store (default: the regime, if there is one)
-    - `x`, `y`: names of axes; for all other axes the case in the middle is shown
-    - `theory`: True to draw the lines on which exact jams fold or lose their stability, computed by
-      `branches(scene, exact=True)` if one of the axes is the rotor speed
+    - `measure`: its name in the store; default: the regime if it was measured, otherwise the first measure
+    - `x`, `y`: names of axes; of all other axes the middle value is shown
+    - `theory`: True to draw lines on which exact jams have a fold or lose their stability, computed by
+      `branches(scene, exact=True)`; this needs the rotor speed as one of the axes
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for names that the store does not have.
     """
@@ -220,10 +220,10 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """Plot the mean of a measure over the cases with the lowest and with the highest fifth of the values of each varied
-    parameter.
+    """Plot, for each varied parameter, the mean of a measure over the cases with the lowest and the highest fifth of its
+    values.
 
-    The number with the largest influence is on top. **Returns** a matplotlib figure, or the given `ax`.
+    The parameter with the largest influence is on top. **Returns** a matplotlib figure, or the given `ax`.
     """
     from jaxvib.draw.sweeps import tornado_chart
 
@@ -266,7 +266,7 @@ def _dims(store: Store) -> list[str]:
 
 
 def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:
-    """Return the drawn values of an axis, at most `_MAX_DOTS`, and their stride."""
+    """Return at most `_MAX_DOTS` values of an axis, and the step between their indices."""
     values = store.read(axis)
     step = -(-values.size // _MAX_DOTS)
     return values[::step], step
@@ -278,11 +278,11 @@ def _is_log(store: Store, axis: str) -> bool:
 
 
 _USUAL_SIZES = {"m": 0.01, "N/m": 1e5, "N": 100.0}
-"""Sizes in SI units of numbers by which the display unit of a whole figure is chosen."""
+"""Usual values, SI, by which the display unit of a whole figure is chosen."""
 
 
 def _display_unit(store: Store, name: str) -> tuple[str, float]:
-    """Return the unit in which an axis or a measure is drawn, and the factor to it."""
+    """Return the display unit of an axis or a measure, and the factor that converts SI values to it."""
     unit = str(store.group[name].attrs.get("units", ""))
     return shown_unit(unit, _USUAL_SIZES.get(unit, 1.0))
 
@@ -305,12 +305,11 @@ def _measure(store: Store, name: str | None) -> str:
 def _measure_label(store: Store, name: str) -> str:
     attributes = store.group[name].attrs
     words, (unit, _) = str(attributes.get("long_name", name)), _display_unit(store, name)
-    return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # else matplotlib would typeset it as a formula
+    return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # otherwise matplotlib typesets a formula
 
 
 def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:
-    """Return the numbers of a measure in a region; the maximum along an additional dimension of the measure; NaN for missing
-    ones."""
+    """Return the values of a measure in a region, NaN if missing. Of a measure with its own axis the maximum is returned."""
     values = store.read(name, region).astype(float)
     return np.max(values, axis=-1) if values.ndim > len(store.shape) else values
 
@@ -338,11 +337,11 @@ def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
 def _theory(
     store: Store, across: str, up: str, xs: np.ndarray, ys: np.ndarray
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the lines in the map on which exact jams of the stored scene fold or lose their stability, by kind.
+    """Return the lines in a map on which exact jams of the stored scene have a fold or lose their stability, by kind.
 
-    Lines exist only if one axis is the rotor speed. If the other axis is a parameter of the initial state, which has no
-    influence on steady motions, the lines are straight. If it is a parameter of the scene, they connect the points at `_ROWS`
-    of its values.
+    Lines exist only if one axis is the rotor speed. If the other axis is a parameter of the initial state, which does not
+    influence steady motions, the lines are straight. If it is a parameter of the scene, the lines connect points that are
+    computed for `_ROWS` of its values.
     """
     if _SPEED not in (across, up):
         return {}
@@ -358,7 +357,7 @@ def _theory(
     for value in rows[:1] if fixed else rows:
         try:
             special = exact_branches(put(scene, (target,), jnp.asarray([float(value)]))).special
-        except InputError:  # the exact method does not include this scene
+        except InputError:  # the exact method does not support this scene
             return {}
         kinds: dict[str, list[float]] = {}
         for point in special:
@@ -368,7 +367,7 @@ def _theory(
     lines: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for kind in sorted({kind for kinds in found for kind in kinds}):
         counts = {len(kinds.get(kind, [])) for kinds in found}
-        if len(counts) == 1:  # lines connect points only if every row has the same number of them
+        if len(counts) == 1:  # points are connected only if every row has the same number of points
             parts = [(np.asarray([kinds[kind][k] for kinds in found]), rows) for k in range(counts.pop())]
         else:
             parts = [

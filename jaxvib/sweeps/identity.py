@@ -14,7 +14,7 @@ def digest(value: Plain) -> str:
 
 
 def difference(one: Plain, other: Plain, name: str = "") -> tuple[str, Plain, Plain] | None:
-    """Return the path of the first difference between two plain values and both entries at this path; None for equal values."""
+    """Return the path of the first difference between two plain values, and both entries there; None for equal values."""
     if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
         pairs = [(f"{name}.{key}" if name else key, one[key], other[key]) for key in one]
     elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):

@@ -1,4 +1,4 @@
-"""Measures of a case: quantities of the optimizer, and quantities of a run from a start."""
+"""Measures of a case: quantities of `optimize`, and quantities of a run."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from jaxvib.motion.batch import BatchRun
 from optimize.quantities.quantity import Quantity
 
 _SETTLED_SPEED_SHARE = 0.01
-"""Largest difference between a mean load speed and the final one, relative to the rotor speed, at which loads are settled."""
+"""Difference between a mean load speed and the final one, relative to the rotor speed, below which loads are settled."""
 
 
 @dataclass(frozen=True)
 class RunMeasure:
-    """Number that is computed from a run, see `BatchRun`.
+    """Quantity that is computed from a run, see `BatchRun`.
 
-    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that returns a scalar, or an array over `axis`, the
-    name of a further dimension ("coordinate", "load"); `meanings`, the names of the values 0, 1, ... if the measure is a label.
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that returns a scalar, or an array with an additional
+    dimension of the name `axis` ("coordinate", "load"); `meanings`: for a label, the meanings of its values 0, 1, ...
     """
 
     name: str
@@ -50,7 +50,7 @@ def _regime(run: BatchRun) -> Array:
 
 
 def _settling(run: BatchRun) -> Array:
-    """Return the end of the last part of the run in which the speed of a load differs from its final speed."""
+    """Return the end, s, of the last part of the run in which the speed of a load differs from its final speed."""
     last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
     away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * jnp.abs(rotor), axis=1)
     late = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
@@ -99,9 +99,10 @@ RUN_MEASURES = {
         RunMeasure("run.settling_time", "s", _settling),
     )
 }
-"""Measures of a run by name: its regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
-foundation force zero to peak, ripple and drift as in `AbstractMeasured`, and the settling time: the time, resolved to 1/64 of
-the run, after which each load speed differs from its final value by less than 1 % of the rotor speed."""
+"""Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
+foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time, with
+a resolution of 1/64 of the run, after which each load speed differs from its final value by less than 1 % of the rotor
+speed."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

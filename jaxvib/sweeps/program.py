@@ -1,4 +1,4 @@
-"""Program that computes a chunk of cases, and the isolation of cases that raise errors."""
+"""Program that computes a chunk of cases, and the search for cases that raise errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SAMPLES = 1024
 """Number of states in the measuring window of a run."""
 
 _PER_TURN = 8
-"""Minimum number of states of the window in a turn of the rotor; jammed loads turn more slowly."""
+"""Smallest number of states in a turn of the rotor; jammed loads turn more slowly, and have more states in a turn."""
 
 _SLOW_PERIODS = 20
 """Length of the window in periods of the lowest natural frequency, as in `simulate`."""
@@ -43,8 +43,8 @@ _CODE = {name: k for k, name in enumerate(CASE_STATUSES)}
 class Chunk(NamedTuple):
     """Results of the cases of a chunk.
 
-    **Attributes**: `found`, values (cases, ...) by name of the measure; `status` (cases,), numbers of `CaseStatus`; `errors`,
-    the message of each failed case by its index.
+    **Attributes**: `found`: values (cases, ...) of each measure, by name; `status` (cases,): indices of `CASE_STATUSES`;
+    `errors`: the message of each failed case, by its index.
     """
 
     found: dict[str, np.ndarray]
@@ -86,9 +86,10 @@ def _each(
 
 @cached
 def _cases(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tuple[Array, ...], Array]:
-    """Compute cases by a program of its own for each digest `program`.
+    """Compute cases by a compiled program; each digest `program` has its own.
 
-    A function compares equal to itself after its global numbers have changed, and would otherwise get the previous program.
+    The digest is an argument because a function is equal to itself after a change of its global variables, so that the program
+    before the change would be used again.
     """
     return _each(scene, values, *choices)
 
@@ -103,9 +104,10 @@ def _speeds(scene: Scene, values: Array, targets: tuple[Target, ...]) -> tuple[A
 
 
 def planned(scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], until: float, steps: int | None) -> BatchPlan:
-    """Return the plan of steps and window for all cases, from the fastest and the slowest of the study's `corners` (n, axes).
+    """Return the plan of steps and window for all cases, from the fastest and the slowest of the `corners` (n, axes) of a
+    study.
 
-    Frequencies increase with each stiffness and decrease with each mass; therefore the corners have the extreme frequencies.
+    Frequencies increase with each stiffness and decrease with each mass; therefore the extreme frequencies are in the corners.
     """
     fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), targets))
     most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
@@ -124,9 +126,9 @@ def planned(scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], unti
 def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
     """Return shape and type of each measure of one case, and the digest of the program of a case.
 
-    The digest differs if any number or operation differs on which results depend: numbers of the scene, and whatever the
-    functions of measures refer to. It begins with `PYTHON` and differs each time if a measure calls Python from its program,
-    because Python cannot be compared. Errors of tracing are passed on.
+    The digest changes with every value or operation on which results depend: parameters of the scene, and all values to which
+    the functions of measures refer. If the program of a measure calls Python, it cannot be compared: the digest begins with
+    `PYTHON` and is different in each call. Errors of tracing are passed on.
     """
     values = jnp.zeros((1, len(study.targets)))
 
@@ -140,9 +142,9 @@ def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
 
 
 def compute(study: Study, chunk: int) -> Chunk:
-    """Compute the cases of a chunk. A case that raises an error is located by bisection and recorded with its message.
+    """Compute the cases of a chunk. A case that raises an error is found by bisection and recorded with its message.
 
-    The program always has the same shapes: a chunk with fewer cases is padded with copies of its first one.
+    The arrays always have the same shapes: a chunk with fewer cases is filled up with copies of its first case.
     """
     values = study.grid.values(chunk)
     errors: dict[int, str] = {}

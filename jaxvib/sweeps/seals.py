@@ -23,7 +23,7 @@ FOLDER = ".seals"
 _LAYOUT, _LOCK = "layout", "lock"
 
 _intact: dict[str, tuple[object, ...]] = {}
-"""Stamps of the files of chunks that this process has read and verified, by the path of the seal."""
+"""Stamps (time, size, number) of the files of chunks that this process has read and verified, by the path of the seal."""
 
 
 def seal_of(store: Path, chunk: int) -> Path:
@@ -66,7 +66,7 @@ def seal(store: Path, chunk: int, files: Mapping[str, Path]) -> None:
 
 
 def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None:
-    """True if the seal of a chunk agrees with its files; None if the chunk has no seal."""
+    """Return True if the seal of a chunk agrees with its files, None if the chunk has no seal."""
     path = seal_of(store, chunk)
     stamps = _stamps({**files, "": path})
     if _intact.get(str(path)) == stamps:
@@ -85,7 +85,7 @@ def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None
 
 
 def seal_layout(store: Path) -> None:
-    """Record the digests of all files of a store that has no chunks yet: metadata and values of axes."""
+    """Record the digests of all files of a store without chunks: metadata and values of axes."""
     files = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob("*")) if path.is_file()}
     digests = {name: _digest({name: path}) for name, path in files.items()}
     (store / FOLDER).mkdir()
@@ -111,7 +111,7 @@ def changed_layout(store: Path) -> str | None:
 
 
 def _lock(file: int, *, exclusive: bool) -> bool:
-    """Lock an open file; False if another process has the lock. The system releases it however the process ends."""
+    """Lock an open file; return False if another process has the lock. The system releases the lock when the process ends."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -133,7 +133,7 @@ def _lock(file: int, *, exclusive: bool) -> bool:
 
 @contextlib.contextmanager
 def locked(store: Path) -> Iterator[bool]:
-    """Hold the lock of a store, and yield False if another process or thread has it.
+    """Lock a store while the context is active; yield False if another process or thread has the lock.
 
     **Raises** `OSError` if the lock file does not exist and cannot be created.
     """
@@ -146,7 +146,7 @@ def locked(store: Path) -> Iterator[bool]:
 
 
 def is_locked(store: Path) -> bool:
-    """True if a process is writing into a store."""
+    """Return True if a process is writing into a store."""
     try:
         file = os.open(store / FOLDER / _LOCK, os.O_RDONLY)
     except OSError:

@@ -1,8 +1,8 @@
-"""Store of a study on disk: labelled arrays in Zarr's format, written in chunks, each completely or not at all.
+"""Store of a study on disk: labelled arrays in the Zarr format, written in chunks.
 
-The numbers of a chunk are written first, then its statuses, and last its seal, which is a digest of all its files
-(`jaxvib.sweeps.seals`). A chunk is finished if and only if its seal agrees with its files. Files are written atomically. No
-file is unpickled.
+The values of a chunk are written first, then its statuses, and last its seal, a digest of all its files
+(`jaxvib.sweeps.seals`). A chunk is finished if and only if its seal agrees with its files. Files are written atomically.
+Reading a store executes no code from it (no pickle).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def require_zarr() -> ModuleType:
 def versions() -> dict[str, str]:
     """Return the versions of all packages on which a result depends, and a digest of the sources of jaxvib.
 
-    The digest also shows if this process has replaced parts of jaxvib.
+    The digest also shows if parts of jaxvib were replaced in this process.
     """
     changed = "" if code_state(look=True).is_on_disk else " with changes in this process"
     return {name: importlib.metadata.version(name) for name in _PACKAGES} | {"sources": digest_of_sources()[:16] + changed}
@@ -71,8 +71,8 @@ def versions() -> dict[str, str]:
 class Store:
     """Open store.
 
-    **Attributes**: `path`; `attributes`, the record of the study, versions and seed; `arrays` by name; `shape`, the number of
-    cases along each dimension; `tile`, the number of cases of a chunk along each dimension; `names` of the measures.
+    **Attributes**: `path`; `attributes`: the record of the study, versions and seed; `arrays` by name; `shape`: number of cases
+    along each dimension; `tile`: number of cases of a chunk along each dimension; `names` of the measures.
     """
 
     def __init__(self, path: Path, writable: bool = False):
@@ -89,7 +89,7 @@ class Store:
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
                 raise InputError("store", f"is {quoted(str(path))}, which is not the store of a sweep; name another one")
             self.record: Tables = self.attributes["study"]
-            # A chunk without values needs a file too, because a missing file counts as damage.
+            # A chunk without values is also written, because a missing file counts as damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self.arrays = {name: self.group[name] for name in self.group.array_keys()}
             self.shape = tuple(self.group["status"].shape)
@@ -98,7 +98,7 @@ class Store:
             self.dims = list(self.group["status"].metadata.dimension_names)
         except InputError:
             raise
-        except Exception as error:  # any error of zarr and its codecs for damaged files
+        except Exception as error:  # for damaged files zarr and its codecs raise errors of any type
             raise self.damaged(f"{type(error).__name__}: {error}") from error
 
     def damaged(self, what: str) -> InputError:
@@ -109,7 +109,8 @@ class Store:
 
     @classmethod
     def create(cls, path: Path, study: Study) -> None:
-        """Create the empty store of a study atomically. A store that another process has created meanwhile is kept."""
+        """Create the empty store of a study atomically. If another process has created it in the meantime, that store is
+        kept."""
         zarr = require_zarr()
         part = path.with_name(f".{uuid.uuid4().hex}.partial")
         try:
@@ -131,19 +132,16 @@ class Store:
         return int(self.attributes["coordinates_of_machine"])
 
     def require_same(self, study: Study) -> None:
-        """Require that the store belongs to this study and to the installed versions.
-
-        **Raises** `InputError` if it belongs to others.
-        """
+        """**Raises** `InputError` if the store belongs to another study or to other versions of the packages."""
         if (found := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
             name, mine, its = found
             part = re.split(r"[.\[]", name)[0]
-            problem = f"is {str(self.path)!r}, which holds another study: its {part} differs"
-            where = "" if part == name else f" ({name} is {_short(its)} there and {_short(mine)} here)"
+            problem = f"is {str(self.path)!r}, which contains another study: its {part} differs"
+            where = "" if part == name else f" ({name} is {_short(its)} in the store and {_short(mine)} here)"
             if study.program.startswith(PYTHON):
                 where = " (a measure calls Python from its program, whose results cannot be compared)"
             elif name == "program":
-                where = " (a number of the scene, the function of a measure, or a value that it refers to)"
+                where = " (a parameter of the scene, the function of a measure, or a value to which it refers)"
             raise InputError("store", f"{problem}{where}; name another store, or run the study of this store")
         for name, version in versions().items():
             if self.attributes["versions"].get(name) != version:
@@ -189,9 +187,9 @@ class Store:
         return tuple(str(self.attributes.get("coordinates", "")).split())
 
     def states(self, *, writing: bool = False) -> np.ndarray:
-        """Read every file once and return the `ChunkState` of each chunk, (chunks,).
+        """Read every file once and return the `ChunkState` (chunks,) of each chunk.
 
-        `writing`: True if this process has the lock.
+        **Arguments**: `writing`: True if this process has the lock.
         """
         busy = not writing and seals.is_locked(self.path)
         return np.asarray([self._state(chunk, busy) for chunk in range(int(np.prod(self.tiles, dtype=np.int64)))], int)
@@ -206,7 +204,7 @@ class Store:
         return ChunkState.damaged
 
     def _is_readable(self, chunk: int, files: dict[str, Path]) -> bool:
-        """True if the files that a killed process left of a chunk can be read."""
+        """Return True if the files of a chunk that an interrupted process left behind can be read."""
         if not any(file.exists() for file in files.values()):
             return True
         region = self.region(chunk)
@@ -218,7 +216,7 @@ class Store:
         return True
 
     def clear(self, chunk: int) -> None:
-        """Remove the files of a damaged chunk, its seal first: an interruption then leaves a chunk that counts as missing."""
+        """Remove the files of a damaged chunk, first its seal: after an interruption the chunk then counts as missing."""
         try:
             for file in (seals.seal_of(self.path, chunk), *reversed(self._files(chunk).values())):
                 shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink(missing_ok=True)
@@ -226,7 +224,7 @@ class Store:
             raise cannot_write(self.path, error) from error
 
     def require_whole(self) -> None:
-        """Require that no chunk is damaged. **Raises** `InputError` otherwise."""
+        """**Raises** `InputError` if a chunk is damaged."""
         bad = np.flatnonzero(self.states() == ChunkState.damaged)
         if bad.size:
             problem = f"is {str(self.path)!r}, in which {bad.size} of {int(np.prod(self.tiles))} chunks are damaged"
@@ -234,7 +232,7 @@ class Store:
             raise InputError("store", f"{problem}, the first of them chunk {bad[0]}; {advice}")
 
     def write(self, study: Study, chunk: int, cases: Chunk) -> None:
-        """Write a chunk: its numbers, then its statuses, then its seal, which marks it as finished."""
+        """Write a chunk: its values, then its statuses, then its seal, which marks it as finished."""
         region = study.grid.region(chunk)
         shape = tuple(s.stop - s.start for s in region)
         try:
@@ -282,7 +280,7 @@ class Store:
         return [slice(k, min(k + rows, self.shape[0])) for k in range(0, self.shape[0], rows)]
 
     def read(self, name: str, region: slice | tuple[slice, ...] = slice(None)) -> np.ndarray:
-        """Return the numbers of an array. **Raises** `InputError` if a chunk of the store is damaged."""
+        """Return the values of an array. **Raises** `InputError` if a chunk of the store is damaged."""
         if not self.is_whole:
             self.require_whole()
             self.is_whole = True

@@ -1,4 +1,4 @@
-"""Study of a scene, built from arguments or read from a file: the numbers that change, the measures, the runs."""
+"""Study of a scene, created from arguments or read from a file: varied parameters, measures, runs."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
 """Type of measures: a list, or a mapping from names to measures."""
 
 _CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
-"""Default number of cases of a chunk by tier: about a second of computation, which outweighs the cost of writing it."""
+"""Default number of cases of a chunk by tier: about one second of computation, much more than the time to write the chunk."""
 
 _RESERVED = ("status", "error")
 
 _MAX_CASES = 10**9
-"""Maximum number of cases of a study: their numbers are stored, and the list of their chunks is in memory."""
+"""Maximum number of cases of a study; the list of all chunks is kept in memory."""
 
 
 def study(
@@ -70,7 +70,7 @@ def study(
 def _grid(scene: Scene, axes: Mapping[str, AxisSpec], samples: int, sampling: str, seed: int) -> Grid:
     """Return the cases of a study, without the size of its chunks."""
     if not isinstance(axes, Mapping) or not axes:
-        raise InputError("axes", "is empty; name at least one number that varies, such as drive.speed")
+        raise InputError("axes", "is empty; name at least one parameter that varies, such as drive.speed")
     found = tuple(axis_of(scene, name, spec) for name, spec in axes.items())
     require_disjoint(scene, found)
     drawn = [axis.name for axis in found if axis.values is None]
@@ -90,7 +90,7 @@ def _grid(scene: Scene, axes: Mapping[str, AxisSpec], samples: int, sampling: st
 
 
 def _require_free_names(names: Sequence[str], axes: Sequence[str]) -> None:
-    """Require names of measures that can be names of arrays in a store beside those of the axes."""
+    """**Raises** `InputError` for names of measures that cannot be used for arrays of a store, or that are used already."""
     for name in names:
         if name in (*_RESERVED, *axes, "sample"):
             raise InputError(f"measure.{name}", "is a name that is used already; choose another one")
@@ -113,7 +113,7 @@ def _run_plan(
     if not runs:
         if until is not None or any(target.number is None for target in targets):
             what = "until" if until is not None else next(f"axes.{a.name}" for a in axes if a.target.number is None)
-            problem = "is an option of runs, but no quantity is measured in a run; measure for example run.regime"
+            problem = "applies to runs, but no quantity is measured in a run; measure for example run.regime"
             raise InputError(what, problem)
         return None
     if until is None:
@@ -141,7 +141,7 @@ def _traced(study: Study) -> Study:
 
 
 def _is_name(name: str) -> bool:
-    """True if a folder of the store may have this name on any file system, and no figure typesets it as a formula."""
+    """Return True for a name that is allowed for a folder on all file systems and is not typeset as a formula in figures."""
     fits = name.isprintable() and 0 < len(name.encode()) <= 200 and name == name.strip()
     return fits and not set(name) & set("/\\$") and not name.startswith((".", "__")) and name != "zarr.json"
 
@@ -259,7 +259,7 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     return Quantity(name or function, str(table.get("unit", "")), found)
 
 
-TEMPLATE = """# A study: the numbers that vary from case to case, and the quantities measured in each case.
+TEMPLATE = """# A study: the parameters that vary from case to case, and the quantities measured in each case.
 # Run: jaxvib sweep study.toml
 scene = "machine.toml"            # path of the scene file, relative to this file
 # tier = "exact"                  # method for quantities of a jam: leading (light loads), exact, time [leading]
@@ -271,7 +271,7 @@ scene = "machine.toml"            # path of the scene file, relative to this fil
 # "loads.drag" = { from = 0.5, to = 5.0, count = 10, scale = "log" }
 # "machine.stiffness[0]" = ["40 N/mm", "50 N/mm", "60 N/mm"]
 
-# Numbers with a range but no count are sampled together, for each combination of the others:
+# Parameters with a range but no count are sampled together, for each combination of the others:
 # samples = 256                   # (write these three lines above [axes])
 # sampling = "low_discrepancy"    # or "random"
 # seed = 0

@@ -48,18 +48,18 @@ class CaseCount(NamedTuple):
 
 
 class Sweep(Result):
-    """Progress of a study and the path of its store; the numbers stay on disk.
+    """Progress of a study and the path of its store; the results stay on disk.
 
     Returned by `sweep` and `open_sweep`.
 
     **Attributes**
 
     - `status`: a `SweepStatus`
-    - `store`: its path
-    - `cases`: their number
+    - `store`: path of the store
+    - `cases`: number of cases
     - `counts`: number of cases with each status
-    - `computed`: cases computed in this call, in `seconds`, compilation included
-    - `damaged`: cases whose files were damaged or incompletely written; `sweep` has computed them again, `open_sweep` counts
+    - `computed`: number of cases computed in this call; `seconds`: their time, including compilation
+    - `damaged`: number of cases whose files were damaged or incomplete; `sweep` has computed them again, `open_sweep` counts
       them as missing
     """
 
@@ -73,7 +73,7 @@ class Sweep(Result):
 
     @property
     def data(self) -> xarray.Dataset:
-        """Labelled results, an xarray dataset that reads from disk on demand, as `xarray.open_zarr(found.store)` does.
+        """Labelled results as an xarray dataset, which reads from disk on demand (like `xarray.open_zarr(found.store)`).
 
         **Raises** `InputError` if xarray is not installed or a chunk of the store is damaged.
         """
@@ -86,7 +86,7 @@ class Sweep(Result):
 
     @property
     def scene(self) -> Scene:
-        """Scene that all cases have in common."""
+        """Scene from which all cases are derived."""
         return scene_from_toml(Store(Path(self.store)).record["scene"])
 
     def summary(self) -> str:
@@ -131,48 +131,51 @@ def sweep(
     timeout: Number = "30 s",
     report: Report | None = None,
 ) -> Sweep:
-    """Compute every case of a study into a store on disk; an existing store of the same study is continued.
+    """Compute all cases of a study and store the results on disk. If the store of the same study exists, it is continued.
 
     - Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask
-    - A finished chunk is written at once and survives any end of the process; a chunk with damaged files is computed again
-    - The numbers of a case depend on that case alone, not on other cases, their order, the number of workers or restarts
+    - A finished chunk is written at once, so that it is not lost if the process is terminated; a chunk with damaged files is
+      computed again
+    - The results of a case do not depend on other cases, on their order, on the number of workers, or on restarts
 
     **Arguments**
 
-    - `scene`: the part that all cases have in common
+    - `scene` from which all cases are derived
     - `axes`: a mapping from names to values, see below; typical: 1 to 3 axes of 10 to 100 values
-    - `measure`: a list of quantities of `optimize`, functions of your own as `optimize.Quantity`, and names of measures of a
+    - `measure`: a list of quantities of `optimize`, your own functions in an `optimize.Quantity`, and names of measures of a
       run (`jaxvib.sweeps.measures.RUN_MEASURES`): "run.regime", "run.mode", "run.load_speed", "run.amplitude",
-      "run.foundation_force", "run.settling_time", ...; or a mapping from names in the store to these
+      "run.foundation_force", "run.settling_time", ...; or a mapping from names in the store to such measures
     - `store`: a folder, usually with the ending ".zarr"
     - `tier` of quantities of a jam: "leading", "exact" or "time"; default: that of each quantity
-    - `start`, `mode`: the start of runs, "rest" (the default), or "jam" for a start near a jam `mode`; the axes may change its
-      numbers
-    - `until`: the end of runs, s
+    - `start`, `mode`: initial state of runs, "rest" (the default), or "jam" for a start near the jam mode `mode`; axes may
+      change its values
+    - `until`: end of runs, s
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion
-    - `samples`, `seed`, `sampling`: number and kind of samples, "low_discrepancy" or "random"; typical: 1000 to 100,000
-    - `chunk`: number of cases that are computed and written together; it is part of the store's record; typical: the default,
-      about a second of computation. Smaller chunks lose less at an interruption and cost more file operations
-    - `workers`: number of processes on this machine; or `scheduler`, the address of a Dask scheduler ("tcp://10.0.0.1:8786"),
+    - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
+    - `chunk`: number of cases that are computed and written together; it is part of the record of the store; typical: the
+      default, about a second of computation. With smaller chunks an interruption loses fewer cases, but there are more file
+      operations
+    - `workers`: number of processes on this machine; or `scheduler`: address of a Dask scheduler ("tcp://10.0.0.1:8786"),
       which must answer within `timeout`, s. Both need the extra `cluster`
     - `report`: a function that is called with a `Progress` after each chunk
 
     Names of `axes`:
 
-    - a parameter of the scene by its name in a design ("machine.stiffness[0]", "loads.drag", "drive.speed")
-    - a number of the start ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]" m/s; without
-      an index, all entries change together)
+    - a parameter of the scene, with the same name as in a `DesignSpace` ("machine.stiffness[0]", "loads.drag", "drive.speed")
+    - a parameter of the initial state ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]"
+      m/s; without an index, all entries change together)
 
-    Values of an axis are a list, or a table of `from`, `to`, `count` and `scale` ("even" or "log"). Cases are all combinations.
-    Numbers whose table has no `count` are sampled together, `samples` times for each combination of the others.
+    The values of an axis are a list, or a table of `from`, `to`, `count` and `scale` ("even" or "log"). The cases are all
+    combinations of these values. Parameters whose table has no `count` are sampled together, `samples` times for each
+    combination of the other axes.
 
     **Returns** `Sweep`. A case that fails raises no error; its status and its message are in the store.
 
     **Raises** `InputError` for
 
     - values that are not allowed
-    - a store of another study; studies differ if any value differs on which results depend, including values in your own
-      functions
+    - a store of another study; two studies are the same only if all values on which the results depend are equal, including
+      values in your own functions
     - a store into which another sweep is writing, and a store that cannot be written
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -239,7 +242,7 @@ def _summarize_sweep(
 ) -> Sweep:
     """Compute the missing chunks of a store that this process has locked, and recompute the damaged ones."""
     if not new_study.program.startswith(PYTHON) and traced_program(new_study)[1] != new_study.program:
-        problem = "have a function that has changed since the study was made, or that gives another program each time"
+        problem = "have a function that has changed since the study was created, or that gives another program in each call"
         raise InputError("measures", f"{problem} (a clock, random numbers, a file); pass such numbers as constants")
     kept.require_same(new_study)
     states = kept.states(writing=True)
@@ -271,7 +274,7 @@ def _cases(new_study: Study, chunk: int) -> int:
 
 @validated
 def open_sweep(store: str | Path) -> Sweep:
-    """Read the store of a finished or running study. Every file is read once, to count the damaged chunks.
+    """Open the store of a finished or running study. Every file is read once in order to find damaged chunks.
 
     **Arguments**: `store`: the folder of the study.
 

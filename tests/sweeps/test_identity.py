@@ -155,9 +155,11 @@ def test_a_store_answers_no_other_question(tmp_path, monkeypatch):
     first, store = asked(Quantity("m", "", by_rate)), tmp_path / "study.zarr"
     assert run_study(first, store).data.m.values.tolist() == [50.0, 60.0]
     monkeypatch.setitem(globals(), "RATE", 3.0)
-    with pytest.raises(jv.InputError, match="measures have a function that has changed since the study was made"):
+    with pytest.raises(jv.InputError, match="measures have a function that has changed since the study was created"):
         run_study(first, store)
-    with pytest.raises(jv.InputError, match=r"holds another study: its program differs \(a number of the scene, the function"):
+    with pytest.raises(
+        jv.InputError, match=r"contains another study: its program differs \(a parameter of the scene, the function"
+    ):
         run_study(asked(Quantity("m", "", by_rate)), store)
     assert run_study(asked(Quantity("m", "", by_rate)), tmp_path / "other.zarr").data.m.values.tolist() == [150.0, 180.0]
     monkeypatch.setitem(globals(), "RATE", 1.0)
@@ -167,7 +169,7 @@ def test_a_store_answers_no_other_question(tmp_path, monkeypatch):
 def test_the_first_difference_is_named(tmp_path):
     store = tmp_path / "study.zarr"
     run_study(study(SCENE, AXES, {"m": CHEAP[0]}), store)
-    with pytest.raises(jv.InputError, match=r"its axes differs \(axes.drive.speed\[1\] is 60.0 there and 61.0 here\)"):
+    with pytest.raises(jv.InputError, match=r"its axes differs \(axes.drive.speed\[1\] is 60.0 in the store and 61.0 here\)"):
         run_study(study(SCENE, {"drive.speed": [50.0, 61.0]}, {"m": CHEAP[0]}), store)
     with pytest.raises(jv.InputError, match="its measure differs"):
         run_study(study(SCENE, AXES, {"other": CHEAP[0]}), store)
@@ -183,7 +185,7 @@ def test_a_number_that_is_read_from_a_file_counts(tmp_path, monkeypatch):
     assert run_study(asked, "study.zarr").data.m.values.tolist() == [100.0, 120.0]
     assert run_study(asked, "study.zarr").computed == 0
     (tmp_path / "numbers.txt").write_text("4.0")
-    with pytest.raises(jv.InputError, match="has changed since the study was made"):
+    with pytest.raises(jv.InputError, match="has changed since the study was created"):
         run_study(asked, "study.zarr")
     with pytest.raises(jv.InputError, match="its program differs"):
         run_study(study(SCENE, AXES, {"m": Quantity("m", "", reads_a_file)}), "study.zarr")

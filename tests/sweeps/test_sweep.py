@@ -150,7 +150,7 @@ def test_a_store_of_another_study_is_refused(whole):
         (study(SCENE, AXES | {"loads.drag": [0.5, 1.0, 3.0, 5.0, 8.0]}, MEASURE, chunk=10), "axes"),
         (study(eqx.tree_at(lambda s: s.machine.mass, SCENE, SCENE.machine.mass + 1.0), AXES, MEASURE, chunk=10), "scene"),
     ):
-        with pytest.raises(jv.InputError, match=f"holds another study: its {what} differs"):
+        with pytest.raises(jv.InputError, match=f"contains another study: its {what} differs"):
             run_study(other, whole.store)
 
 

@@ -1,1 +1,1 @@
-"""Commands about motion in time, and about the stability of motions as a number of the machine varies."""
+"""Commands for motion in time, and for the stability of motions over a parameter of the machine."""

@@ -17,7 +17,8 @@ from jaxvib.cli.output import CSV, fields_of
 @CSV
 @shared
 def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
-    """List every way in which the exciters of SCENE can turn with one speed; --out adds a picture of their phases."""
+    """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a picture of
+    phases."""
     from jaxvib.results.status import status_name  # slow imports, which --help does not need
     from jaxvib.steady.jams.phases import degrees
 

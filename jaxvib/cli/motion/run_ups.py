@@ -23,7 +23,7 @@ from jaxvib.cli.document import SEPARATION
 @click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups computed in parallel.")
 @shared
 def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
-    """Run SCENE up from rest at each drag with each set of initial angles, and report the final regimes of the loads."""
+    """Compute run-ups of SCENE from rest for each drag and each set of initial angles, and report the final regimes."""
     from jaxvib.units import number
 
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None

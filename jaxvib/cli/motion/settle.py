@@ -16,7 +16,7 @@ from jaxvib.errors import InputError
 _START = click.option(
     "--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state [jam with --mode, else rest]."
 )
-_MODE = click.option("--mode", type=int, help="Number of the jam mode to start in.")
+_MODE = click.option("--mode", type=int, help="Number of the jam mode near which the run starts.")
 
 
 @app.command("settle")
@@ -24,7 +24,7 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 @_START
 @_MODE
 @SEPARATION
-@click.option("--drift", type=float, help="Largest relative change of a settled motion [1e-6, or steady in the mean].")
+@click.option("--drift", type=float, help="Largest drift (relative change) of a settled motion [1e-6, or steady in the mean].")
 @click.option("--tolerance", type=float, help="Allowed error of one time step [1e-9].")
 @click.option("--stretches", type=int, default=200, show_default=True, help="Largest number of stretches.")
 @SPEED
@@ -32,7 +32,8 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 def settle(scene: Path, speed: str | None, tolerance: float | None, output: Output, **options: Any) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change, or change without a trend.
 
-    --out saves the last stretch. With --drift, the motion must repeat itself with at most this relative change.
+    --out saves the last stretch. With --drift, the motion must settle to this drift; a motion that is only steady in the mean
+    does not suffice.
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
     run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance, None), **options)
@@ -55,7 +56,7 @@ def settle(scene: Path, speed: str | None, tolerance: float | None, output: Outp
 def envelope(
     scene: Path, tolerance: float | None, without: tuple[str, ...], csv: Path | None, output: Output, **options: Any
 ) -> None:
-    """Integrate the averaged equations of SCENE, for long run-ups in steps of many turns; --out saves them (envelope.npz)."""
+    """Integrate the averaged equations of SCENE, with steps of many turns, for long run-ups; --out saves envelope.npz."""
     loaded = loaded_scene(scene, without)
     steps = None if tolerance is None else jv.Tolerance(tolerance)
     run = jv.envelope(loaded, stepsize_controller=steps, **_with_start(options))
@@ -76,8 +77,8 @@ def envelope(
 @click.option("--stretches", type=int, default=40, show_default=True, help="Number of stretches of the run, at least 8.")
 @shared
 def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> None:
-    """Measure the growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and the time after which
-    derivatives fail."""
+    """Measure the growth of small disturbances of a motion of SCENE: regular, unstable, chaotic or undecided, and the time
+    after which derivatives are meaningless."""
     if options["start"] == "spin_up":
         raise InputError("--start", "is 'spin_up'; the growth of disturbances needs a constant speed, use 'rest' or 'jam'")
     found = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))

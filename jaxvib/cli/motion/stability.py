@@ -36,7 +36,7 @@ _POINTS_OPTION = click.option("--points", type=int, default=300, show_default=Tr
 @app.command("stability-map")
 @click.argument("scene", type=click.Path(path_type=Path))
 @_VARY
-@click.option("--value", "values", multiple=True, required=True, help="Value of that number with its unit, repeatable.")
+@click.option("--value", "values", multiple=True, required=True, help="Value of the parameter with its unit, repeatable.")
 @_OMEGA
 @_POINTS_OPTION
 @WITHOUT
@@ -50,7 +50,7 @@ def stability_map(
     without: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Map the stability of exact jams of SCENE over one of its numbers; --out draws the map."""
+    """Map the stability of exact jams of SCENE over a parameter; --out draws the map."""
     make, read = _varied(loaded_scene(scene, without), vary)
     x = [read(value, "--value") for value in values]
     found = jv.stability_map(make, x, omega=_range(omega), points=points)
@@ -83,9 +83,9 @@ def _special(points: list[dict], scale: float) -> str:
 @app.command("onset")
 @click.argument("scene", type=click.Path(path_type=Path))
 @_VARY
-@click.option("--kind", required=True, help="Kind of special point that appears: fold, torus, symmetry or another one.")
+@click.option("--kind", required=True, help="Kind of the special point: fold, torus (torus bifurcation), symmetry or another.")
 @click.option(
-    "--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without the special point and one with it."
+    "--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without the special point, and a higher one with it."
 )
 @_OMEGA
 @_POINTS_OPTION
@@ -103,16 +103,17 @@ def onset(
     without: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Find the value of a number at which an exact diagram of SCENE gets a torus bifurcation, or another special point."""
+    """Find the value of a parameter at which a torus bifurcation, or another special point, appears in the diagram of SCENE."""
     make, read = _varied(loaded_scene(scene, without), vary)
     low, high = (read(value, "--between") for value in between)
     found = jv.stability_onset(make, kind, (low, high), omega=_range(omega), points=points, accuracy=accuracy)
     document = {"vary": vary, "kind": kind, "value": found, "accuracy": accuracy, "between": [low, high]}
-    output.done(document, lambda: f"{kind.replace('_', ' ')} from {vary} = {found:.6g} on (to {accuracy:g}, SI units)", "onset")
+    words = f"{kind.replace('_', ' ')} for {vary} of {found:.6g} and above (relative accuracy {accuracy:g}, SI units)"
+    output.done(document, lambda: words, "onset")
 
 
 def _varied(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable[[str, str], float]]:
-    """Return a function from a value of the named number to the scene, and a function that reads such a value from text."""
+    """Return a function that returns the scene for a value of the parameter `name`, and a function that reads such a value."""
     import jax.numpy as jnp
 
     from jaxvib.machine.numbers.named import find_number, put_numbers

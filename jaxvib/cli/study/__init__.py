@@ -1,1 +1,1 @@
-"""Commands for studies of a scene, of many cases, or of a record."""
+"""Commands for studies of a scene, for sweeps over many cases, and for records of measurements."""

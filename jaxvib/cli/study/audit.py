@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 @click.argument("scene", type=click.Path(path_type=Path), required=False)
 @click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
 @click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
-@click.option("--until", help="Duration of the run when no jam is given, such as 20s [100 slow periods after the run-up].")
+@click.option(
+    "--until", help="Duration of the run if no jam is compared, such as 20s [100 slowest natural periods after the run-up]."
+)
 @click.option("--start", type=click.Choice(["rest", "turning"]), help="Initial state of a run, in place of a jam.")
 @click.option(
     "--add-missing/--no-add-missing", default=True, show_default=True, help="Also add each effect that the scene does not have."
@@ -47,10 +49,10 @@ def audit(
     output: Output,
     **options: Any,
 ) -> None:
-    """Report the change and the cost of each effect and each tier of SCENE: negligible effects, and effects that may be
-    missing.
+    """Report by how much each effect and each tier changes the results of SCENE, and their cost: negligible and missing
+    effects.
 
-    Each effect of the scene is removed in turn, and each effect that it lacks is added with typical numbers. --out adds the
+    Each effect of the scene is removed in turn, and each effect that it lacks is added with typical values. --out adds the
     figure."""
     if count_operations:
         from jaxvib.study.audit.operation_counts import operation_counts  # slow import, which --help does not need

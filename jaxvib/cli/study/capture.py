@@ -98,5 +98,5 @@ def capture(
 
 
 def _is_near_change(share: np.ndarray, k: int) -> bool:
-    """Return True at both ends, and if a neighbour has another share."""
+    """Return True at both ends, and if the share of a neighbour is different."""
     return k in (0, len(share) - 1) or share[k] != share[k - 1] or share[k] != share[k + 1]

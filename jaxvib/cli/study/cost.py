@@ -17,18 +17,16 @@ if TYPE_CHECKING:
 
 _QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
 _SOLVERS = ("default", "Tsit5", "Dopri8")
-"""Names of `jaxvib.study.accuracy.work_precision`, repeated here because that import is slow."""
+"""Names in `jaxvib.study.accuracy.work_precision`, repeated here because its import is slow."""
 
 
 @app.command("cost")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option(
-    "--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="Quantity that is computed."
-)
+@click.option("--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="Computed quantity.")
 @click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
 @click.option(
     "--until",
-    help="Duration of the time integration, such as 20s [20 slow periods; for a jam until its transient has decayed].",
+    help="Duration of the time integration, such as 20s [20 slowest natural periods; for a jam until transients decay].",
 )
 @click.option(
     "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration, repeatable [all]."
@@ -48,7 +46,7 @@ def cost(
     speed: str | None,
     output: Output,
 ) -> None:
-    """Measure the cost of accuracy on SCENE: error against seconds for every method; --out adds the figure."""
+    """Measure the cost of accuracy for SCENE: error and computing time of every method; --out adds the figure."""
     found = jv.work_precision(
         loaded_scene(scene, speed=speed), quantity, mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats
     )
@@ -77,11 +75,11 @@ def cost_table(cost: Cost) -> str:
     ]
     title = f"{cost.quantity.replace('_', ' ')}; the reference has an error of {cost.reference_error:.1e}"
     chosen = [[f"{error:.0e}", *_method_columns(cost.cheapest(error))] for error in SHOWN_ERRORS]
-    parts = [table(title, head, rows), table("cheapest", ["error", "method", "seconds"], chosen)]
+    parts = [table(title, head, rows), table("fastest method", ["error", "method", "seconds"], chosen)]
     return "\n".join(parts + [f"left out: {reason}" for reason in cost.left_out])
 
 
 def _method_columns(row: CostRow | None) -> list[str]:
     if row is None:
-        return ["none of these methods, or below the error of the reference", ""]
+        return ["no method, or below the error of the reference", ""]
     return [", ".join(part for part in (row.tier, row.method, row.dtype, row.setting) if part), f"{row.seconds:.2e}"]

@@ -98,7 +98,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
         if ten is not None:
             rows.append(_row(f"mu1 by the formula of {ten.periods} periods, N m s", ten.viscous))
         rows.append(_row("frequency of small swings, rad/s", found.frequency))
-        rows.append(_row("zero of the record, rad", found.offset))
+        rows.append(_row("recorded angle at the hanging position, rad", found.offset))
         holds = found.status_name in ("found", "undetermined")
         meaning = "intervals are for a confidence of 95 %" if holds else "intervals include noise only"
         lines = [

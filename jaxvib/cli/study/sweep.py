@@ -23,7 +23,7 @@ _QUIET = 10.0
 @app.command("sweep")
 @click.argument("study", type=click.Path(path_type=Path))
 @click.option("--store", type=click.Path(path_type=Path), help="Folder to write [name of STUDY with the ending .zarr].")
-@click.option("--resume/--no-resume", default=True, show_default=True, help="Continue a store that exists already.")
+@click.option("--resume/--no-resume", default=True, show_default=True, help="Continue the study if its store exists already.")
 @click.option("--workers", type=click.IntRange(min=1), help="Number of processes on this machine (Dask).")
 @click.option("--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786.")
 @click.option(
@@ -33,7 +33,8 @@ _QUIET = 10.0
 def sweep(
     study: Path, store: Path | None, resume: bool, workers: int | None, scheduler: str | None, timeout: str, output: Output
 ) -> None:
-    """Compute all cases of STUDY, a study file, into a store on disk; after an interruption, the same command continues.
+    """Compute all cases of the study file STUDY, and store the results on disk; after an interruption, the same command
+    continues.
 
     --out adds the figure that fits the study (sweep.png).
     """
