@@ -14,7 +14,7 @@ from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
-_START_HELP = "Initial state: rest (the machine is at rest, the drive turns at its speed), jam (with --mode), or spin_up (smooth, from rest)."
+_START_HELP = "Initial state: rest (machine at rest, drive at its speed), jam (with --mode), or spin_up (smooth, from rest)."
 
 _SCREENS = ("linear-screen", "circular-screen", "feeder")
 _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus", *_SCREENS)
