@@ -190,7 +190,7 @@ def check_gradients(
       an array are checked; default: all parameters of the scene; typical: 5 to 20. The steps of a parameter that is 0 are
       relative to its typical size. A parameter at a bound, such as a damping of 0, is left out. Each parameter needs 22
       evaluations
-    - `routes`: "forward" and "reverse" mode of JAX, as far as the quantity supports them (`simulate` supports reverse mode by
+    - `routes`: "forward" and "reverse" mode of JAX, if the quantity supports them (`simulate` supports reverse mode by
       default, and forward mode with `diffrax.ForwardMode()`)
     - `implicit`: an additional route for a quantity that is computed from the solution of an equation, see `ImplicitRoute`
     - `tolerance` of each derivative, relative to the derivative itself, or to a thousandth of the largest derivative (as
