@@ -35,7 +35,7 @@ def threshold_chart(
 def curve_chart(
     value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray, *, ax: Axes | None = None
 ) -> Drawn:
-    """Draw thresholds of capture over the varied number, with their uncertainty, and the lowest captured speeds.
+    """Draw thresholds of capture over the varied parameter, with their uncertainty, and the lowest captured speeds.
 
     >>> import numpy as np
     >>> len(curve_chart(np.arange(2.0), np.array([-0.5, np.nan]), np.array([0.1, np.nan]), np.array([-0.6, -0.2])).axes)

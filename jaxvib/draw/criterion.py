@@ -34,7 +34,7 @@ def agreement_maps(
     **Arguments**
 
     - `speed` (S,): rotor speed, rad/s, drawn in `unit`
-    - `height` (H,): load mass relative to the scene's, on a log scale
+    - `height` (H,): load mass relative to that of the scene, on a log scale
     - `predicted` (H, S): True if the criterion predicts balancing
     - `maps`: a panel for each (title, exact), `exact` (H, S) True if the loads balance
 

@@ -268,7 +268,7 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Draw
 
 
 def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertainty: float, *, ax: Axes | None = None) -> Drawn:
-    """Draw growth rates (n,) 1/s of intervals that end at `time` (n,) s, and the largest Lyapunov exponent 1/s with its
+    """Draw growth rates (n,), 1/s, of intervals that end at `time` (n,), s, and the largest Lyapunov exponent, 1/s, with its
     standard error."""
     figure, (axes,) = panels(1, ax=ax)
     axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each interval")

@@ -78,7 +78,7 @@ def panels(
     """
     if ax is not None:
         given = [ax] if isinstance(ax, Axes) else ax
-        if isinstance(given, (list, tuple, np.ndarray)):  # not any sequence: a long `range` would fill the memory
+        if isinstance(given, (list, tuple, np.ndarray)):  # not every sequence, because a long `range` would fill the memory
             given = list(np.ravel(np.asarray(given, dtype=object)))
         if not isinstance(given, list) or not all(isinstance(each, Axes) for each in given):
             raise InputError("ax", f"is {quoted(ax)}; give matplotlib's Axes, such as those of matplotlib.pyplot.subplots()")
@@ -149,7 +149,7 @@ def load_names(count: int) -> list[str | None]:
 
 
 def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str], filled: Sequence[bool]) -> None:
-    """Draw filled or hollow points at one `x` with their names to the right; names of nearly touching points share a text.
+    """Draw filled or hollow points at one `x` with their names to the right; names of points that nearly touch share a text.
 
     The limits of the axes must already be set, because points outside of them are left out.
     """

@@ -1,1 +1,1 @@
-"""Exchange with other tools: functional mock-up units, state-space models, files of modal analysis."""
+"""Exchange with other tools: functional mock-up units, state-space models, universal files, recordings."""

@@ -1,7 +1,7 @@
-"""Scalar programs written as C.
+"""C source of scalar programs.
 
-Statements that depend on parameters alone go into a separate function, which is called when a parameter changes; the equations
-read its results as constants. Each operation is one statement. An operation without a rule is an error.
+Statements that depend only on parameters form a separate function, which is called when a parameter changes; the equations read
+its results as constants. Each operation is one statement. An operation without a rule is an error.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ _RULES: Mapping[str, str] = {
 """C expressions of operations, by their names in JAX."""
 
 _BRANCHES = {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}
-"""Comparisons that choose a branch of the equations."""
+"""Comparisons that select one of two expressions, such as contact or no contact."""
 
 
 class Written(NamedTuple):
     """Program in C.
 
-    **Attributes**: `prepare`, the statements that depend on parameters alone; `body`, the other statements; `constants`, the
-    number of results of `prepare` that `body` reads; `branches`, the number of comparisons in `body` that are event indicators.
+    **Attributes**: `prepare`: the statements that depend only on parameters; `body`: the other statements; `constants`: number
+    of results of `prepare` that `body` reads; `branches`: number of comparisons in `body` that are event indicators.
     """
 
     prepare: list[str]
@@ -67,7 +67,7 @@ class Written(NamedTuple):
 
 
 def number_text(value: Any) -> str:
-    """Return a number as C text that gives the same bits when it is read.
+    """Return a number as C text from which a compiler obtains the same bits.
 
     >>> number_text(0.1), number_text(-3.0), number_text(True)
     ('0.1', '-3.0', '1')
@@ -85,11 +85,11 @@ def write_program(
 ) -> Written:
     """Write a scalar program as C.
 
-    **Arguments**: `inputs`, the C expression of each argument; `parameters`, the number of leading arguments that change only
-    at events; `outputs`, the C expression to which each result is assigned; `has_events`: True to assign the difference of the
-    two sides of each comparison to an event indicator.
+    **Arguments**: `inputs`: the C expression of each argument; `parameters`: number of leading arguments that change only at
+    events; `outputs`: the C expression to which each result is assigned; `has_events`: True to assign the difference of the two
+    compared values to an event indicator, for each comparison.
 
-    **Raises** `InputError` with the name of an operation that has no rule.
+    **Raises** `InputError` with the name of an operation without a rule.
     """
     return _Writer(program, inputs, parameters, has_events).written(outputs)
 
@@ -143,7 +143,7 @@ class _Writer:
         values = [self._read(atom, early=early) for atom in equation.invars]
         if name == "custom_jvp_call":  # in scalar programs only `sine_and_cosine` has a custom rule
             return [f"sin({values[0]})", f"cos({values[0]})"]
-        # A comparison of two magnitudes selects a pivot of a linear solve and is not an event of the machine.
+        # A comparison of two magnitudes selects a pivot in the solution of linear equations; it is not an event of the machine.
         if name in _BRANCHES and not early and _is_real(equation) and not self.magnitudes.issuperset(_variables(equation)):
             return [self._branch(f"{values[0]} {_BRANCHES[name]} {values[1]}", *values)]
         if name in ("max", "min", "clamp"):
@@ -157,7 +157,7 @@ class _Writer:
         if (rule := _SPECIAL.get(name)) is not None:
             return [rule(values, params, equation)]
         if name not in _RULES or (name == "div" and not _is_real(equation)):
-            problem = f"needs the operation {name!r} of JAX, for which there is no C code; remove the part that needs it"
+            problem = f"needs the operation {name!r} of JAX, which cannot be written in C; remove the part that needs it"
             raise InputError("scene", problem)
         return [_RULES[name].format(*values)]
 
@@ -167,7 +167,7 @@ class _Writer:
         return f"{self._branch(test, x, y) if real else f'({test})'} ? {x} : {y}"
 
     def _branch(self, test: str, x: str, y: str) -> str:
-        """Return a test, and make the difference of its sides an event indicator."""
+        """Return a comparison as C text, and assign the difference of the two values to an event indicator."""
         if self.has_events:
             self.body.append(f"indicators[{self.branches}] = {x} - {y};")
             self.branches += 1

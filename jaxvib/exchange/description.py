@@ -1,4 +1,4 @@
-"""Descriptions of functional mock-up units, the file modelDescription.xml of FMI 2.0 and 3.0."""
+"""Description of a functional mock-up unit: the file modelDescription.xml of FMI 2.0 and 3.0."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _STRUCTURED = re.compile(r"(der\()?[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\]
 class Variable(NamedTuple):
     """Variable of a functional mock-up unit; its value reference is its index in the list of all variables.
 
-    **Attributes**: `name`; `unit`, "" for none; `kind`, the causality of FMI; `start`, None if the value is computed; `about`,
-    a description; bounds `low` and `high`, or None; `state`: for the rate of a state, the index of that state, otherwise None;
-    `nominal` value or None; `listed`: False for a variable that the description of FMI 2.0 omits.
+    **Attributes**: `name`; `unit`, "" for none; `kind`: the causality in FMI; `start`: the initial value, None if it is
+    computed; `about`: a description; bounds `low` and `high`, or None; `state`: for the rate of a state, the index of the
+    state, otherwise None; `nominal`: typical size, or None; `listed`: False for a variable that a description in FMI 2.0 omits.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Variable(NamedTuple):
 
     @property
     def is_calculated(self) -> bool:
-        """True if the value is computed from others at the start too."""
+        """True if the initial value is also computed from other variables."""
         return self.kind in ("output", "local") and self.start is None
 
 
@@ -76,8 +76,8 @@ def describe_model(
 ) -> str:
     """Return the text of modelDescription.xml.
 
-    **Arguments**: `name` and `identifier` of the model; `token` with which its binary must agree; `variables` in the order of
-    their value references; `step` of co-simulation and `stop` time of the default experiment, s.
+    **Arguments**: `name` and `identifier` of the model; `token`: text that must be equal in the binary; `variables` in the
+    order of their value references; `step` of co-simulation and `stop` time of the default experiment, s.
     """
     two = fmi == "2.0"
     listed = [(reference, each) for reference, each in enumerate(variables) if each.listed or not two]

@@ -1,4 +1,4 @@
-"""Functional mock-up units: a scene as C source and a binary, for tools without Python."""
+"""Functional mock-up units: a scene as C source and as a binary, for tools without Python."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from jaxvib.ode.scalarize import NotScalarizable, scalar_program
 from jaxvib.runtime.compat import HAS_JAXPRS
 
 _STEPS_PER_RADIAN = 16.0
-"""Steps of co-simulation per radian of the fastest motion, which give a phase error of 1e-7 per radian."""
+"""Number of steps of co-simulation per radian of the fastest motion; with it the phase error is 1e-7 per radian."""
 
 _COMPILERS = ("cc", "gcc", "clang")
 _COMPILER_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden", "-s")
@@ -58,8 +58,8 @@ class Fmu(NamedTuple):
 
     Returned by `export_fmu`.
 
-    **Attributes**: `path` of the file; `has_binary`: True if it contains a binary for this platform beside the source;
-    `message`, a sentence about the binary; `statements`, the number of C statements of the equations.
+    **Attributes**: `path` of the file; `has_binary`: True if it contains a binary for this platform in addition to the source;
+    `message`: a sentence about the binary; `statements`: number of C statements of the equations.
     """
 
     path: Path
@@ -82,17 +82,16 @@ def export_fmu(
     """Write a scene as a functional mock-up unit (FMU), for model exchange and co-simulation.
 
     The file contains the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary for this
-    platform. It needs neither Python nor jaxvib. The same scene gives the same bytes.
+    platform. Tools that use it need neither Python nor jaxvib. The same scene gives a file with the same bytes.
 
-    - Parameters of the FMU are all parameters of the scene under their names (`machine.stiffness[0]`), with units and bounds;
-      they may change during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the
-      classical Runge-Kutta method of order 4
+    - Parameters are all parameters of the scene with their names (`machine.stiffness[0]`), units and bounds; they may change
+      during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the classical Runge-Kutta
+      method of order 4
     - Outputs are the states (`displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`), `acceleration.y1`,
       `foundation_force.up`, `rotor.angle` and `rotor.speed`
     - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m, anticlockwise), which
       is added to the torque of the motor
-    - In a scene with several exciters, their signals have the place of the exciter before their names, such as
-      `exciters[1].rotor.torque`
+    - In a scene with several exciters, the names of their signals begin with the exciter, such as `exciters[1].rotor.torque`
     - Event indicators are comparisons in nonsmooth forces (stops, contacts, dry friction) and in a drive whose acceleration
       jumps; a solver ends a step at the time at which an indicator changes its sign
     - Directional derivatives of rates and outputs with respect to states, inputs, parameters and time are exact
@@ -103,9 +102,9 @@ def export_fmu(
     - `path` of the file, ".fmu"
     - `fmi`: version of the standard, "2.0" (the default) or "3.0"
     - `start`: as in `simulate` except "spin_up", or a `State`
-    - `mode`: number of the jam to start in; typical: 1, 3, 5
+    - `mode`: number of the jam mode for `start="jam"`; typical: 1, 3, 5
     - `drive`: "scene" (the default), or "input" for inputs in place of the drive: `rotor.speed` and its derivative
-      `rotor.acceleration` for an ideal drive, only `rotor.torque` for a motor
+      `rotor.acceleration` for an ideal drive (prescribed motion), only `rotor.torque` for a motor
     - `binary`: True to compile a binary
 
     **Returns** `Fmu`.
@@ -172,7 +171,7 @@ def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) ->
 
 
 def _described(scene: Scene) -> str:
-    """Return the machine and its exciters in words."""
+    """Return a description of the machine and its exciters."""
     carried = [
         " and ".join(
             ([] if each.loads is None else [f"{each.loads.count} {each.loads.kind}"])
@@ -190,8 +189,9 @@ def _step(scene: Scene) -> float:
 
 
 class _Programs(NamedTuple):
-    """Programs in C: the `rates` and outputs; their derivatives in a direction of states and inputs (`tangent`), which implicit
-    solvers need often, and in a direction of parameters, time, states and inputs (`full_tangent`)."""
+    """Programs in C: the rates and outputs (`rates`); their directional derivatives with respect to states and inputs
+    (`tangent`), which implicit solvers need often; and those with respect to parameters, time, states and inputs
+    (`full_tangent`)."""
 
     rates: Written
     tangent: Written
@@ -201,7 +201,7 @@ class _Programs(NamedTuple):
 def _programs(scene: Scene, equations: Equations, events: bool, parameters: int) -> _Programs:
     """Return the programs of a scene."""
     if not HAS_JAXPRS:
-        raise InputError("scene", "cannot be written as C, since this version of JAX does not give access to its programs")
+        raise InputError("scene", "cannot be written in C, because this version of JAX does not give access to its programs")
     time = jnp.zeros((), scene.top_speed.dtype)
     given = (scene, time, equations.states, equations.inputs)
 
@@ -235,7 +235,7 @@ def _text(value: object) -> str:
 
 
 def _flat(tree: object) -> list[str]:
-    """Return the numbers of a tree as texts for C and XML."""
+    """Return all values in the arrays of a tree as texts for C and XML."""
     return [_text(value) for leaf in jax.tree.leaves(tree) for value in np.asarray(leaf).ravel()]
 
 

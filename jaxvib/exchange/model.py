@@ -1,4 +1,4 @@
-"""Equations of a scene as a function of its parameters, of time, states and inputs, for other tools."""
+"""Equations of a scene as a function of parameters, time, states and inputs, for other tools."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.linalg import solve_definite
 
 DriveBy = Literal["scene", "input"]
-"""Source of the rotor's motion: the drive of the scene, or inputs."""
+"""Source of the motion of the rotor: the drive of the scene, or inputs."""
 
 
 class _AppliedForce(Effect):
-    """External forces on the coordinates, (nd,), N, for angles N m."""
+    """External forces (nd,) on the coordinates, N (on angles: N m)."""
 
     force: Array
     kind: str = eqx.field(static=True, kw_only=True, default="applied_force")
@@ -66,7 +66,7 @@ class _SpeedInput(IdealDrive):
 
 
 class _TorqueInput(Motor):
-    """Motor with an additional torque on its rotor; only that torque acts if `motor` is None."""
+    """Motor with an additional torque on its rotor. If `motor` is None, only the additional torque acts."""
 
     speed: Array
     inertia: Array
@@ -104,23 +104,23 @@ class RotorInputs(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Inputs of the equations: `force` on the coordinates (nd,), N, for angles N m; `rotors`, those of each exciter."""
+    """Inputs of the equations: `force` (nd,) on the coordinates, N (on angles: N m); `rotors`: the inputs of each exciter."""
 
     force: Any
     rotors: tuple[RotorInputs, ...]
 
 
 class States(NamedTuple):
-    """State of the equations: `machine`; `rotor_angles`, for each exciter the angle, rad, of a rotor whose speed is an input,
-    otherwise None."""
+    """State of the equations: `machine`; `rotor_angles`: for each exciter the angle of its rotor, rad, if the speed of the
+    rotor is an input, otherwise None."""
 
     machine: State
     rotor_angles: tuple[Any, ...]
 
 
 class Outputs(NamedTuple):
-    """Outputs that are not states or rates: `foundation_force` (nb,) N; `rotors`, for each exciter the angle and the speed of
-    the rotor, None if they are states or inputs."""
+    """Outputs that are neither states nor rates: `foundation_force` (nb,) N; `rotors`: for each exciter the angle and the speed
+    of its rotor, None if these are states or inputs."""
 
     foundation_force: Any
     rotors: tuple[Any, ...]
@@ -129,9 +129,10 @@ class Outputs(NamedTuple):
 class Equations(NamedTuple):
     """Equations of a scene for another tool.
 
-    **Attributes**: `rates`, a function (scene, time, states, inputs) -> (rates of the states, outputs); initial values of
-    `states` and `inputs`; `state_signals`, `rate_signals`, `input_signals` and `output_signals`, a `Signal` for each number in
-    the order of the leaves. In `rate_signals`, only the rates of velocities have a signal; the others are None.
+    **Attributes**: `rates`: a function (scene, time, states, inputs) -> (rates of the states, outputs); `states` and `inputs`:
+    their initial values; `state_signals`, `rate_signals`, `input_signals` and `output_signals`: a `Signal` for each entry, in
+    the order of the arrays of the tree (leaves of `jax.tree`). In `rate_signals` only the rates of velocities have a signal;
+    the other entries are None.
     """
 
     rates: Callable[[Scene, Array, States, Inputs], tuple[States, Outputs]]
@@ -144,7 +145,7 @@ class Equations(NamedTuple):
 
 
 def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
-    """Return the equations of a scene that starts in a state."""
+    """Return the equations of a scene, with the initial state `start`."""
     carrier = scene.machine.structure()
     zero = np.zeros((), carrier.mass.dtype)
     by_input = drive == "input"
@@ -207,7 +208,7 @@ def _driven(exciter: Exciter, angle: Array | None, given: RotorInputs, by_input:
 
 
 def state_signals(scene: Scene, state: State) -> list[Signal]:
-    """Return a `Signal` for each number of a state, in the order of its leaves."""
+    """Return a `Signal` for each entry of a state, in the order of its arrays (leaves of `jax.tree`)."""
     carrier = scene.machine.structure()
     leaves, structure = jax.tree.flatten(state)
     ends = np.cumsum([np.size(leaf) for leaf in leaves])
@@ -240,15 +241,15 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
 
 
 def has_events(scene: Scene) -> bool:
-    """True if the equations are piecewise: nonsmooth forces, or a drive whose acceleration jumps."""
+    """Return True if the equations are piecewise smooth: nonsmooth forces, or a drive whose acceleration jumps."""
     smooth = all(term.is_smooth for effect in scene.all_effects for term in effect.terms())
     return not smooth or any(exciter.drive.jump_ts() for exciter in scene.exciters)
 
 
 def named_entries(scene: Scene) -> list[NamedNumber]:
-    """Return the name of each parameter of a scene, in the order of its leaves.
+    """Return the named parameters of a scene, in the order of its arrays (leaves of `jax.tree`).
 
-    **Raises** `InputError` for a scene with a number that has no name.
+    **Raises** `InputError` for a scene with a parameter that has no name.
     """
     leaves, structure = jax.tree.flatten(scene)
     ends = np.cumsum([np.size(leaf) for leaf in leaves])
@@ -260,6 +261,6 @@ def named_entries(scene: Scene) -> list[NamedNumber]:
         found[int(where if each.entry is None else where[each.entry])] = each
     if len(found) != sum(map(np.size, leaves)):
         raise InputError(
-            "scene", "has a number without a name, which another tool could not set; give a scene of jaxvib's parts"
+            "scene", "has a parameter without a name, which another tool could not set; give a scene of jaxvib's parts"
         )
     return [found[k] for k in range(len(found))]

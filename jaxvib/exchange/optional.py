@@ -10,7 +10,7 @@ from jaxvib.errors import InputError, quoted
 
 
 def optional_module(name: str, extra: str) -> Any:
-    """Import a module of an optional package. **Raises** `InputError` with the command that installs it, if it is missing."""
+    """Import a module of an optional package. If it is missing, **raises** `InputError` with the command that installs it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -19,9 +19,9 @@ def optional_module(name: str, extra: str) -> Any:
 
 
 def require_writable(path: Path) -> None:
-    """Require, before anything is computed, that a path can be written to.
+    """Check that a file can be written, before the computation begins.
 
-    **Raises** `InputError` for a missing folder, a read-only file and a name that no file can have.
+    **Raises** `InputError` for a missing folder, a read-only file and a name that is not allowed.
     """
     try:
         if not path.parent.is_dir():

@@ -1,4 +1,4 @@
-"""Names and units of the inputs and outputs of a machine, common to all formats."""
+"""Names and units of the inputs and outputs of a machine, the same in all formats."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Signal(NamedTuple):
 
 
 def coordinate_signals(carrier: Carrier, name: str, order: int) -> tuple[Signal, ...]:
-    """Return the signals of a derivative of the coordinates: order 0 displacements, 1 velocities, 2 accelerations."""
+    """Return the signals of the coordinates (`order` 0) or of their derivatives: velocities (1) or accelerations (2)."""
     named = zip(carrier.coordinates, carrier.units, strict=True)
     return tuple(Signal(f"{name}.{coordinate}", unit + _RATES[order]) for coordinate, unit in named)
 
 
 def force_inputs(carrier: Carrier) -> tuple[Signal, ...]:
-    """Return the signals of the forces on the coordinates: N, for an angle N m."""
+    """Return the signals of the forces on the coordinates, N (on angles: N m)."""
     named = zip(carrier.coordinates, carrier.units, strict=True)
     return tuple(Signal(f"force.{coordinate}", "N" if unit == "m" else "N m") for coordinate, unit in named)
 

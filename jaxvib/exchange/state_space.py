@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     import scipy.signal
 
 _MAX_RESIDUAL = 1e-6, 1e-3
-"""Largest residual acceleration of a load in a jam, relative to the acceleration by its drag alone, in double and in single
-precision."""
+"""Largest residual acceleration of a load in a jam, relative to the acceleration that its drag alone causes, in double and in
+single precision."""
 
 _AT_REST = (
     "linear machine with the masses of its loads at their places, at the rotor speed {speed:.6g} rad/s; inputs are forces on "

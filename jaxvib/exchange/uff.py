@@ -1,4 +1,4 @@
-"""Universal files (UFF, UNV) of modal analysis, written and read through pyuff.
+"""Universal files (UFF, UNV) of modal analysis, written and read by the package pyuff.
 
 A machine is represented by nodes: its platforms, points on a rotor's axis, or points of bodies in a plane. The direction +X is
 along the axis, +Y across, +Z up.
@@ -151,7 +151,7 @@ def export_uff(
 
 
 def _nodes(scene: Scene) -> list[_Node]:
-    """Return the nodes of a machine; points that always move alike are one node."""
+    """Return the nodes of a machine; points that always have the same motion form one node."""
     found: dict[bytes, _Node] = {}
     for place, position in _places(scene):
         rows = np.asarray(scene.machine.rows_at(place))
@@ -405,7 +405,7 @@ def _read_function(dataset: dict[str, Any], length: float, force: float) -> UffF
 
 
 def _scale(dataset: dict[str, Any], side: str, length: float, force: float) -> float:
-    """Return the factor from the file's units to SI for one side of the quotient, numerator or denominator."""
+    """Return the factor from the units of the file to SI, for the numerator ("ordinate") or the denominator ("orddenom")."""
     kind = int(dataset[f"{side}_spec_data_type"])
     own = int(dataset[f"{side}_len_unit_exp"]), int(dataset[f"{side}_force_unit_exp"])
     lengths, forces = own if kind == 1 else _EXPONENTS.get(kind, (0, 0))

@@ -1,1 +1,1 @@
-"""Local page with sliders for the numbers of a machine, and diagrams that follow them."""
+"""Local page with sliders for the parameters of a machine, and diagrams that follow the sliders."""

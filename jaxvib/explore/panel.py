@@ -1,4 +1,4 @@
-"""Axes, lines and legend of a chart as outlines and texts of an SVG picture, in a tenth of the time of matplotlib."""
+"""Axes, lines and legend of a chart as outlines and texts of an SVG picture, which take a tenth of the time of matplotlib."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 
 def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
-    """Return a round or a square dot with that style."""
+    """Return a round or a square dot with the given style."""
     outline = box(x - 0.045, x + 0.045, y - 0.045, y + 0.045) if square else circle((x, y), 0.05, 13)
     return Part(outline, look, filled=True)
 

@@ -45,7 +45,7 @@ class SceneOrProblem(NamedTuple):
 
 
 def scene_or_problem(ask: Callable[[], Scene]) -> SceneOrProblem:
-    """Return the scene from `ask`, or the message of its error: sliders may have values at which no machine is possible."""
+    """Return the scene from `ask`, or the message of its error, because some values of the sliders give no possible machine."""
     try:
         return SceneOrProblem(ask(), "")
     except (InputError, ComputationError) as error:
@@ -119,7 +119,8 @@ def _draw_all(scene: Scene) -> None:
 
 
 def has_branches(scene: Scene) -> bool:
-    """True if the jams of the scene form branches over the rotor speed, that is, if its machine only moves up and down."""
+    """Return True if the jams of the scene form branches over the rotor speed, that is, if the machine moves only up and
+    down."""
     return scene.mounting.axes == (1,)
 
 

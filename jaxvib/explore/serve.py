@@ -63,7 +63,7 @@ def require_free(port: int) -> None:
 
 
 def guarded(page: _Page, token: str, port: int) -> _Page:
-    """Return an ASGI application that passes on to `page` only requests of that page at `/token/`; others get an empty 404.
+    """Return an ASGI application that forwards only requests of the page at `/token/` to `page`; others receive an empty 404.
 
     The header Host must be this computer with `port`; this rejects sites whose name was made to point here (DNS rebinding). The
     header Origin, which browsers add to requests of other sites and to all websockets, must agree with Host if it is present.
@@ -128,6 +128,6 @@ def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]
 
 
 def leave() -> None:
-    """End the process at once. An orderly exit would wait for marimo's threads, which wait for pages that are still open."""
+    """End the process at once. A normal exit would wait for marimo's threads, which wait for pages that are still open."""
     sys.stdout.flush()
     os._exit(0)

@@ -114,8 +114,8 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
 
 
 def _is_adjustable(scene: Scene, name: str) -> bool:
-    """True if the scene has that parameter, it is not 0, and no other parameter overrides it, such as a rotor's
-    `stiffness_terms`."""
+    """Return True if the scene has this parameter, if it is not 0, and if no other parameter, such as `stiffness_terms` of a
+    rotor, replaces it."""
     part, _, field = name.partition(".")
     owner = getattr(scene, part)
     value = getattr(owner, field, None)
@@ -123,7 +123,7 @@ def _is_adjustable(scene: Scene, name: str) -> bool:
 
 
 def _has_equal_loads(scene: Scene) -> bool:
-    """True if all loads have equal parameters and no load has its own station, so that the number of loads can change."""
+    """Return True if all loads have equal parameters and one station, so that the number of loads can be changed."""
     return scene.mounting.at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 

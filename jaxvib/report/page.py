@@ -129,7 +129,7 @@ def units_of(result: eqx.Module) -> dict[str, str]:
 
 
 def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
-    """Replace a unit such as "m or rad" by the unit of the machine's coordinates if all of them have the same."""
+    """Replace a unit such as "m or rad" by the unit of the machine's coordinates if all coordinates have the same unit."""
     alike = set(scene.machine.structure().units)
     choice = 0 if alike == {"m"} else 1 if alike == {"rad"} else None
     return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}

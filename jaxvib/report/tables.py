@@ -43,7 +43,7 @@ def escaped(text: object) -> str:
 def in_display_units(document: Mapping[str, Plain], units: Units) -> tuple[Mapping[str, Plain], Units]:
     """Return a document whose numbers are in display units, and these units.
 
-    One name has one unit: its largest number in the whole document decides, whether in a list or in the rows of a table.
+    Each name has one unit, which is chosen by the largest value of this name in the document, in lists and in rows of tables.
 
     >>> in_display_units({"omega": 10.0, "jams": [{"amplitude": [0.002]}]}, {"omega": "rad/s", "amplitude": "m"})
     ({'omega': 95.49296585513721, 'jams': [{'amplitude': [2.0]}]}, {'omega': 'rpm', 'amplitude': 'mm'})
@@ -128,7 +128,7 @@ def _words(name: str) -> str:
 
 
 def _plain(value: Plain) -> bool:
-    """True if a value fits into one cell."""
+    """Return True if a value fits into one cell."""
     if isinstance(value, list):
         return len(value) <= _MAX_INLINE_ENTRIES and all(not isinstance(x, (list, dict)) for x in value)
     return not isinstance(value, dict)

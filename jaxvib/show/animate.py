@@ -25,7 +25,7 @@ from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.units import Number, number
 
 _TURN = 0.42
-"""Largest rotation between pictures, turns. Near half a turn, the rotor seems to turn at another speed or backward."""
+"""Largest rotation between two pictures, turns. Near half a turn, the rotor appears to turn at another speed or backward."""
 
 _TURNS_PER_PICTURE = 0.09
 """Default rotation between pictures, turns of the rotor."""
@@ -60,7 +60,7 @@ def animate(
 
     **Arguments**
 
-    - `motion`: a `Run`, or an `Orbit` with the `scene` that it belongs to
+    - `motion`: a `Run`, or an `Orbit` together with its `scene`
     - `path` of the file: a GIF (".gif") or one HTML page with embedded pictures (".html"); None writes no file
     - `begin`, `end`: the part that is shown, s or text; default: the last four periods of a run, or four periods of an orbit
     - `seconds`: duration of the film; typical: 5 to 10; default: the rotor turns by about a tenth of a turn between pictures
@@ -184,7 +184,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     slower = (shown.time.size / fps) / (shown.time[-1] - shown.time[0])
     note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x as large"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
-    # Texts wider than the picture must not shrink it.
+    # Texts that are wider than the picture must not reduce the size of the drawing.
     for text in stage.texts:
         text.set_in_layout(False)
     cursors = _strips((lower, below), scene, strips)

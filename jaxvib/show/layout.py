@@ -25,7 +25,7 @@ class Tie(NamedTuple):
 
 
 def order_of_ties(ties: list[Tie], levels: int) -> list[int]:
-    """Return an order of the ties from left to right in which few ties cross other platforms, and platforms are drawn short.
+    """Return an order of the ties from left to right for which few ties cross other platforms and platforms are short.
 
     Pairs of ties are swapped until no swap is an improvement.
 

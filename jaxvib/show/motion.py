@@ -79,7 +79,7 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
 
 
 def _stored_states(run: Run, time: np.ndarray) -> Trajectory:
-    """Return stored states of a run that cover these times: the dense ones of its window if they do."""
+    """Return stored states of a run that include these times: those of its window if it includes them."""
     slack = 1e-9 * max(float(run.window.time[-1]), 1e-300)
     kept = [run.window, *([] if run.trajectory is None else [run.trajectory])]
     for states in kept:

@@ -22,7 +22,7 @@ _SECONDS = 1.6
 def moving(scene: Scene, jam: Jam) -> str:
     """Return the sketch of a scene that moves in a jam mode, with the forces on the foundation as arrows.
 
-    The rotor turns faster than the loads, at its own speed. Loads that stay together are drawn at the same place.
+    The rotor turns at its own speed, faster than the loads. Coincident loads are drawn at the same place.
 
     **Arguments**: `scene` of platforms, and a `jam` of it, from `jam_modes`.
 
@@ -65,7 +65,7 @@ def moving(scene: Scene, jam: Jam) -> str:
 
 
 def still(scene: Scene) -> str:
-    """Return the sketch of a scene at rest as the text of an SVG file, in a fraction of the time of `jaxvib.sketch`.
+    """Return the sketch of a scene at rest as the text of an SVG file; this is much faster than `jaxvib.sketch`.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES

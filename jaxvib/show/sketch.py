@@ -38,7 +38,7 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
 
     **Returns** a matplotlib figure, or the given `ax`.
 
-    **Raises** `InputError` for an argument that is not a scene, a scene with traced numbers (within `jit` or `grad`), or a
+    **Raises** `InputError` for an argument that is not a scene, a scene with traced values (within `jit` or `grad`), or a
     `deck` on a machine without points (x, y).
 
     >>> import jaxvib as jv

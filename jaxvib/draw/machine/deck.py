@@ -1,4 +1,4 @@
-"""Ellipses of the points of a deck at their places."""
+"""Ellipses of the points of a deck, drawn at the positions of the points."""
 
 from __future__ import annotations
 

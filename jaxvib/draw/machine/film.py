@@ -115,7 +115,7 @@ class Film(FuncAnimation):
         colours, often = np.unique(np.asarray(strip).reshape(-1, 3), axis=0, return_counts=True)
         chosen: list[np.ndarray] = []
         for colour in colours[np.argsort(-often, kind="stable")].astype(int):
-            # Colours close to one in the palette would only displace other colours.
+            # A colour that is close to one in the palette would only take the place of another colour.
             if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _MIN_COLOR_DIFFERENCE for other in chosen):
                 chosen.append(colour)
         palette = Image.new("P", (1, 1))
