@@ -176,7 +176,7 @@ def test_growth_starts_as_far_apart_as_asked(monkeypatch):
         with pytest.raises(jv.ComputationError, match="no more"):
             jv.growth(s, 10.0, separation=separation)
     np.testing.assert_allclose(np.degrees(starts), [1.0, 10.0, 0.0], atol=1e-12)
-    with pytest.raises(jv.InputError, match="which is only for named starts"):
+    with pytest.raises(jv.InputError, match="it is used only with named starts"):
         jv.growth(s, 10.0, start=jv.initial_state(s), separation=0.0)
 
 

@@ -72,7 +72,7 @@ def test_starts_that_cannot_be_say_what_else_to_start_from():
             "start is 'jam', but effects cubic_support and stop are not included in this function (term SupportForce); "
             "start at 'rest', or from a State"
         )
-    with pytest.raises(jv.InputError, match=r"separation is 0\.1, which is only for named starts"):
+    with pytest.raises(jv.InputError, match=r"separation is 0\.1; it is used only with named starts"):
         jv.simulate(scene(), 1.0, start=jv.initial_state(scene()), separation=0.1)
     np.testing.assert_allclose(jv.initial_state(scene(), separation="3 deg").azimuth, -np.pi / 2 + np.deg2rad([-3.0, 0.0, 3.0]))
 
