@@ -99,6 +99,7 @@ from jaxvib.motion.analysis.spectrum import Spectrum
 from jaxvib.motion.ensemble import Ensemble, ensemble
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.envelope.result import Envelope, EnvelopeStatus
+from jaxvib.motion.envelope.run_up import MotorRunUp, MotorRunUpStatus, run_up
 from jaxvib.motion.growth import Growth, GrowthStatus, growth
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
@@ -292,6 +293,7 @@ __all__ = [
     "simulate",
     "settle",
     "envelope",
+    "run_up",
     "ensemble",
     "run_ups",
     "regime",
@@ -302,6 +304,8 @@ __all__ = [
     "RunStatus",
     "Envelope",
     "EnvelopeStatus",
+    "MotorRunUp",
+    "MotorRunUpStatus",
     "Ensemble",
     "Regime",
     "RegimeName",

@@ -132,6 +132,7 @@ RESULTS = {
     "Regime": lambda: RESULTS["Run"]().regime,
     "Ensemble": lambda: jv.ensemble(at_speed, jnp.linspace(40.0, 80.0, 3), 1.0, stepsize_controller=jv.EqualSteps(64)),
     "Envelope": lambda: jv.envelope(SCENE, 2.0, samples=16),
+    "MotorRunUp": lambda: jv.run_up(SCREEN, 2.0),
     "JamModes": cached(lambda: jv.jam_modes(SCENE)),
     "Jam": lambda: RESULTS["JamModes"]().select(1),
     "Branches": lambda: jv.branches(SCENE, points=50),
@@ -192,7 +193,7 @@ RESULTS = {
 }
 
 # fmt: off
-SEVERAL_PANELS = ["Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
+SEVERAL_PANELS = ["Run", "Envelope", "MotorRunUp", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
                   "BalancedStates", "Swing", "Identified", "MachineFit", "RunUps", "Audit", "SynchronousRegimes",
                   "SynchronousOrbit"]
 # fmt: on

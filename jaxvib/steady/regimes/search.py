@@ -21,7 +21,7 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
-from jaxvib.steady.regimes.local import regime_growth, slopes_of, vibration_scale
+from jaxvib.steady.regimes.local import slopes_of, vibration_scale
 from jaxvib.steady.regimes.symmetry import Exchange, distinct_regimes, exchanges_of
 
 _EVEN_SPEEDS, _NEAR_SPEEDS = 200, 40
@@ -35,12 +35,6 @@ _STARTS_PER_PROGRAM = 256
 
 _MAX_ROUNDS = 3
 """Number of times that exchanged phases of known regimes are used as starts."""
-
-_EVEN_PHASES = 8
-"""Number of phases of the second mass from which `most_stable` starts."""
-
-_NEAR_WORKING_SPEED = 0.99
-"""Speed from which `most_stable` starts, relative to the largest working speed of a drive."""
 
 _ITERATIONS = 60
 """Maximum number of steps of Newton's method."""
@@ -155,23 +149,6 @@ def _with_fixed(sets: np.ndarray, free: np.ndarray, count: int, dtype: np.dtype)
     phases = np.zeros((len(sets), count), dtype)
     phases[:, free] = sets
     return phases
-
-
-def most_stable(balance: TorqueBalance) -> tuple[Array, Array]:
-    """Return the speed, rad/s, and the phases (count,) of the regime with the smallest growth rate.
-
-    Newton's method starts near the working speed from regular sets of phases.
-    """
-    prescribed = balance.is_prescribed
-    free = _free_phases(prescribed)
-    even = 2.0 * np.pi / _EVEN_PHASES * np.arange(_EVEN_PHASES)[:, None]
-    sets = _with_fixed(even if free.size == 1 else _regular_sets(free.size), free, prescribed.size, balance.unbalance.dtype)
-    omega, phases, neutral, good = jax.vmap(lambda a: solve_near(_NEAR_WORKING_SPEED * balance.speed, a, balance))(
-        jnp.asarray(sets)
-    )
-    growth = jax.vmap(lambda *at: regime_growth(balance, *at))(omega, phases, neutral)
-    best = jnp.argmin(jnp.where(good & jnp.isfinite(growth), growth, jnp.inf))
-    return omega[best], phases[best]
 
 
 def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -47,7 +47,7 @@ from jaxvib.steady.regimes.local import (
     slopes_of,
     vibration_scale,
 )
-from jaxvib.steady.regimes.search import all_regimes, is_balanced, most_stable
+from jaxvib.steady.regimes.search import all_regimes, is_balanced
 from jaxvib.units import Number, number, numbers
 from jaxvib.units.known import when_known
 
@@ -280,18 +280,6 @@ def _regimes_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
 
 @cached
 def _regime_near(scene: Scene, omega: Array, phases: Array) -> SynchronousRegime:
-    return SynchronousRegime(**_numbers_near(scene, omega, phases), scene=scene)
-
-
-@cached
-def most_stable_regime(scene: Scene) -> SynchronousRegime:
-    """Return the synchronous regime with the smallest growth rate among those near the working speed of the drives.
-
-    It is a function of the scene by a fixed number of operations, for searches over many machines; `synchronous_regimes` finds
-    all regimes. The status is `not_converged` if there is none.
-    """
-    require_rotating_masses(scene)
-    omega, phases = most_stable(jax.lax.stop_gradient(assemble_torque_balance(scene)))
     return SynchronousRegime(**_numbers_near(scene, omega, phases), scene=scene)
 
 

@@ -1,0 +1,224 @@
+"""Run-up of motors from rest: resonances that catch exciters, peaks on the way, and the weakest motors that pass."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.display import quantity_text, speed_text
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.errors import InputError
+from jaxvib.machine.drives.drive import Motor
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
+from jaxvib.motion.envelope.envelope import envelope
+from jaxvib.motion.envelope.result import Envelope
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
+from jaxvib.results.status import member, status_name
+from jaxvib.steady.outcome import REFUSED
+from jaxvib.units import Number, number
+
+if TYPE_CHECKING:
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
+
+_BELOW_RESONANCE = 1.05
+"""Speed relative to a natural frequency up to which an exciter has not passed it; exciters are caught slightly below."""
+
+_WORKING_SHARE = 0.95
+"""Largest natural frequency relative to the working speed of a motor that counts as a resonance on the way."""
+
+_SAMPLES = 4096
+"""Number of stored times of a run-up, from which peaks are read."""
+
+_LARGEST_FACTOR, _BISECTIONS = 64.0, 10
+"""Largest factor of the torques in the search for the weakest motors, and largest number of its bisections."""
+
+
+class MotorRunUpStatus(eqx.Enumeration):
+    """Outcomes of a run-up. The value of each member is the message shown to the user."""
+
+    passed = "all exciters pass all resonances below their working speeds"
+    caught = "a resonance catches an exciter"
+    not_turning = "an exciter does not turn: its motor cannot lift its unbalance against gravity, or turns it too slowly"
+    not_finished = "the averaged run did not reach its end"
+    refused = REFUSED
+
+
+class MotorRunUp(Result):
+    """Run-up of motors from rest.
+
+    Returned by `run_up`.
+
+    **Attributes**
+
+    - `status`: a `MotorRunUpStatus`
+    - `resonances` (nd,), rad/s: natural frequencies, ascending
+    - `speed` (exciter,), rad/s: mean speed at the end, in the direction of rotation
+    - `caught_at` (exciter,): number of the resonance, from 1, that the exciter does not pass; 0 if it passes all below its
+      working speed
+    - `peak_amplitude` (nd,), m, zero to peak, and `peak_force`, N: largest values on the way
+    - `least_torque`: the factor by which the torques of all motors can be multiplied until one of them does not pass; NaN if it
+      was not requested, and if even motors 64 times as strong do not pass
+    - `run`: the averaged motion, an `Envelope`
+    - `scene`
+    """
+
+    status: MotorRunUpStatus
+    resonances: Array = eqx.field(metadata=in_unit("rad/s", "coordinate"))
+    speed: Array = eqx.field(metadata=in_unit("rad/s", "exciter"))
+    caught_at: Array = eqx.field(metadata=in_unit("", "exciter"))
+    peak_amplitude: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))
+    peak_force: Array = eqx.field(metadata=in_unit("N"))
+    least_torque: Array = eqx.field(metadata=in_unit(""))
+    run: Envelope = eqx.field(metadata=part(prefix="run_"))
+    scene: Scene = eqx.field(metadata=SCENE)
+
+    def summary(self) -> str:
+        """Return the outcome as text: a line for each exciter, the peaks and the weakest motors."""
+        lines = [self.message]
+        for k, (speed, caught) in enumerate(zip(np.asarray(self.speed), np.asarray(self.caught_at).tolist(), strict=True)):
+            at = f", caught by resonance {caught} at {speed_text(self.resonances[caught - 1])}" if caught else ""
+            lines.append(f"  exciter {k}: {speed_text(speed)}{at}")
+        structure = self.scene.machine.structure()
+        named = zip(structure.coordinates, self.peak_amplitude, structure.units, strict=True)
+        peaks = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in named)
+        lines.append(f"  peaks on the way: {peaks}; foundation force {quantity_text(self.peak_force, 'N', 4)}")
+        if np.isfinite(self.least_torque):
+            lines.append(f"  all pass with torques of at least {float(self.least_torque):.3g} times those of the motors")
+        return "\n".join(lines)
+
+    @validated
+    def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
+        """Plot the histories of the run-up. **Arguments**: `unit` and `ax` as `Run.plot`."""
+        return self.run.plot(unit=unit, ax=ax)
+
+
+class _Scaled(Motor):
+    """Motor whose torque is that of another one times a factor."""
+
+    motor: Motor
+    factor: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, motor: Motor, factor: Array):
+        self.motor, self.factor, self.kind = motor, factor, "scaled"
+
+    @property
+    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.motor.speed
+
+    @property
+    def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.motor.inertia
+
+    def torque(self, speed: Array) -> Array:
+        return self.factor * self.motor.torque(speed)
+
+    def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
+        return self.factor * self.motor.torque_at(t, speed, states)
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        return self.motor.jump_ts()
+
+
+@validated
+def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
+    """Run the motors of a scene up from rest by the averaged equations, and name the resonances that catch exciters.
+
+    An exciter is caught by the lowest natural frequency below 0.95 of its working speed that its speed at the end does not
+    exceed by 5 %.
+
+    **Arguments**
+
+    - `scene` as for `envelope`, with at least one motor
+    - `until`, s or text: end of the run, after which an exciter that has not passed counts as caught; typical: 5 to 60
+    - `least`: True to search for `least_torque` by bisection, in about 16 runs, to 1 %. A motor that passes is assumed to pass
+      with more torque
+
+    **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between capture and
+    passage use `simulate`.
+
+    **Raises** `InputError` for a scene without a motor and as `envelope`. A run that fails has a status.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> springs = [jv.support(at=(x, 0.0), stiffness=(3e4, 3e4), damping=(300.0, 300.0)) for x in (-0.6, 0.6)]
+    >>> screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    >>> weak = jv.DCMotor(100.0, stall_torque=0.6, inertia=0.5)
+    >>> found = jv.run_up(jv.Scene(screen, exciters=[jv.Exciter(drive=weak, unbalance=0.4)]), "90 s")
+    >>> found.status_name, found.caught_at.tolist(), round(float(found.resonances[0]), 1), round(float(found.speed[0]))
+    ('caught', [1], 14.1, 14)
+
+    Source: I. I. Blekhman, Vibrational Mechanics, 2000; the criterion is ours.
+    """
+    scene = validate_scene(scene)
+    if all(exciter.drive.ideal for exciter in scene.exciters):
+        raise InputError("scene", "has no motor; a run-up needs a drive of limited power, for example InductionMotor(...)")
+    end = number(until, "s", "until", low=0.0, open_low=True)
+    resonances = np.sort(np.asarray(natural_frequencies(scene)))
+    run = envelope(scene, end, samples=_SAMPLES, throw=False)
+    speed, caught, status = _judgement(scene, run, resonances)
+    kept = run.trajectory
+    assert kept is not None
+    force = np.sqrt(np.sum(np.asarray(kept.foundation_force) ** 2, axis=1))
+    factor = _least_torque(scene, end, resonances, passed=status == "passed") if least else np.nan
+    return MotorRunUp(
+        status=member(MotorRunUpStatus, status),
+        resonances=jnp.asarray(resonances),
+        speed=jnp.asarray(speed),
+        caught_at=jnp.asarray(caught),
+        peak_amplitude=jnp.max(kept.amplitude, axis=0),
+        peak_force=jnp.asarray(np.max(force)),
+        least_torque=jnp.asarray(factor, resonances.dtype),
+        run=run,
+        scene=scene,
+    )
+
+
+def _judgement(scene: Scene, run: Envelope, resonances: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return the speed of each exciter, the number of the resonance that catches it, and the name of the status."""
+    directions = np.array([exciter.direction for exciter in scene.exciters])
+    speed = directions * np.array([float(np.mean(np.asarray(n))) for n in run.window.rotor_speeds])
+    caught = np.zeros(len(speed), int)
+    for k, exciter in enumerate(scene.exciters):
+        on_the_way = resonances < _WORKING_SHARE * float(exciter.drive.speed)
+        missed = np.flatnonzero(on_the_way & ~(speed[k] > _BELOW_RESONANCE * resonances))
+        caught[k] = 0 if exciter.drive.ideal or missed.size == 0 else missed[0] + 1
+    name = status_name(run.status)
+    if name == "not_turning":
+        return speed, caught, "not_turning"
+    if name not in ("done", "unstable", "would_separate"):
+        return speed, caught, "not_finished"
+    return speed, caught, "caught" if np.any(caught) else "passed"
+
+
+def _least_torque(scene: Scene, end: Array, resonances: np.ndarray, *, passed: bool) -> float:
+    """Return the smallest factor of all torques with which all exciters pass, by bisection of its logarithm."""
+    motors = [k for k, exciter in enumerate(scene.exciters) if not exciter.drive.ideal]
+
+    def passes(factor: float) -> bool:
+        drives = [_Scaled(cast(Motor, scene.exciters[k].drive), jnp.asarray(factor, resonances.dtype)) for k in motors]
+        scaled = eqx.tree_at(lambda s: [s.exciters[k].drive for k in motors], scene, drives)
+        return _judgement(scaled, envelope(scaled, end, save="window", throw=False), resonances)[2] == "passed"
+
+    step = 0.5 if passed else 2.0
+    last, new = 1.0, step
+    while passes(new) == passed:
+        last, new = new, new * step
+        if not 1.0 / _LARGEST_FACTOR <= new <= _LARGEST_FACTOR:
+            return last if passed else np.nan
+    low, high = min(last, new), max(last, new)
+    for _ in range(_BISECTIONS):
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if passes(middle) else (middle, high)
+        if high / low < 1.01:
+            break
+    return high
