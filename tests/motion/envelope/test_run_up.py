@@ -36,7 +36,7 @@ def test_weak_motor_is_caught_below_the_resonance():
     assert "caught by resonance 1" in found.summary()
 
 
-def test_least_torque_separates_capture_from_passage_in_simulation():
+def test_least_torque_separates_capture_from_passage():
     found = jv.run_up(central(5.0), 60.0, least=True)
     assert found.status_name == "passed" and found.caught_at.tolist() == [0]
     ends = [jv.simulate(central(5.0 * float(found.least_torque) * x), 60.0, save="window") for x in (0.9, 1.1)]
