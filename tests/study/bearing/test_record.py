@@ -100,7 +100,7 @@ def test_wrong_records(tmp_path):
         jv.identify(ROD, jv.Record(t, 0.01 * t))
     with pytest.raises(jv.InputError, match=r"has \d samples about the turning point at .* s; 5 are needed"):
         jv.identify(ROD, jv.Record(t, 0.1 * np.cos(np.pi * t / 3.0)))
-    with pytest.raises(jv.InputError, match=r"record is .*; it must be a Record"):
+    with pytest.raises(jv.InputError, match=r"records\[0\] is .*; it must be a MeasuredRun"):
         jv.identify(ROD, (t, t))
     with pytest.raises(jv.InputError, match=r"instrument is 2.0; the relative uncertainty of J"):
         jv.identify(ROD, jv.Record(t, 0.01 * t), instrument=2.0)
