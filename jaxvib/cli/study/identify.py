@@ -100,7 +100,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
         rows.append(_row("frequency of small swings, rad/s", found.frequency))
         rows.append(_row("recorded angle at the hanging position, rad", found.offset))
         holds = found.status_name in ("found", "undetermined")
-        meaning = "intervals are for a confidence of 95 %" if holds else "intervals include noise only"
+        meaning = "intervals are for a confidence of 95 %" if holds else "intervals do not include the error of the law"
         lines = [
             f"{swing.name}: {swing.samples} samples, noise {found.noise:.3g} rad",
             f"{found.status_name}: {found.message}",

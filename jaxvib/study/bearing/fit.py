@@ -42,11 +42,12 @@ class Unknowns(NamedTuple):
 
 class Fit(NamedTuple):
     """Result of a fit: the `unknowns`; their `covariance` (p, p), in their order, from the Fisher information with the
-    estimated noise; `residual` (n,) rad, fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s;
-    `converged`."""
+    estimated noise if it is white; `slopes` (n, p), derivatives of the fitted angles; `residual` (n,) rad, fit minus record;
+    `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
 
     unknowns: Unknowns
     covariance: Array
+    slopes: Array
     residual: Array
     noise: Array
     stopped_at: Array
@@ -139,6 +140,7 @@ def fit_swing(
     return Fit(
         unknowns=unravel(first + unit * x),
         covariance=covariance,
+        slopes=size * jacobian / unit[None],
         residual=fitted - angle,
         noise=jnp.sqrt(variance),
         stopped_at=stopped_at,

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.numerics.noise import colored_covariance
 from jaxvib.results.estimate import Estimate, interval, shown, student_quantile
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -46,7 +47,7 @@ class IdentifyStatus(eqx.Enumeration):
     """Outcomes of a fit. The value of each member is the message shown to the user."""
 
     found = "the fit explains the record up to noise"
-    patterned = "the residuals of the fit are not noise: the friction law is incomplete and the intervals are wrong"
+    patterned = "the residuals of the fit are not noise: the friction law is incomplete, and its numbers depend on the swing"
     negative = "a coefficient of friction is below 0: the swing grows, or its decay does not follow this law"
     contradicted = "the period contradicts the length and inertia of the pendulum, and mu1 is proportional to them"
     undetermined = "the record does not determine the friction: it is too short, too noisy, or has swings of one amplitude only"
@@ -190,16 +191,18 @@ def _interpret_fit(
 ) -> Identified:
     """Return the fit with intervals, a status and notes."""
     values = [float(v) for v in jax.tree.leaves(fit.unknowns)]
-    covariance = np.asarray(fit.covariance)
-    errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     used = record.time <= until
+    slopes, residuals = np.asarray(fit.slopes)[used], np.asarray(fit.residual)[used]
+    # A fit that failed may have derivatives that are not finite; its status says so.
+    usable = np.all(np.isfinite(slopes)) and np.all(np.isfinite(np.asarray(fit.covariance))) and np.any(residuals)
+    covariance = colored_covariance(slopes, residuals) if usable else np.asarray(fit.covariance)
+    errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     samples = int(np.count_nonzero(used))
     quantile = student_quantile(samples - len(values))
     plain = [interval(v, float(e), quantile, 0.0) for v, e in zip(values, errors, strict=True)]
     angle, rate, offset, frequency = plain[:4]
     viscous, *more = (interval(v, float(e), quantile, instrument) for v, e in zip(values[4:], errors[4:], strict=True))
     dry = more[0] if more else None
-    residuals = np.asarray(fit.residual)[used]
     pattern = float(np.sum(residuals[1:] * residuals[:-1]) / np.sum(residuals**2)) if np.any(residuals) else 0.0
     structure, chance = _structure(record.time[used], residuals, turns, len(values))
     correlation = float(covariance[4, 5] / (errors[4] * errors[5])) if dry is not None else math.nan
@@ -270,9 +273,9 @@ def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
     if math.isfinite(found.stopped_at):
         yield f"dry friction stops the pendulum at {found.stopped_at:.4g} s"
     if np.any(found.record.time > found.until):
-        yield f"the record after {found.until:.4g} s is residuals out: the pendulum rests, or its swing is below the noise"
+        yield f"the record after {found.until:.4g} s is left out: the pendulum rests, or its swing is below the noise"
     if is_patterned:
-        yield "the residuals of the fit are not noise: the intervals include noise only and are too narrow"
+        yield "the residuals of the fit are not noise: the intervals include their correlation, but not the error of the law"
     if decrement is not None and decrement.is_drifting:
         yield "the formula of ten periods assumes viscous friction only: here its interval does not contain mu1"
 
