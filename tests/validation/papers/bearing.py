@@ -137,8 +137,8 @@ NUMBERS = (
         _share_of_gravity,
         within=0.5,
         unit="%",
-        note=f"an upper bound, printed without a speed; computed at the slowest published jam, {_JAM} rad/s; the bound is "
-        f"reached at {math.sqrt(9.81 / (0.005 * _LENGTH)):.1f} rad/s",
+        note=f"the paper prints an upper limit, without a speed; at the slowest published jam, {_JAM} rad/s, the change is "
+        f"below it; the limit is reached at {math.sqrt(9.81 / (0.005 * _LENGTH)):.1f} rad/s",
     ),
     _measured("scatter of 20 measurements", 2.1, reason="the twenty measurements are not printed"),
     _measured(

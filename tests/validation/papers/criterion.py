@@ -153,7 +153,7 @@ NUMBERS = (
         note="n1 = 0.7, n2 = 0.5, n12 = 0.6, rho = 1.4, h = 0.03, 0.02, h12 = 0.04, q = 0.8",
     ),
     _two(
-        "after (38), f(0)",
+        "after (38)",
         "f(0)",
         lambda: _static()[2] * _static()[0],
         lambda: math.prod(_two_speeds()) ** 2,

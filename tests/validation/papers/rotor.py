@@ -164,7 +164,9 @@ NUMBERS = (
         )
         for k, differs in ((0, 176.51), (1, 272.81))
     ),
-    _number("section IV", "mean distance a", 0.265, _mean_distance, within=5e-4, unit="m"),
+    _number(
+        "section IV", "mean distance a of the pendulums from the centre of mass", 0.265, _mean_distance, within=5e-4, unit="m"
+    ),
     _number(
         "section IV",
         "b3",
@@ -176,7 +178,8 @@ NUMBERS = (
         misprint=Misprint(
             "10.41 N m s",
             "21.56 N m s",
-            "damping matrix of the two dampers that b1 and b2 imply",
+            "sum of b L^2 over the two dampers, whose coefficients b follow from b1 (their sum) and b2 (their sum weighted "
+            "with +L1 and -L2)",
             _DAMPER_1 * _L1**2 + _DAMPER_2 * _L2**2,
         ),
     ),

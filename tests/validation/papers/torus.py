@@ -140,7 +140,8 @@ _CHAOTIC = {
         0.010,
         4e-5,
         5.1,
-    ): "chaotic: single failures among captures up to -0.87, at other speeds with another number of steps",
+    ): "chaotic: isolated failures among the captures, up to the speed -0.87; with another number of steps they occur at "
+    "other speeds",
 }
 """Damping, stiffness, friction and gap of entries whose computed speed is not certain, and the reason."""
 
@@ -190,7 +191,7 @@ NUMBERS = (
     ),
     _formula(
         "(8), (9), last terms",
-        "unbalance in the equation of a of ball 1",
+        "unbalance in the equation of the angle a of ball 1",
         lambda: _pull(printed_torus),
         _own_pull,
         within=1e-6,
@@ -201,14 +202,14 @@ NUMBERS = (
     ),
     _formula(
         "(8), (9), friction",
-        "friction in the equation of a, per normal force",
+        "friction in the equation of the angle a, per unit normal force",
         lambda: _braking(printed_torus),
         _own_braking,
         within=6.0,
         unit="1/m",
         note="the bound is 2 %, because the rotor responds to the friction too",
         misprint=Misprint(
-            "lever arm R1 (it reproduces the tables more closely)",
+            "lever arm R1 (with it the tables of the paper are reproduced more closely)",
             "lever arm R1 - r",
             "the same equations, with and without rolling friction",
             lambda: _braking(gap_torus),
