@@ -116,7 +116,7 @@ def batches(quick: bool) -> None:
     print(f"\n{BATCH_SIZE} runs together, 10 numbers, the step looped over its stages")
     make = lambda: runs(s, apart(s), 20 if quick else 200, 1e-3, BATCH_SIZE)  # noqa: E731
     base = row("as it is", make())
-    with mock.patch.object(dopri8_loop, "_advanced", dopri8_loop._advance):
+    with mock.patch.object(dopri8_loop, "_advance_batch_last", dopri8_loop._advance):
         row("batch_last: as vmap lays it out", make(), base)
 
 

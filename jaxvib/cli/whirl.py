@@ -17,9 +17,13 @@ if TYPE_CHECKING:
 
 @app.command("whirl")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--speed", type=SPEED_TYPE, help="Rotor speed, such as '3000 rpm' [the drive's].")
+@click.option("--speed", type=SPEED_TYPE, help="Rotor speed, such as '3000 rpm' [the speed of the drive].")
 @click.option(
-    "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Include the masses of the loads."
+    "--loads",
+    type=click.Choice(["fixed", "none"]),
+    default="fixed",
+    show_default=True,
+    help="'fixed': the masses of the loads are fixed to the rotor; 'none': without the loads.",
 )
 @CSV
 @shared

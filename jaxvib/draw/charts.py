@@ -52,15 +52,15 @@ def branch_diagram(
 
     Stable parts are solid lines, unstable parts dashed. If there are more than two coordinates, each has a separate panel.
 
-    **Arguments** (np points, nd coordinates)
+    **Arguments** (n points, nd coordinates)
 
-    - `rotor_speed` (np,), `omega` (np,): rotor speed and load speed, rad/s, drawn in `unit`
-    - `stable` (np,): stability; `judged` states the criterion below the figure
-    - `amplitude` (np, nd): amplitudes, m, drawn in mm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units` None:
+    - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
+    - `stable` (n,): stability; `judged` states the criterion below the figure
+    - `amplitude` (n, nd): amplitudes, m, drawn in mm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units` None:
       all m
-    - `force` (np,): foundation force, N
+    - `force` (n,): foundation force, N
     - `resonances`: resonances, rad/s, drawn as horizontal lines
-    - `modes` (np,): numbers of the jam modes, written at the line of `at`
+    - `modes` (n,): numbers of the jam modes, written at the line of `at`
     - `marks`: points, each (label, rotor speeds, load speeds), rad/s
     - `names` (nd,): names of the coordinates
     - `at`: operating speed, rad/s, drawn as a vertical line

@@ -1,4 +1,4 @@
-"""Charts of recordings, and of records and the models fitted to them."""
+"""Charts of recorded runs of a machine, of the recorded swing of a pendulum, and of the models fitted to them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from jaxvib.display import speed_unit
 from jaxvib.draw.style import COLORS, GUIDE, Drawn, Onto, legend_above, panels
 
 
-def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:
+def swing_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:
     """Draw the recorded and the fitted angle over time, and their difference in a second panel, in degrees.
 
     `time` (n,) is in s, `angle` and `fitted` (n,) are in rad. The difference, fit minus record, is compared with twice the
     `noise`, rad.
 
     >>> import numpy as np
-    >>> len(record_chart(np.arange(3.0), np.zeros(3), np.ones(3), 0.1).axes)
+    >>> len(swing_chart(np.arange(3.0), np.zeros(3), np.ones(3), 0.1).axes)
     2
     """
     degrees = 180.0 / np.pi

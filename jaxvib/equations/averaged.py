@@ -19,7 +19,8 @@ that turn with theta. The averaged equation keeps the slow part of this product 
 Only a_j, the forward circular part of the acceleration at the load, drives the load; the backward part averages to zero. All
 loads at one port have the same a. For loads at different stations s_j, B_j = B + s_j T and a_j = a_1 + s_j a_2. A contains w_j'
 (the reaction of the loads); therefore a, or (a_1, a_2), is the solution of a linear system. With the levers g_j = 1 or
-(1, s_j), P = e^H B M^-1 B^T e of those one or two rows, h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j, the system is
+(1, s_j), P = e^H B M^-1 B^T e (with stations a 2 x 2 matrix, from B and T), h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j,
+the system is
 
     (1 - P sum_j h_j g_j g_j^T) a + P sum_j h_j e^{2 i psi_j} g_j g_j^T conj(a)
         = - e^H B M^-1 ((C + n G) V + K Y) + P sum_j g_j S_j e^{i psi_j} (w_j^2 - i f_j)
@@ -38,7 +39,7 @@ unbalance gives the torque T(w) in place of that of the drag, and I is the inert
 infinite. All exciters share the amplitudes Y and V. A set of amplitudes Y_k for each exciter, Y_k' = V_k - i w_k Y_k,
 describes the same motion with Y = sum_k Y_k e^{i psi_k}, because the equations are linear in them. The equations are therefore
 valid for exciters of different speeds too: Y then beats at the differences of the speeds. The rotation of a housing with the
-machine, which changes the torque of a motor by -T'(w) c q', is neglected.
+machine, which changes the torque of a motor by -T'(w) c q' (c q': angular velocity of the housing), is neglected.
 
 Source: the method of averaging, N. N. Bogoliubov, Yu. A. Mitropolsky, Asymptotic Methods in the Theory of Non-linear
 Oscillations, 1961; I. I. Blekhman, Synchronization in Science and Technology, 1988. The averaged equations are (1), (2) of the
@@ -107,8 +108,8 @@ class Averaged(eqx.Module):
     """Averaged equations of a scene for time integration; a pure function of time (s) and `Amplitudes`.
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), where M includes the loads' masses
-    - `port` (levers, np, nd): B and, if loads have stations, T, of each exciter; `input_matrix`: M^-1 times their transposes,
-      (levers, np, nd)
+    - `port` (levers, p, nd): B and, if loads have stations, T, of each exciter, in the p directions of the mount;
+      `input_matrix`: M^-1 times their transposes, (levers, p, nd)
     - `levers` g (levers, count): 1 and, if loads have stations, s_j in m; 0 for the rows of other exciters
     - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s of each rotating mass, all (count,)
     - of each exciter: `drives`; `counts`, the number of its loads, 0 for an unbalance; `directions` of rotation
@@ -138,7 +139,7 @@ class Averaged(eqx.Module):
 
     @property
     def free_shifts(self) -> int:
-        """Number of shifts of phases that change no motion: one of all phases, or one of each prescribed phase."""
+        """Number of zero eigenvalues from shifts of phases: 1 for a common shift, or 1 for each prescribed phase."""
         return max(int(np.sum(self.is_prescribed)), 1)
 
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
@@ -346,7 +347,7 @@ def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: A
 
     - `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The drives have constant speed,
       or their torque is a function of the speed
-    - `neutral`: number of eigenvalues 0 to omit: 1, and one more for each direction of a family of motions
+    - `neutral`: number of zero eigenvalues to omit: 1, and one more for each free parameter of a continuous family of motions
     """
     nd, count = displacement.shape[0], phase.shape[0]
     free = np.flatnonzero(~field.is_prescribed)

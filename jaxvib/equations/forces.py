@@ -35,7 +35,7 @@ from jaxvib.runtime.programs import cached
 
 @validated
 def foundation_force(scene: Scene, state: State) -> Array:
-    """Return the force of all supports on the foundation, gravity excluded, (nb,) N: R = sum_i (k_i y_i + b_i y_i').
+    """Return the force of all supports on the foundation, gravity excluded, N: R = sum_i (k_i y_i + b_i y_i').
 
     **Arguments**
 

@@ -281,8 +281,9 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
 
 
 def rotating_direction(mount: Mount, direction: int = 1) -> Array:
-    """Return e (np,): a point on a unit circle with angle w t, clockwise -w t, moves by Re(e exp(i w t)) in the mount's
-    directions.
+    """Return the rotating direction e, one entry for each direction of the mount.
+
+    A point on a unit circle with angle w t, clockwise -w t, moves by Re(e exp(i w t)).
 
     `direction` is +1 anticlockwise, -1 clockwise.
     """
@@ -290,7 +291,7 @@ def rotating_direction(mount: Mount, direction: int = 1) -> Array:
 
 
 def peak_force(force: Array) -> Array:
-    """Return the root of the sum of the squared peaks in all directions, N, of a force with complex amplitudes (nb,) N."""
+    """Return the root of the sum of the squared peaks in all directions, N, of a force with complex amplitudes, N."""
     return magnitude(force[0]) if force.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(force) ** 2))
 
 

@@ -39,7 +39,7 @@ class Model(eqx.Module):
         return mount
 
     def foundation_force(self, displacement: Array, velocity: Array) -> Array:
-        """Return the force of all supports on the foundation, gravity excluded, (nb,) N."""
+        """Return the force of all supports on the foundation, gravity excluded, N, one entry for each direction."""
         force = self.carrier.foundation_force(displacement, velocity)
         for term, rows in zip(terms_of(self.scene.all_effects, SupportForce), self.supports, strict=True):
             force = force + term.force(rows @ displacement, rows @ velocity)

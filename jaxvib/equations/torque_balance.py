@@ -185,7 +185,8 @@ def can_start(scene: Scene) -> Array:
     gravity = total_gravity(scene.all_effects)
     each = []
     for exciter in scene.exciters:
-        motor = exciter.drive.torque_and_inertia(*(jnp.zeros_like(exciter.drive.speed),) * 2)
+        zero = jnp.zeros_like(exciter.drive.speed)
+        motor = exciter.drive.torque_and_inertia(zero, zero)
         if exciter.unbalance is None or motor is None or 1 not in gravity:
             each.append(jnp.asarray(True))
         else:

@@ -119,8 +119,8 @@ class States(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs that are neither states nor rates: `foundation_force` (nb,) N; `rotors`: for each exciter the angle and the speed
-    of its rotor, None if these are states or inputs."""
+    """Outputs that are neither states nor rates: `foundation_force`, N, one entry for each direction; `rotors`:
+    for each exciter the angle and the speed of its rotor, None if these are states or inputs."""
 
     foundation_force: Any
     rotors: tuple[Any, ...]

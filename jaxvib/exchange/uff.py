@@ -48,7 +48,7 @@ _MAX_BYTES = 2**28
 
 
 class _Node(NamedTuple):
-    """Node of a machine: `number`, `position` (x, y, z) in m, `rows` (np, nd) from coordinates to its displacements."""
+    """Node of a machine: `number`, `position` (x, y, z) in m, `rows`: the matrix from coordinates to its displacements."""
 
     number: int
     position: tuple[float, float, float]

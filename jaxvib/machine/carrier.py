@@ -65,11 +65,11 @@ class Carrier(eqx.Module):
 
     @property
     def foundation_directions(self) -> tuple[str, ...]:
-        """Names of the directions of the force on the foundation, (nb,): "up", or "across" and "up"."""
+        """Names of the directions of the force on the foundation: "up", or "across" and "up"."""
         return ("up",) if self.foundation_stiffness.shape[0] == 1 else ("across", "up")
 
     def foundation_force(self, displacement: Array, velocity: Array) -> Array:
-        """Return the force on the foundation, T_K q + T_C q', (nb,) N, without effects.
+        """Return the force on the foundation, T_K q + T_C q', N, one entry for each direction, without effects.
 
         **Arguments**
 
@@ -126,8 +126,8 @@ class Machine(Part):
         """
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the rows (np, nd) of a point; its displacement is rows q. Exciters, supports, stops and drawings use this
-        method.
+        """Return the matrix (directions, nd) that gives the displacement of a point: rows q. Exciters, supports, stops and
+        drawings use this method.
 
         **Arguments**
 

@@ -57,8 +57,8 @@ class Mount(eqx.Module):
 
     **Attributes**
 
-    - `rows`: arrays (np, nd). The first is a point of the rotor's axis. The second is the tilt of the axis, in 1/m times the
-      unit of a displacement. Machines that do not tilt have the first only
+    - `rows`: arrays (np, nd), which times q give a displacement. The first is that of a point of the rotor's axis. The second
+      is the tilt of the axis, in 1/m times the unit of a displacement. Machines that do not tilt have the first only
     - `axes` (np,): the direction of each row in the plane of the loads (0 across, 1 up)
     - `levers`: a lever (count,) for each entry of `rows`; None stands for 1, an absent entry for 0. `levers` is (None,) if all
       loads run at the first point, and (None, distances from this point in m) if each load has its own station
@@ -85,7 +85,7 @@ class Mount(eqx.Module):
 
     @property
     def tilt(self) -> Array | None:
-        """Rows (np, nd) of the tilt of the axis; None if the axis cannot tilt."""
+        """Matrix (directions, nd) that gives the tilt of the axis from q; None if the axis cannot tilt."""
         return self.rows[1] if len(self.rows) > 1 else None
 
     @property
@@ -99,7 +99,10 @@ class Mount(eqx.Module):
         return len(self.levers) == 1 and self.levers[0] is None
 
     def load_rows(self, count: int) -> Array:
-        """Return the rows of each load's point, (count, np, nd). `count` is the number of loads."""
+        """Return the matrices (count, directions, nd) that give the displacement of each load's point from q.
+
+        `count` is the number of loads.
+        """
         if self.at_one_point:
             return jnp.broadcast_to(self.rows[0], (count, *self.rows[0].shape))
         return jax.vmap(lambda levers: _combine(levers, self.rows))(self.levers)
@@ -116,7 +119,7 @@ class Mount(eqx.Module):
         return dict(zip(self.axes, _combine(levers, moved), strict=True))
 
     def rotor_rows(self) -> Array:
-        """Return the rows of the rotor's mass centre, (np, nd)."""
+        """Return the matrix (directions, nd) that gives the displacement of the rotor's mass centre from q."""
         return _combine(self.rotor_levers, self.rows)
 
     def distances(self, count: int) -> Array:

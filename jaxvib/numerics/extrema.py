@@ -19,10 +19,10 @@ _MIDDLE = (NODES - 1) / 2.0
 
 
 def _hermite() -> tuple[np.ndarray, np.ndarray]:
-    """Matrices (4, 3) and (4, 4) to the even and the odd coefficients, see `_polynomial`.
+    """Return matrices (4, 3) and (4, 4) that give the even and the odd coefficients of `_polynomial`.
 
-    They act on the sums and the differences of two values or two slopes, at -1/2 and 1/2, and at -3/2 and 3/2. The sum of the
-    inner values is omitted, because all values are relative to it.
+    They are multiplied by sums and differences of the values, and of the slopes, at the two inner points (-1/2 and 1/2) and at
+    the two outer points (-3/2 and 3/2). The sum of the inner values is omitted, because all values are relative to it.
     """
     nodes, even = np.asarray([[0.5], [1.5]]), np.asarray([0, 2, 4, 6])
 
@@ -38,8 +38,8 @@ _EVEN, _ODD = _hermite()
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """Locate the extrema of an evenly sampled motion over its first half, its second half and all of it.
 
-    Between two samples the motion is the polynomial p of degree 7 through values and slopes of four samples, where these two
-    are in the middle (at the ends: the outermost four), with the error
+    Between two samples the motion is the polynomial p of degree 7 through the values and slopes of four samples. The two
+    samples are the middle ones of the four; at the ends the outermost four samples are used. The error is
 
         |x - p| <= 0.32 / 8! max |d^8 x/ds^8|        (at the ends 0.88 / 8!)
 

@@ -94,7 +94,7 @@ class LoopDopri8(AbstractDopri8):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Array, Y, _Known]:
         """See `AbstractDopri8.advance`."""
-        advance = multi_tangent_jvp(_advanced, _advance_jvp) if self.tangents else _advanced
+        advance = multi_tangent_jvp(_advance_batch_last, _advance_jvp) if self.tangents else _advance_batch_last
         known = None if made_jump is True else solver_state
         if known is not None and made_jump is not False:
             known = (known[0], jnp.where(made_jump, 0, known[1]))
@@ -147,11 +147,11 @@ def _advance(inputs: _Inputs) -> _Step:
 def _advance_batched(inputs: _Inputs, is_batched: Batched) -> _Step:
     """`_advance` for a batch along a last axis."""
     t0, dt, y0, known, args, terms = inputs
-    t0_too, dt_too, y0_too, known_too, *others_too = is_batched
+    t0_batched, dt_batched, y0_batched, known_batched, *others_batched = is_batched
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
-    flags = flat_tangents((t0_too, dt_too, *others_too), (t0, dt, args, terms))
+    flags = flat_tangents((t0_batched, dt_batched, *others_batched), (t0, dt, args, terms))
     places = [k for k, along in enumerate(flags) if along]
-    like = jax.tree.map(lambda leaf, along: leaf[..., 0] if along else leaf, y0, y0_too)
+    like = jax.tree.map(lambda leaf, along: leaf[..., 0] if along else leaf, y0, y0_batched)
     size = next(leaf.shape[-1] for leaf, along in zip(*map(jax.tree.leaves, (inputs, is_batched)), strict=True) if along)
 
     def whole(tree: PyTree[Array], along: Batched) -> Array:
@@ -159,8 +159,8 @@ def _advance_batched(inputs: _Inputs, is_batched: Batched) -> _Step:
         return ravel(jax.tree.map(spread, tree, along), 1)
 
     if known is not None:
-        # All runs start with the first stage that is missing in one of them.
-        known = (whole(known[0], known_too[0]), jnp.min(known[1]))
+        # All runs start at the earliest stage that any of them still has to compute.
+        known = (whole(known[0], known_batched[0]), jnp.min(known[1]))
 
     def rates(share: RealScalarLike, y: Array) -> Array:
         def rate(y: Y, moving: list[Array]) -> VF:
@@ -171,12 +171,12 @@ def _advance_batched(inputs: _Inputs, is_batched: Batched) -> _Step:
         found = jax.vmap(rate, in_axes=-1, out_axes=-1)(unravel(y, like), [leaves[k] for k in places])
         return ravel(found, 1)
 
-    dt = dt[None, :] if dt_too else dt
-    end, stages, error = _stages(whole(y0, y0_too), known, rates, lambda total: dt * total, dt)
+    dt = dt[None, :] if dt_batched else dt
+    end, stages, error = _stages(whole(y0, y0_batched), known, rates, lambda total: dt * total, dt)
     return unravel(end, like), stages, unravel(error, like)
 
 
-_advanced = batch_last(_advance, _advance_batched)
+_advance_batch_last = batch_last(_advance, _advance_batched)
 
 
 def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:

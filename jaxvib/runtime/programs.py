@@ -83,12 +83,15 @@ class CachedFunction(Generic[P, T]):
             ) from error
 
     def is_ready(self, *args: P.args, **kwargs: P.kwargs) -> bool:
-        """Return True if a call need not wait for a program: it is in memory or cannot be stored, or an argument is traced."""
+        """Return True if a call does not have to load or compile a stored program.
+
+        The program is in memory already, or the call uses none, because it cannot be stored or an argument is traced.
+        """
         leaves, treedef = jax.tree.flatten((args, kwargs))
         return any(map(traced, leaves)) or self.stored.is_ready(leaves, treedef)
 
     def prepare(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Read the program of a call from disk, or else trace it, and compile it without running it."""
+        """Make the program of a call ready without running it: read it from disk, or else trace and compile it."""
         start()
         self.stored.compiled(*jax.tree.flatten((args, kwargs)))
 

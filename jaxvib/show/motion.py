@@ -23,7 +23,7 @@ class Stretch(NamedTuple):
     """Motion at some times.
 
     **Attributes**: `time` (nt,) s; `displacement`, `velocity` (nt, nd); `rotors`, a `RotorPose` for each exciter, whose arrays
-    have a leading axis over the times; `force` on the foundation, (nt, nb) N.
+    have a leading axis over the times; `force` on the foundation, (nt, directions) N.
     """
 
     time: np.ndarray

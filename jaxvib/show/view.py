@@ -89,7 +89,7 @@ class View(abc.ABC):
     def arrows(self, pose: Pose, total: np.ndarray, per_newton: float) -> list[Part]:
         """Return arrows of the forces on the foundation.
 
-        The force of each support is drawn at the support, the `total` (nb,) N in black beside the machine.
+        The force of each support is drawn at the support, the `total`, N, in black beside the machine.
         """
         whole = (0.0, float(total[0])) if total.size == 1 else (float(total[0]), float(total[1]))
         found = [

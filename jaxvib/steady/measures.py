@@ -40,7 +40,7 @@ ZONE_LIMITS = {
 
 _MIN_SLIP = 1e-4
 """Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both
-have a relative rounding error of 1e-12."""
+ways to compute the torque have a relative rounding error of 1e-12."""
 
 
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
@@ -84,7 +84,7 @@ class VibrationMeasures(eqx.Module):
 
     Returned by `vibration_measures`.
 
-    **Attributes** (nd coordinates, supports of the platforms)
+    **Attributes** (nd platforms, each with one coordinate and one support)
 
     - `speed` of the loads, rad/s
     - `stroke` (nd,), m peak to peak; typical: 2 to 20 mm
@@ -184,7 +184,7 @@ def _measures(scene: Scene, omega: Array, displacement: Array, force: Array) -> 
 
 
 def require_platforms(scene: Scene, what: str) -> Platforms:
-    """Return the machine of a scene. **Raises** `InputError` that names `what` needs platforms, for other machines."""
+    """Return the machine of a scene. **Raises** `InputError` for other machines: `what` needs platforms."""
     if not isinstance(scene.machine, Platforms):
         raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}; {what} needs a machine of platforms")
     return scene.machine
@@ -222,7 +222,8 @@ def static_deflections(scene: Scene) -> Array:
     """
     machine = require_platforms(scene, "the deflection")
     model, carried = linear_model(scene), _has_support(machine)
-    # The stiffness matrix of platforms without supports is singular up to rounding: they are fixed here, with the result NaN.
+    # The stiffness matrix of platforms without supports is singular up to rounding. They are attached to the ground here, and
+    # their deflection is replaced by NaN.
     held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
     sag = jnp.linalg.solve(model.carrier.stiffness + held, STANDARD_GRAVITY * jnp.diagonal(model.mass))
     return jnp.where(carried, jnp.abs(sag), jnp.nan)
@@ -243,19 +244,19 @@ def _has_support(machine: Platforms) -> Array:
 def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0) -> Array:
     """Return an estimate of the mean speed of material along a deck that throws it, m/s, positive up the deck.
 
-        G (cos(t + f) - cos t) = -G sin(t) f - f^2/2,    cos t = 1/G, t < 0;
-        v = w/(2 pi) [ x'(t) f/w - (x(t + f) - x(t)) - g sin(slope) (f/w)^2 / 2 ]
+        G (cos(p + f) - cos p) = -G sin(p) f - f^2/2,    cos p = 1/G, p < 0;
+        v = w/(2 pi) [ x'(p) f/w - (x(p + f) - x(p)) - g sin(slope) (f/w)^2 / 2 ]
 
-    A particle leaves the deck when the deck's acceleration reaches that of gravity, at the phase t, flies for the phase f,
+    A particle leaves the deck when the deck's acceleration reaches that of gravity, at the phase p, flies for the phase f,
     lands without rebound and moves with the deck until the next throw. x is the motion along the deck, G the throw number.
-    For a straight line at the angle b to a level deck v = g f^2 / (4 pi w tan b), the formula of
-    handbooks. Real material is slower; typical: 0.7 to 0.9 of it, less in deep or sticky layers.
+    For motion along a straight line at the angle b to a level deck, v = g f^2 / (4 pi w tan b), the formula of handbooks. Real
+    material is slower; typical: 0.7 to 0.9 of v, less in deep or sticky layers.
 
     **Arguments**
 
-    - `amplitude` U (2,), m, complex: amplitudes across and up, u = Re(U e^{i w t})
+    - `amplitude` U (2,), m, complex: amplitudes across (horizontal, along x) and up, u = Re(U e^{i w t})
     - `speed` w, rad/s or text; typical: 75 to 160
-    - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
+    - `slope` of the deck, rad or text, measured anticlockwise from x; typical: "-15 deg" to 0 (the default)
 
     **Returns** the speed, m/s; typical: 0.1 to 0.5. It is 0 for throw numbers of at most 1, at which material only slides, and
     NaN above 3.297, at which a flight is longer than a period.
@@ -283,22 +284,22 @@ def _require_finite(amplitude: np.ndarray) -> None:
 @cached
 def _conveying_speed(amplitude: Array, w: Array, slope: Array) -> Array:
     along = jnp.cos(slope) * amplitude[0] + jnp.sin(slope) * amplitude[1]
-    across = -jnp.sin(slope) * amplitude[0] + jnp.cos(slope) * amplitude[1]
-    size = magnitude(across)
+    normal = -jnp.sin(slope) * amplitude[0] + jnp.cos(slope) * amplitude[1]
+    size = magnitude(normal)
     throw = w**2 * size / (STANDARD_GRAVITY * jnp.cos(slope))
     flies = throw > 1.0
     g = jnp.where(flies, throw, 2.0)
     begin = -jnp.arccos(1.0 / g)
 
     def height(phase: Array) -> Array:
-        """Height of the particle above the deck in units of the amplitude times the throw number, divided by phase^2."""
+        """Height of the particle above the deck, divided by the amplitude, times the throw number, divided by phase^2."""
         return (-g * jnp.sin(begin) * phase - phase**2 / 2.0 - g * (jnp.cos(begin + phase) - jnp.cos(begin))) / phase**2
 
     full = jnp.asarray(2.0 * np.pi, g.dtype)
     lands = height(full) <= 0.0
     flight = bracketed_root(height, jnp.asarray(1e-3, g.dtype), jnp.where(lands, full, 4.0 * full))
-    # The phase of `across` is zero at its highest point.
-    turned = along * jnp.where(flies, jnp.conj(across), 1.0) / jnp.where(flies, size, 1.0)
+    # The phase of `normal` is zero at its highest point.
+    turned = along * jnp.where(flies, jnp.conj(normal), 1.0) / jnp.where(flies, size, 1.0)
 
     def path(phase: Array) -> Array:
         return (turned * jnp.exp(1j * phase)).real

@@ -99,7 +99,7 @@ class Sweep(Result):
             lines.append(f"  {self.damaged} cases were in damaged or incomplete files: {again}")
         if self.computed:
             each = 1e3 * self.seconds / self.computed
-            lines.append(f"  {self.computed} of them in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
+            lines.append(f"  {self.computed} cases were computed in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
         return "\n".join(lines)
 
     @validated
@@ -152,9 +152,9 @@ def sweep(
     - `until`: end of runs, s
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
-    - `chunk`: number of cases that are computed and written together; it is part of the record of the store; typical: the
-      default, about a second of computation. With smaller chunks an interruption loses fewer cases, but there are more file
-      operations
+    - `chunk`: number of cases that are computed and written together; a store is continued only with the same number.
+      Typical: the default, about a second of computation. With smaller chunks an interruption loses fewer cases, but there are
+      more file operations
     - `workers`: number of processes on this machine; or `scheduler`: address of a Dask scheduler ("tcp://10.0.0.1:8786"),
       which must answer within `timeout`, s. Both need the extra `cluster`
     - `report`: a function that is called with a `Progress` after each chunk
@@ -228,10 +228,10 @@ def run_study(
         Store.create(path, new_study)
     kept = Store(path, writable=True)
     with kept.locked():
-        return _summarize_sweep(kept, new_study, begun, workers, scheduler, timeout, report)
+        return _compute_missing(kept, new_study, begun, workers, scheduler, timeout, report)
 
 
-def _summarize_sweep(
+def _compute_missing(
     kept: Store,
     new_study: Study,
     begun: float,
@@ -265,7 +265,7 @@ def _summarize_sweep(
                 kept.write(new_study, chunk, cases)
                 add(int(sizes[chunk]))
     states[:] = ChunkState.finished
-    return _found(kept, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged])))
+    return _sweep_result(kept, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged])))
 
 
 def _cases(new_study: Study, chunk: int) -> int:
@@ -293,10 +293,10 @@ def open_sweep(store: str | Path) -> Sweep:
     states = opened.states()
     damaged = np.flatnonzero(states == ChunkState.damaged)
     cases = sum(math.prod(s.stop - s.start for s in opened.region(int(chunk))) for chunk in damaged)
-    return _found(opened, states, 0, 0.0, cases)
+    return _sweep_result(opened, states, 0, 0.0, cases)
 
 
-def _found(store: Store, states: np.ndarray, computed: int, seconds: float, damaged: int) -> Sweep:
+def _sweep_result(store: Store, states: np.ndarray, computed: int, seconds: float, damaged: int) -> Sweep:
     counts = store.counts(states)
     rows = tuple(CaseCount(name, int(n)) for name, n in zip(CASE_STATUSES, counts, strict=True) if n)
     status = SweepStatus.incomplete if counts[0] else SweepStatus.done

@@ -262,7 +262,7 @@ def jam_speed(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 
 @validated
 def fold_margin(*, mode: int) -> Quantity:
-    """Return the smallest change of the rotor speed, up or down, at which a jam mode ends at a fold, rad/s, to leading order.
+    """Return the smallest change of the rotor speed, up or down, at which a jam mode ends at a fold, rad/s (leading order).
 
         margin = min(n - n_low, n_high - n),    n_low, n_high rotor speeds of the folds that end the mode
 

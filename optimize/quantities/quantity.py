@@ -111,7 +111,7 @@ class Quantity:
 
     @property
     def easy(self) -> Quantity:
-        """Same quantity to leading order and without tolerances, for a first search.
+        """Leading-order quantity of the machine with its nominal parameters, for a first search.
 
         The first search is faster, and its best machines are near the final ones.
         """

@@ -195,7 +195,7 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
 
 
 def _with_requested_modes(problem: Problem, point: Point) -> Point:
-    """Return the designs; a design in which a jam has another than the requested mode number has NaN values."""
+    """Return the designs; the values of a design are NaN if the mode number of one of its jams is not the requested one."""
     if not problem.keys:
         return point
     same = np.ones(len(point.z), bool)

@@ -188,7 +188,7 @@ def solve_model(
 
 
 def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return True (s, mi) for demands (slopes, excess) that are active after the step.
+    """Return True (designs, demands) for demands (slopes, excess) that are active after the step.
 
     An interior-point method leaves small multipliers of inactive demands, which are not small relative to an objective near 0.
     """

@@ -1,4 +1,6 @@
-"""Numerical form of a search: values and derivatives of many designs at once, with jams followed between designs.
+"""Numerical form of a search: values and derivatives of many designs at once.
+
+Jams are followed from one design to the next: each search for a jam starts near its load speed in the last design.
 
 Two functions are compiled: the evaluation of a chunk of designs, and a number of steps of the descent (`descent`). Chunks run
 in parallel on all cores.
@@ -33,15 +35,20 @@ _ROUNDING_SHARE = 1e-9
 """Value of a quantity, relative to its values for other designs, below which it counts as 0 with a rounding error."""
 
 Speeds = tuple[Any, ...]
-"""Load speeds near which jams are searched for: for each key, an array with a leading axis over the designs."""
+"""Load speeds near which jams and folds are searched for: for each of them (`Key`), an array with an axis over the designs."""
 
 
 class Problem(eqx.Module):
     """Design space with an objective and demands.
 
-    **Attributes**: `space`; `objective`; `demands`: the forms of the demands; `constants` (mi,): their limits if these are
-    numbers; `keys` of the followed speeds; `scales` (mi,): the units of the demands, positive; `batch_size`: the number of
-    designs in a batch; `parts`: the number of smooth pieces whose maximum is the objective.
+    **Attributes**
+
+    - `space`; `objective`
+    - `demands`, without their limits if these are numbers (`Demand.form`); `constants` (demands,): these limits
+    - `keys`: the jams and folds whose load speeds are followed, see `Key`
+    - `scales` (demands,): positive numbers by which the excesses of the demands are divided
+    - `batch_size`: the number of designs in a batch
+    - `parts`: the number of smooth pieces whose maximum is the objective
     """
 
     space: DesignSpace
@@ -59,7 +66,7 @@ class Problem(eqx.Module):
         return len(self.space.held)
 
     def values(self, z: Array, near: Sequence[Array], pieces: bool = False) -> tuple[Array, tuple[Array, ...]]:
-        """Return the values (1 + me + mi,) of the objective, deviations of held quantities and excesses of demands, with the
+        """Return the values of the objective, deviations of held quantities and excesses of demands, in one array, with the
         `pieces` of the objective appended if requested; and the followed speeds."""
         evaluation = Evaluation(self.space.at(z), dict(zip(self.keys, near, strict=True)))
         values = self.read(evaluation)
@@ -75,7 +82,7 @@ class Problem(eqx.Module):
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
     def easy(self) -> Problem | None:
-        """Return the problem of the first search: quantities to leading order and without tolerances.
+        """Return the problem of the first search: leading-order quantities of the machine with its nominal parameters.
 
         Demands on quantities without a leading order are omitted. None if it is the same problem, or if the objective has no
         leading order.

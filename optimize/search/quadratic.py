@@ -46,8 +46,9 @@ def solve_penalized(
     Method: Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers have an
     error of at most about a millionth of the penalty.
 
-    **Arguments** (s problems): `hessian` B (s, d, d), positive semidefinite; `slope` g (s, d); `held` A (s, me, d) and
-    a (s, me); `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `penalty` (s,).
+    **Arguments** (s problems, d unknowns, me equalities, mi inequalities): `hessian` B (s, d, d), positive semidefinite;
+    `slope` g (s, d); `held` A (s, me, d) and a (s, me); `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d);
+    `penalty` (s,).
 
     >>> import numpy as np
     >>> none = np.zeros((1, 0, 1)), np.zeros((1, 0))

@@ -81,7 +81,7 @@ def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
     code, out, _ = typed("show", "study.zarr")
     left = 10 - reports[0].done  # 6 or 8: threads end their chunks of 4, 4 and 2 cases in any order
     assert left in (6, 8) and code == 0 and "some cases have not been computed yet" in out and f"{left} missing" in out
-    assert f"{left} of them in this call" in typed("sweep", "study.toml")[1]
+    assert f"{left} cases were computed in this call" in typed("sweep", "study.toml")[1]
 
 
 @pytest.mark.parametrize(

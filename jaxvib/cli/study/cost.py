@@ -26,7 +26,8 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
 @click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
 @click.option(
     "--until",
-    help="Duration of the time integration, such as 20s [20 slowest natural periods; for a jam until transients decay].",
+    help="Duration of the time integration, such as 20s [20 periods of the lowest natural frequency; for a jam, until "
+    "transients decay].",
 )
 @click.option(
     "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration, repeatable [all]."
@@ -81,5 +82,5 @@ def cost_table(cost: Cost) -> str:
 
 def _method_columns(row: CostRow | None) -> list[str]:
     if row is None:
-        return ["no method, or below the error of the reference", ""]
+        return ["no method is this accurate, or the reference itself is not", ""]
     return [", ".join(part for part in (row.tier, row.method, row.dtype, row.setting) if part), f"{row.seconds:.2e}"]

@@ -73,7 +73,7 @@ def time_histories(
     The rows are displacements in mm, tilts in mrad if there are any, speeds of loads and rotor in `unit`, and the foundation
     force in N.
 
-    **Arguments**
+    **Arguments** (nt times, nd coordinates, nb directions of the force)
 
     - `whole`, `end`: tuples of time (nt,), s; displacement (nt, nd), m or rad; load speeds (nt, count) and rotor speeds
       (nt, exciters), rad/s; force (nt, nb), N. The last periods are those of `end`
@@ -163,9 +163,8 @@ def amplitude_histories(
     """Draw the histories of an averaged run, a panel for each quantity; amplitudes are zero to peak.
 
     `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
-    (nt, count) and `rotor_speed` (nt, exciters) are in rad/s, drawn in `unit`, and the foundation force `force` (nt, nb) is in
-    N.
-    """
+    (nt, count) and `rotor_speed` (nt, exciters) are in rad/s, drawn in `unit`, and the foundation force `force` (nt,
+    directions) is in N."""
     unit, scale = speed_unit(unit)
     kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)

@@ -17,7 +17,7 @@ from jaxvib.units.known import when_known
 
 
 class TorqueTable(Motor):
-    """Motor, switched on at t = 0, with a measured or catalogued torque over its speed.
+    """Motor, switched on at t = 0, with a measured or catalogued torque as a function of its speed.
 
     The torque follows straight lines between the points. The first and the last line continue beyond them.
 
@@ -169,12 +169,13 @@ def _require_steady_speed(speeds: np.ndarray) -> None:
 
 
 class Converter(Motor):
-    """Motor on a frequency or voltage converter that changes its speed without a load over time.
+    """Motor on a frequency or voltage converter, which varies the motor's no-load speed over time.
 
         T(t, theta') = T_motor(theta' + n_motor - n(t))
 
-    The torque depends on the difference to n(t) as it does on the difference to n_motor without a converter. This is exact for
-    a `DCMotor` whose voltage is changed, and for Kloss's formula at constant flux (voltage in proportion to the frequency).
+    n_motor is the motor's own speed without a load (`motor.speed`). With the converter the torque depends on theta' - n(t) as
+    without it on theta' - n_motor. This is exact for a `DCMotor` whose voltage is changed, and for Kloss's formula at constant
+    flux (voltage in proportion to the frequency).
 
     **Arguments**
 
@@ -212,7 +213,7 @@ class Converter(Motor):
         return self.motor.inertia
 
     def torque(self, speed: Array) -> Array:
-        """Return the torque at the working speed of the reference."""
+        """Return the torque at the rotor's `speed` while the reference is at its working speed."""
         return self.motor.torque(speed + self.motor.speed - self.speed)
 
     def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
@@ -235,8 +236,8 @@ class SpeedControl(Motor):
         z' = integral_gain (n(t) - theta' + (T - T_u) / gain)
 
     The integral z is a state of the motor (`state.rotor[2]`, N m). The last term keeps it from growing while the torque is at
-    its limit. Theories of steady motions need a torque over the speed, which this drive does not have: use `ConstantSpeed`
-    there.
+    its limit. Theories of steady motions need the torque as a function of the speed, which this drive does not have: use
+    `ConstantSpeed` there.
 
     **Arguments** (SI, or strings with a unit; all greater than 0)
 

@@ -17,7 +17,8 @@ SPEED = unit("rad/s", low=0.0, open_low=True, words="rotor speed")
 INERTIA = unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the rotor")
 
 Rotor = tuple[Array, ...] | None
-"""Angle (rad), speed (rad/s) and the states of the motor if they are states of the motion, otherwise None."""
+"""With a motor: angle (rad) and speed (rad/s) of the rotor and further states of the motor, all part of the state of the scene.
+With an ideal drive: None."""
 
 
 class Drive(Part):
@@ -49,14 +50,14 @@ class Drive(Part):
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
         """Return the rotor speed, rad/s.
 
-        **Arguments**: `t`, s; `rotor`: angle (rad) and speed (rad/s) in the state under a motor, None under an ideal drive.
+        **Arguments**: `t`, s; `rotor`: with a motor, angle (rad) and speed (rad/s) of the rotor from the state; else None.
         """
 
     @abc.abstractmethod
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
         """Return the rotor's angle, rad.
 
-        **Arguments**: `t`, s; `rotor`: angle (rad) and speed (rad/s) in the state under a motor, None under an ideal drive.
+        **Arguments**: `t`, s; `rotor`: with a motor, angle (rad) and speed (rad/s) of the rotor from the state; else None.
         """
 
     @abc.abstractmethod

@@ -28,8 +28,8 @@ class MatrixMachine(Machine):
     **Attributes** (nd coordinates)
 
     - `mass`, `damping`, `stiffness` and `gyroscopic` (or None), (nd, nd)
-    - `places_rows` (number of places, np, nd): the rows of each place, see `Mount`
-    - `foundation` (2, nb, nd): stiffness and damping of the force on the foundation
+    - `places_rows` (number of places, directions of a place, nd): displacement of each place = rows times q, see `Mount`
+    - `foundation` (2, nb, nd): stiffness and damping of the force on the foundation in its nb directions
     """
 
     mass: Array = eqx.field(metadata=unit("", words="mass matrix"))

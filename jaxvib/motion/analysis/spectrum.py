@@ -40,7 +40,7 @@ class Spectrum(Result):
     Each segment is weighted by the Hann window. The height of the peak of a steady vibration is its amplitude, zero to peak,
     within 2 %.
 
-    **Attributes** (P segments, nf frequencies)
+    **Attributes** (P segments, nf frequencies, nd coordinates, nb directions of the force)
 
     - `time` (P,), s: the middles of the segments
     - `frequency` (nf,), rad/s; its resolution is about 2 pi divided by the duration of a segment

@@ -179,8 +179,8 @@ def envelope(
     - `max_steps`: the run fails after this number of steps; typical: 2^16 (the default)
 
     Gravity has no mean torque on a load that makes full turns. If a load is too slow to pass the top of its track, or its drag
-    or motor cannot lift it from the bottom, the status is `not_turning`. Effects other than gravity, and an exciter with loads
-    and an unbalance or a motor, raise `InputError`.
+    or motor cannot lift it from the bottom, the status is `not_turning`. Effects other than gravity, and an exciter
+    that has, in addition to loads, an unbalance or a motor, raise `InputError`.
 
     **Returns** `Envelope`. Forward and reverse derivatives, `jit` and `vmap` are supported.
 
@@ -384,7 +384,7 @@ def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
 
 
 def _anticlockwise(scene: Scene, rates: Array) -> Array:
-    """Return speeds (..., count) of the rotating masses in the fixed frame from those in their directions, or the reverse."""
+    """Return speeds (..., count), positive anticlockwise, from speeds positive in each exciter's direction, or the reverse."""
     directions = turning_directions(scene)
     return rates if np.all(directions == 1) else jnp.asarray(directions) * rates
 
@@ -412,8 +412,9 @@ def _measure(model: Model, window: Envelopes) -> Measured:
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
     """Return True if every rotating mass can make full turns in the potential of gravity.
 
-    At the end it must have the energy to pass the top, I w^2/2 > (max V - min V)/2. If it did not have this energy at the
-    start, its drag or its motor must have been able to lift it, D n or T(0) > max |dV/dphi|.
+    At the end it must have the energy to pass the top from the mean height, where it has its averaged speed w:
+    I w^2/2 > (max V - min V)/2. If it did not have this energy at the start, its drag or its motor must have been able to lift
+    it, D n or T(0) > max |dV/dphi|.
     """
     starts, gravity = can_start(scene), total_gravity(scene.all_effects).get(1)
     each, begins = [], np.cumsum([0, *(max(count, 1) for count in field.counts)])

@@ -48,7 +48,7 @@ class EnvelopeStatus(eqx.Enumeration):
 class Envelopes(eqx.Module):
     """Averaged motion at some times. The loads are all masses that turn: loads, and rotors with an unbalance but no loads.
 
-    **Attributes** (nt times)
+    **Attributes** (nt times, nd coordinates, nb directions of the force)
 
     - `time` (nt,), s
     - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes at the loads' mean angle. If exciters turn at

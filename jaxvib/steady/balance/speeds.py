@@ -1,4 +1,4 @@
-"""Characteristic speeds of a machine, at which the mean force of its exciter on coincident loads changes sign."""
+"""Characteristic speeds of a machine: coincident loads change between gathering and balancing."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class CharacteristicSpeeds(Result):
 
     @property
     def status(self) -> CriterionStatus:
-        """Outcome, a `CriterionStatus`: the support of the machine, and the success of the computation.
+        """Outcome, a `CriterionStatus`: whether supports resist every motion, and whether the computation succeeded.
 
         Every machine has a first resonance, with damping and without, and finite shapes; other speeds may be absent.
         """
@@ -109,7 +109,7 @@ class CharacteristicSpeeds(Result):
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:
-    """Return the receptance of the exciter's port at speed `omega` (scalar, rad/s), (np, np) complex, m/N.
+    """Return the receptance of the exciter's port at speed `omega` (scalar, rad/s), m/N.
 
         A(w) = B [K - w^2 (M + sum m_j B^T B) + i w (C + w G)]^-1 B^T,     displacement = Re(A F exp(i w t))
 
@@ -117,7 +117,7 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 
     **Arguments**: `scene`; `omega`.
 
-    **Returns** (np, np) complex. Its values are not finite at an undamped resonance.
+    **Returns** a complex array (p, p) for a port with p directions. Its values are not finite at an undamped resonance.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
@@ -142,11 +142,12 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
 
         Re(e^H A(w) e) = Re(b^H [K - w^2 (M_S - i G) + i w C]^-1 b)
 
-    which is the trace of A without coupling by the rotor speed. Without damping, its poles are the eigenvalues of K y = w^2
-    (M_S - i G) y, and its zeros are those of the same problem on b^H y = 0 (the port fixed); poles and zeros interlace. With
-    damping, its sign changes are bracketed on a grid between the lowest and the highest undamped resonance: outside this range
-    damping cannot change the sign, because Re(b^H D^-1 b) = y^H (K - w^2 M_S) y with y = D^-1 b. A damper between the
-    exciter's platform and the foundation changes none of these speeds, because it adds only to the imaginary part of 1/A.
+    M_S = M + sum m_j B^T B is the mass matrix with the loads. Without the gyroscopic matrix G the mean is the real part of the
+    trace of A. Without damping, its poles are the eigenvalues of K y = w^2 (M_S - i G) y, and its zeros are those of the same
+    problem on b^H y = 0 (the port fixed); poles and zeros interlace. With damping, its sign changes are bracketed on a grid
+    between the lowest and the highest undamped resonance: outside this range damping cannot change the sign, because
+    Re(b^H D^-1 b) = y^H (K - w^2 M_S) y, where D is the matrix in brackets and y = D^-1 b. A damper between the exciter's
+    platform and the foundation changes none of these speeds, because it adds only to the imaginary part of 1/A.
 
     **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every parameter of the scene,
     forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).
@@ -187,7 +188,8 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
         resonances, additional = root_or_zero(values), root_or_zero(fixed)
         shapes = inverse.T @ vectors
     else:
-        # The metric is K, because M_S - i G is not positive definite for a large polar moment, and a resonance is missing.
+        # The metric is K, because M_S - i G is not positive definite for a large polar moment: one of the resonances then does
+        # not exist.
         square, inverse = relative_to(carrier.stiffness, model.mass - 1j * gyroscopic)
         values, vectors, fixed = _free_and_fixed_modes(square, inverse @ direction)
         resonances, additional = _inverse_root(values)[::-1], _inverse_root(fixed)[::-1]
@@ -203,7 +205,8 @@ def _direction(model: LinearModel) -> Array:
 
 
 def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
-    """**Raises** `InputError` if no coordinate moves the port, a rotor has a motion without a spring, or rounding hides one."""
+    """**Raises** `InputError` if no coordinate moves the port, a rotor has a motion without a spring, or rounding errors hide a
+    resonance."""
     if not np.any(port):
         problem = "does not move with any coordinate, and its loads have no effect; put the exciter at a point that can move"
         raise InputError("machine.port", problem)
@@ -220,10 +223,10 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
     if np.sum(squares <= rounding * squares[-1]) > free:
         stiff = int(np.argmax(np.diag(stiffness) / np.diag(mass)))
         name = scene.machine.structure().coordinates[stiff]
-        cannot = "cannot be computed with the others in this precision; use a softer spring or leave it out of the machine"
+        advice = "too high for this precision; use a softer spring or leave this coordinate out of the machine"
         if np.any(port[:, stiff]):
-            raise InputError("machine.exciter", f"stands on {name}, which {cannot}")
-        raise InputError("machine.stiffness", f"is so high at {name} that this coordinate {cannot}")
+            raise InputError("machine.exciter", f"stands on {name}, where the stiffness is {advice}")
+        raise InputError("machine.stiffness", f"is at {name} {advice}")
 
 
 def _inverse_root(values: Array) -> Array:
@@ -252,7 +255,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     frozen, b, poles, zeros, forms = jax.lax.stop_gradient((model, direction, resonances, additional, shapes))
     carrier = model.carrier
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
-    trace = jnp.finfo(last.dtype).eps ** 0.75 * last
+    tiny_damping = jnp.finfo(last.dtype).eps ** 0.75 * last
     # This term changes neither the real part of 1/A nor the sign changes. It makes the function smooth at the poles.
     participation = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
     smoothing = 1j * last**2 / participation
@@ -260,10 +263,10 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
 
     def functional(m: LinearModel, w: Array) -> Array:
         # A small damping is added, because a mode without damping that never moves the port gives 0/0 at its resonance.
-        matrix = m.dynamic_stiffness(w) + 2j * w * trace * frozen.mass + smooth
+        matrix = m.dynamic_stiffness(w) + 2j * w * tiny_damping * frozen.mass + smooth
         return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
 
-    damped = eqx.tree_at(lambda m: m.carrier.damping, frozen, frozen.carrier.damping + 2.0 * trace * frozen.mass)
+    damped = eqx.tree_at(lambda m: m.carrier.damping, frozen, frozen.carrier.damping + 2.0 * tiny_damping * frozen.mass)
     modal = damped.decomposed().modal
 
     def fast_functional(w: Array) -> Array:
@@ -272,7 +275,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
         receptance = modal.receptance(w, jnp.ones_like(w))
         return (receptance / (1.0 + smoothing * receptance)).real
 
-    width = jnp.einsum("ar,ab,br->r", forms.conj(), jax.lax.stop_gradient(carrier.damping), forms).real / 2.0 + trace
+    width = jnp.einsum("ar,ab,br->r", forms.conj(), jax.lax.stop_gradient(carrier.damping), forms).real / 2.0 + tiny_damping
     poles = jnp.where(jnp.isnan(poles), last, poles)
     if model.mount.gyroscopic is not None:
         # A rotor with a large polar moment can have its last sign change above the last resonance.

@@ -63,7 +63,7 @@ class Orbit(Result):
 
     Values are NaN if the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
 
-    **Attributes**
+    **Attributes** (nd coordinates, nb directions of the force)
 
     - `status`: an `OrbitStatus`
     - `residual` of the torque balance, relative

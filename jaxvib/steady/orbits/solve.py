@@ -19,7 +19,8 @@ Parameter = Literal["omega", "rotor_speed"]
 
 
 def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
-    """Return the response of the carrier to unbalance: its k-th harmonic per harmonic of sum_g S_g e(phi_g), (K, nd, np).
+    """Return the response of the carrier to unbalance: its k-th harmonic per harmonic of sum_g S_g e(phi_g), (K, nd, p) for p
+    directions.
 
     X_k = D(k w)^-1 B^T k^2 w^2,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
     """
@@ -33,8 +34,8 @@ def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, order
 
 
 def _port_response(model: CoincidentModel, grid: Grid, omega: Array, speed: Array) -> Array:
-    """Return the response A_k (K, np, np) of the port to unbalance: k-th harmonic of its acceleration per k-th harmonic of
-    sum_g S_g e(phi_g)."""
+    """Return the response A_k (K, p, p) of the port with p directions to unbalance: k-th harmonic of its acceleration per k-th
+    harmonic of sum_g S_g e(phi_g)."""
     return _port_response_from(model, grid, omega, unbalance_response(model, omega, speed, grid.orders))
 
 
@@ -45,7 +46,8 @@ def _port_response_from(model: CoincidentModel, grid: Grid, omega: Array, respon
 
 
 def _feedback(grid: Grid, port_response: Array) -> Array:
-    """Return the matrix (np, np, M, M) from sum_g S_g e(phi_g) to the acceleration of the port, both at the points."""
+    """Return the matrix (p, p, M, M), with p directions of the port, from sum_g S_g e(phi_g) to the acceleration of the port,
+    both at the points."""
     by_distance = jnp.einsum("kab,dk->abd", port_response.real, grid.cosine) - jnp.einsum(
         "kab,dk->abd", port_response.imag, grid.sine
     )
@@ -231,8 +233,8 @@ class BranchTangent(NamedTuple):
 
     **Attributes**: `slope` dn/dOmega; `residual` of the torque balance at the points, relative to its torques; `speed_error`:
     estimated relative error of the rotor speed at this load speed, due to the number of points; `deviation_error`: that of psi,
-    rad; `response` (K, nd, np): `unbalance_response` of the carrier at the orders of the grid; `acceleration` (np, M) of the
-    port at the points, m/s^2."""
+    rad; `response` (K, nd, p): `unbalance_response` of the carrier at the orders of the grid; `acceleration` (p, M) of the port
+    with p directions at the points, m/s^2."""
 
     slope: Array
     residual: Array
@@ -299,7 +301,7 @@ def _bordered(by_deviation: Array, by_unknown: Array) -> Array:
 
 class Harmonics(NamedTuple):
     """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `deviation` (G, J) rad; `displacement` (nd, K)
-    m of the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the foundation."""
+    m of the carrier, `acceleration` (directions, K) m/s^2 of the port, `force` (directions, K) N on the foundation."""
 
     deviation: Array
     displacement: Array
@@ -308,7 +310,7 @@ class Harmonics(NamedTuple):
 
 
 def harmonics_of(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, response: Array | None = None) -> Harmonics:
-    """Return harmonics of psi and of the carrier's motion; `response` (K, nd, np): its `unbalance_response`, if known."""
+    """Return harmonics of psi and of the carrier's motion; `response`: its `unbalance_response`, if known."""
     carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)
     force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)

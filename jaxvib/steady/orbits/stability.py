@@ -103,7 +103,8 @@ def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: b
 
 class _Coefficients(NamedTuple):
     """Coefficients of the linear equations at one angle: `moving` s e' with its derivatives `moving1` and `moving2`, and
-    `coupling`, s e' minus the part of dry friction, (np, G, P); derivatives of the torque `by_angle`, `by_rate`, (G, P)."""
+    `coupling`, s e' minus the part of dry friction, (directions of the port, G, P); derivatives of the torque `by_angle`,
+    `by_rate`, (G, P)."""
 
     moving: Array
     coupling: Array
@@ -400,7 +401,7 @@ def _times(matrix: Array, vectors: Array) -> Array:
 
 
 def _small_solve(weight: Array, right: Array) -> Array:
-    """Return the solution x (np, ...) of (1 - weight) x = right, written out for np = 1 or 2; weight (np, np, ...)."""
+    """Return the solution x (n, ...) of (1 - weight) x = right, written out for n = 1 or 2; weight (n, n, ...)."""
     a = np.eye(weight.shape[0]).reshape(*weight.shape[:2], *[1] * (weight.ndim - 2)) - weight
     if weight.shape[0] == 1:
         return right / a[0]

@@ -60,7 +60,7 @@ class SynchronousStatus(eqx.Enumeration):
     )
     different_speeds = "ideal drives turn unbalances at different speeds, so that no motion repeats"
     under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
-    at_fold = "the motion is at a fold or in a family of equal motions: it has no gradient"
+    at_fold = "the motion is at a fold or belongs to a continuous family of motions: it has no gradient"
     refused = REFUSED
 
 
@@ -99,7 +99,8 @@ class SynchronousOrbit(PathsOfPoints, Result):
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
       of angles in rad, due to the number of harmonics
     - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad
-      for rotations), and `force_harmonics` (nb, K), N, of the orders 0, 1, 2, ...
+      for rotations), and `force_harmonics` (directions, K), N, of the force on the
+      foundation; orders 0, 1, 2, ...
     - `scene`
     """
 
@@ -198,7 +199,7 @@ def synchronous_orbit(
       it by th_k = sigma_k n t (phase 0) and gives Omega = n
     - the loads at one angle on a balanced rotor under an ideal drive: the exciters jam together
 
-    **Arguments**: `scene` with effects without free rotation of loads; and
+    **Arguments**: `scene` without effects that release the rotation of loads about their own centres; and
 
     - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two arguments:
     - `speed`: start of Omega, rad/s or text; default: the mean speed of the motors; typical: 60 to 320

@@ -60,8 +60,8 @@ class PeriodicScene(eqx.Module):
     sigma (theta + alpha + psi) with the direction sigma of its exciter.
 
     **Attributes**: the assembled `model`; `field`, its equations of motion; `length`, m: a typical displacement; `phases` alpha
-    (bodies,), rad. Deviations about them are small, so that their derivatives lose no digits; `feedback`: angular acceleration
-    of a body due to an acceleration of the carrier by `length`.
+    (bodies,), rad. Deviations about them are small, so that their derivatives lose no digits; `feedback`: d^2 psi/dtheta^2 of a
+    body due to d^2 q/dtheta^2 = `length` of the carrier, the largest of all exciters.
     """
 
     model: Model
@@ -98,7 +98,7 @@ class PeriodicScene(eqx.Module):
         return jnp.concatenate(parts) / omega**2
 
     def slopes(self, theta: Array, x: Array, rate: Array, omega: Array) -> tuple[Array, Array]:
-        """Return the derivatives (n, 2 n + 1) of `acceleration` with respect to `x`, `rate` and `omega`, and itself."""
+        """Return the derivatives (n, 2 n + 1) of `acceleration` with respect to `x`, `rate` and `omega`, and its value (n,)."""
 
         def of_all(every: Array) -> tuple[Array, Array]:
             x, rate = jnp.split(every[:-1], 2)
@@ -128,7 +128,7 @@ def _exciter_state(exciter: Exciter, angle: Array, rate: Array) -> ExciterState:
 
 
 def periodic_scene(scene: Scene, phases: Array) -> PeriodicScene:
-    """Return the equations of a scene for its periodic motions, with a phase (N,) near that of each exciter."""
+    """Return the equations of a scene for its periodic motions; `phases` (N,), rad, are approximate phases of the exciters."""
     counts = body_counts(scene)
     model = assemble(scene)
     length = sum(map(unbalance_of, scene.exciters), jnp.zeros(())) / jnp.min(jnp.diagonal(model.carrier.mass))
@@ -290,7 +290,7 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
     change = solve_in_turn(found.matrix, between.ravel() if forced else jnp.append(between.ravel(), 0.0))
     last = jnp.abs(analyzed(x, deviation_analysis(grid))[:, -1:])
     off = jnp.concatenate([jnp.abs(change[: x.size].reshape(x.shape)), last], axis=1)
-    largest = jnp.maximum(jnp.max(jnp.abs(x[:nd])), 1e-3)  # phases can leave the carrier at rest
+    largest = jnp.maximum(jnp.max(jnp.abs(x[:nd])), 1e-3)  # the forces of the exciters may cancel
     each = jnp.max(off[:nd]) / largest, jnp.max(off[nd:], initial=0.0), 0.0 if forced else jnp.abs(change[-1] / omega)
     return jnp.max(jnp.abs(found.residual)) / found.scale, jnp.max(jnp.stack([jnp.asarray(e) for e in each]))
 

@@ -43,13 +43,12 @@ _ITERATIONS = 60
 def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
     """Return the speeds (n,) rad/s and phases (n, count) rad of all distinct regimes.
 
-    1. The sum of all torques over the speed is explicit for given phases. Every root of this sum, for regular and random sets
-    of phases, is a start of Newton's method for the speed and all phases
+    1. The sum of all torques is an explicit function of the speed for given phases. Every root of this sum, for regular and
+    random sets of phases, is a start of Newton's method for the speed and all phases
     2. Further starts are the phases of the solutions, exchanged between masses, mirrored, or with one phase shifted by half a
     turn
     3. Regimes that differ by a common shift of all phases or by an exchange of equal masses are one regime. Regimes of one
-    speed whose phases
-       can change without a change of torques belong to a family, of which one member is kept
+    speed whose phases can change without a change of torques belong to a family, of which one member is kept
     """
     count, speed = balance.unbalance.size, np.asarray(balance.speed)
     if balance.is_prescribed.all():

@@ -60,7 +60,7 @@ class Tiers(Result):
         return "\n".join(lines)
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot relative differences of load speed, amplitude and foundation force over the mass of a load.
+        """Plot relative differences of load speed, amplitude and foundation force against the mass of a load.
 
         Hollow symbols mark unstable jams.
 
@@ -78,7 +78,7 @@ class Tiers(Result):
 
 @validated
 def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers:
-    """Compare a jam mode to leading order with the exact jam, for loads that are heavier and lighter than those of the scene.
+    """Compare the leading-order result for a jam mode with the exact jam, for heavier and lighter loads than in the scene.
 
     The drag is multiplied by the square of the factor on the mass. The leading-order balance n(Omega) then stays the same,
     except for the contribution of the loads to the mass of their platform. Dry friction is proportional to the mass, as in a

@@ -118,9 +118,9 @@ class Identified(Result):
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
-        from jaxvib.draw.record import record_chart  # slow import
+        from jaxvib.draw.record import swing_chart  # slow import
 
-        return record_chart(self.record.time, self.record.angle, self.fitted, self.noise, ax=ax)
+        return swing_chart(self.record.time, self.record.angle, self.fitted, self.noise, ax=ax)
 
 
 def identify_bearing(

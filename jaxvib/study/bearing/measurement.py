@@ -103,7 +103,7 @@ bearing = "20 mm"           # diameter at which dry friction acts
 # g = 9.81                  # m/s^2
 
 [identify]
-dry = true                  # identify mu2 as well as mu1
+dry = true                  # identify the dry friction mu2 as well as the viscous friction mu1
 instrument = 0.03           # relative uncertainty of the moment of inertia, from its measurement
 """
 """Commented example of a measurement file."""

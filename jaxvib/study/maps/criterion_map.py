@@ -29,15 +29,16 @@ if TYPE_CHECKING:
 class CriterionMap(Result):
     """Comparison of the criterion with exact stability for a machine with lighter or heavier loads and weaker or stronger drag.
 
-    **Attributes** (D drags, M masses, S speeds, B boundaries 2 nd - 1)
+    **Attributes** (D drags, M masses, S speeds, B = 2 nd - 1 boundaries for nd coordinates)
 
     - `speeds` (S,), rad/s; `mass_factor` (M,) and `drag_factor` (D,): factors on the mass and drag of the scene's loads
     - `predicted` (M, S): True if the criterion predicts stable auto-balancing (it does not depend on the drag)
     - `growth` (D, M, S), 1/s: exact growth rate, stable if negative
     - `right` (D, M): share of the speeds at which both agree
     - `boundary` (M, B), rad/s: the criterion's boundaries, ascending, NaN for an absent one
-    - `shift` (D, M, B): (exact - predicted)/predicted, where the exact boundary is the end of that exact interval of stability
-      that overlaps most with the interval of the criterion; NaN if there is none in the range of speeds
+    - `shift` (D, M, B): (exact - predicted)/predicted for each lower or upper end of an interval of the criterion. It is
+      compared with the same end of the exact interval of stability that overlaps most with this interval; NaN if no exact end
+      is in the range of speeds
     """
 
     status = Computed.done
@@ -65,9 +66,9 @@ class CriterionMap(Result):
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot agreement and disagreement of the criterion over rotor speed in `unit` and load mass, one panel for each drag,
-        onto as many axes `ax` if circular.
+        onto as many axes `ax` if given.
 
-        **Returns** a matplotlib figure, or the circular `ax`. **Raises** `InputError` for another unit or number of axes.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         from jaxvib.draw.criterion import agreement_maps  # slow import
 
@@ -110,10 +111,11 @@ def criterion_map(
             raise InputError(name, "must be a list of numbers greater than 0, one at least, ascending")
     grid, mass_factor, drag_factor = values.values()
 
-    circular = circular_loads(scene)
+    scene_loads = circular_loads(scene)
 
     def loaded(m: jax.Array, d: float = 1.0) -> Scene:
-        loads = eqx.tree_at(lambda x: (x.mass, x.drag), circular, (circular.mass * m, circular.drag * d))
+        factors = scene_loads.mass * m, scene_loads.drag * d
+        loads = eqx.tree_at(lambda x: (x.mass, x.drag), scene_loads, factors)
         return eqx.tree_at(lambda s: s.loads, scene, loads)
 
     results = [criterion(loaded(jnp.asarray(m))) for m in mass_factor]

@@ -132,11 +132,11 @@ def run_ups(
     - `starts`: number of sets of random angles, uniform over the circle; typical: 32 to 1000. The error of a share is about
       1 / sqrt(starts)
     - `seed` of the random angles
-    - `angles` (ns, count), rad: sets of angles in place of random ones. Without `starts` and `angles` there is one set, at the
-      bottom of the track with the `separation` of `simulate`
+    - `angles` (sets, count), rad: sets of angles in place of random ones. Without `starts` and `angles` there is one set, at
+      the bottom of the track with the `separation` of `simulate`
     - `separation`: angle between neighbouring loads of this one set, rad; typical: 0.02
     - `stepsize_controller`: as for `simulate`, except `Accuracy`; default: `Tolerance(1e-7)`, in single precision 1e-5
-    - `batch`: number of runs that advance run_batch on each core; typical: 16 (the default)
+    - `batch`: number of runs that advance together on each core; typical: 16 (the default)
     - `max_steps`: a run fails after this number of steps; default: as for `simulate`, but at least 2^20
 
     **Returns** `RunUps`; its `fraction` gives the share of the starts that end in a kind of motion. A run that fails raises no

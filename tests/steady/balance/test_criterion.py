@@ -356,11 +356,11 @@ def test_exciter_that_cannot_move_is_refused():
         jv.criterion(s)
     with pytest.raises(jv.InputError, match=r"machine\.stiffness.* is inf"):
         jv.one_mass(mass=1.0, stiffness=float("inf"), damping=0.0)
-    for exciter, field in ((2, "exciter stands on y2, which"), (1, "stiffness is so high at y2 that this coordinate")):
+    for exciter, field in ((2, "exciter stands on y2, where the stiffness is"), (1, "stiffness is at y2")):
         machine = jv.two_mass(
             mass=(4.0, 3.0), stiffness=(1e4, 1e20), damping=(3.0, 3.0), link_stiffness=2e4, link_damping=1.0, exciter=exciter
         )
-        with pytest.raises(jv.InputError, match=rf"machine\.{field} cannot be computed with the others"):
+        with pytest.raises(jv.InputError, match=rf"machine\.{field} too high for this precision"):
             jv.criterion(eqx.tree_at(lambda x: x.machine, scene("two_mass"), machine))
 
 
