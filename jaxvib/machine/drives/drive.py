@@ -17,7 +17,7 @@ SPEED = unit("rad/s", low=0.0, open_low=True, words="rotor speed")
 INERTIA = unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the rotor")
 
 Rotor = tuple[Array, ...] | None
-"""States of a rotor with a motor: its angle (rad), its speed (rad/s) and further states of the motor; None for an ideal drive."""
+"""States of a rotor with a motor: its angle (rad), speed (rad/s) and further states of the motor; None for an ideal drive."""
 
 
 class Drive(Part):
