@@ -21,7 +21,7 @@ import numpy as np
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, force_per_amplitude
 from optimize.search import descent, find, model, polish
-from optimize.search.evolve import Followed, evolve
+from optimize.search.evolve import PopulationValues, evolve
 from optimize.search.problem import Point, Problem, find_speeds, problem_of
 
 __all__ = ["SIZES", "chain", "gradient_cost", "race"]
@@ -105,7 +105,7 @@ def by_gradients(problem: Problem, polishing: int, seconds: float) -> Course:
         return inner(problem, z, near)
 
     def told(_share: float, point: Point) -> None:
-        counted[0] += descending[0] * descent.STRETCH
+        counted[0] += descending[0] * descent.STEPS_PER_CALL
         values = point.values[np.isfinite(point.values[:, 0]), 0]
         for row, new in zip(course, (time.perf_counter() - begun, counted[0], float(np.min(values))), strict=True):
             row.append(new)
@@ -134,7 +134,7 @@ def by_differential_evolution(problem: Problem, seconds: float, seed: int = 0) -
     """SciPy's differential evolution, its population of 8 d evaluated at once."""
     from scipy.optimize import differential_evolution
 
-    followed, course, begun = Followed(problem), Course([], [], []), time.perf_counter()
+    followed, course, begun = PopulationValues(problem), Course([], [], []), time.perf_counter()
 
     def values(z: np.ndarray) -> np.ndarray:
         found = followed.of(np.clip(z.T, 0.0, 1.0))[:, 0]
@@ -173,7 +173,7 @@ def race(free: int, seconds: float) -> None:
     problem = problem_of(space, wish, ())
     polishing = 10 if free <= 30 else 3
     by_gradients(problem, polishing, 0.0)
-    Followed(problem).of(np.full((1, free), 0.5))
+    PopulationValues(problem).of(np.full((1, free), 0.5))
     print(f"{free} free numbers, {SIZES[free]} platforms")
     courses: dict[str, Course] = {}
     for name, search in (

@@ -525,7 +525,7 @@ def test_hostile_names_give_valid_units(name, identifier, tmp_path):
         (dict(fmi="1.0"), "fmi is '1.0'; "),
         (dict(drive="wheel"), "drive is 'wheel'; "),
         (dict(start="spin_up"), "start is 'spin_up', which replaces the drive"),
-        (dict(mode=3), "mode is 3, "),
+        (dict(mode=3), "mode is 3; "),
     ],
 )
 def test_wrong_arguments_of_units_end_in_one_sentence(change, says, tmp_path):

@@ -85,7 +85,7 @@ RUN = ["run.mode"]
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        (dict(axes={}), "axes is empty; name at least one number"),
+        (dict(axes={}), "axes is empty; name at least one parameter"),
         (dict(axes={"drive.sped": [1.0]}), "is not a parameter of this scene; did you mean 'drive.speed'"),
         (dict(axes={"start.rat": [1.0]}), "is not a parameter of the initial state; did you mean 'start.rate'"),
         (dict(axes={"start.rate[3]": [1.0]}), "start.rate has 3 entries"),

@@ -45,7 +45,9 @@ class NamePlateMotor(Motor):
 
     power: Array = eqx.field(metadata=unit("W", **_POSITIVE, words="rated power of the motor"))
     rated_speed: Array = eqx.field(metadata=unit("rad/s", **_POSITIVE, words="rated speed of the motor"))
-    breakdown_ratio: Array = eqx.field(metadata=unit("", low=1.0, open_low=True, words="breakdown torque over rated torque"))
+    breakdown_ratio: Array = eqx.field(
+        metadata=unit("", low=1.0, open_low=True, words="breakdown torque divided by rated torque", typical=2.5)
+    )
     inertia: Array = eqx.field(metadata=INERTIA)
     frequency: Array = eqx.field(metadata=unit("rad/s", **_POSITIVE, words="frequency of the supply"))
     kind: str = eqx.field(static=True)

@@ -66,11 +66,11 @@ def test_a_case_is_a_quantity_of_another_scene():
     ("make", "says"),
     [
         (lambda: under(FIRST, "x", [("drive.speed", 3.0)]), "must be a dictionary, for example"),
-        (lambda: worst(FIRST, {}), "give a dictionary"),
+        (lambda: worst(FIRST, {}), "must be a dictionary such as"),
         (lambda: worst(FIRST, [0.1]), "must be a dictionary, for example"),
         (lambda: worst(FIRST, {"machine.stiffness": True}), "stiffness is True; it must be a number"),
         (lambda: worst(FIRST, {"machine.stiffness": "5 %"}), "must be a number"),
-        (lambda: worst(FIRST, {"machine.stiffness": 0.0}), "give a share"),
+        (lambda: worst(FIRST, {"machine.stiffness": 0.0}), "must be between 0 and 1"),
         (lambda: worst(FIRST, {"machine.stiffness": 0.05}, samples=1), "samples is 1"),
         (lambda: quantile(FIRST, True, {"machine.stiffness": 0.05}), "level is True; it must be a number"),
         (lambda: quantile(FIRST, "half", {"machine.stiffness": 0.05}), "must be a number"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.study.accuracy.gradient_check import _DIFFERENCE_STEPS, _SAFETY, _extrapolated, _scale
+from jaxvib.study.accuracy.gradient_check import _DIFFERENCE_STEPS, _NOISE_FACTOR, _extrapolated, _scale
 from optimize import (
     amplitude,
     expected,
@@ -121,12 +121,15 @@ class Routes:
             difference, noise, _ = (np.asarray(x) for x in zip(*(_extrapolated(row, value[q]) for row in rows), strict=True))
             scale = np.maximum(_scale(difference), 1e-3 * abs(value[q]))
             for name, slopes in found.items():
-                off, allowed = np.abs(slopes[q] - difference), tolerance * scale + _SAFETY * np.nan_to_num(noise, nan=np.inf)
+                off, allowed = (
+                    np.abs(slopes[q] - difference),
+                    tolerance * scale + _NOISE_FACTOR * np.nan_to_num(noise, nan=np.inf),
+                )
                 # A peak of a run-up changes its course within the larger steps: a difference that noisy says nothing.
                 tells = noise < 1e-2 * scale
                 assert np.all(off[tells] <= allowed[tells]), (name, self.quantities[q].words, slopes[q], difference, noise)
                 np.testing.assert_allclose(slopes[q], next(iter(found.values()))[q], atol=tolerance * scale.max())
-            judged += int(np.sum(_SAFETY * noise < tolerance * scale))
+            judged += int(np.sum(_NOISE_FACTOR * noise < tolerance * scale))
         return judged
 
 

@@ -59,7 +59,7 @@ def test_a_threshold_curve_is_captures_beside_each_other():
     assert curve.threshold[1] == float(alone.threshold) and curve.uncertainty[1] == float(alone.uncertainty)
     assert np.all((curve.least >= -1.0) & (curve.least <= -0.1)) and curve.summary().count("+-") == 2
     assert len(curve.plot().axes) == 1
-    with pytest.raises(jv.InputError, match=r"values is \[\]; one finite number"):
+    with pytest.raises(jv.InputError, match=r"values is \[\]; it must be a list"):
         jv.threshold_curve(published_torus, [])
 
 
