@@ -39,7 +39,7 @@ class RotorAngle(NamedTuple):
     - `drive`: drive of prescribed speed, None with a spline
     - `span`, s, in which the angle is known
     - `marked`: True if the zero of the angle is a mark on the rotor, the same in all runs
-    - `error`, rad: largest standard error of the angle in the span
+    - `error`, rad: root mean square of the standard error of the angle in the span
     - `notes`: sentences for the reader
     """
 
@@ -124,7 +124,7 @@ def _step(time: np.ndarray) -> float:
 
 
 def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None) -> tuple[Any, float]:
-    """Return a spline of degree 5 through noisy values, and its largest standard error.
+    """Return a spline of degree 5 through noisy values, and the root mean square of its standard error.
 
     **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): the number of a value's mark, each with an unknown
     offset (0 on average).
@@ -162,7 +162,7 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
         criterion = n * math.log(max(float(left @ left) / n, 1e-26)) + count * math.log(n)
         if criterion < best[0]:
             at = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * intervals + 1), knots, _DEGREE)
-            spread = np.max(np.einsum("ij,jk,ik->i", at.toarray(), inverse[:size, :size], at.toarray()))
+            spread = np.mean(np.einsum("ij,jk,ik->i", at.toarray(), inverse[:size, :size], at.toarray()))
             best = criterion, BSpline(knots, found[:size], _DEGREE), math.sqrt(variance * float(spread))
         intervals = max(intervals + 1, int(1.4 * intervals))
     return best[1], best[2]

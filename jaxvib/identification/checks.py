@@ -20,6 +20,10 @@ _WINDOWS, _ORDERS = 16, 3
 _CONTRADICTION = 4.0
 """Distance of a fitted value from a known one, in standard errors, that errors cannot explain."""
 
+_ANGLE_SHARE = 0.1
+"""Share of the residuals due to errors of the rotor's angle above which intervals count as too narrow. The share is small
+because these errors change slowly and do not average out like noise."""
+
 _UNEXPLAINED = 0.5
 """Share of a channel's standard deviation in the residuals above which a fit counts as none."""
 
@@ -29,8 +33,9 @@ class FitStatus(eqx.Enumeration):
 
     found = "the model explains the records up to noise"
     patterned = (
-        "the residuals are not noise: they repeat with the rotor's angle, so the model lacks a part or the minimum is a wrong "
-        "one, and the intervals are too narrow; compare the residuals over speed, and start from better values"
+        "the residuals are not noise: they repeat with the rotor's angle, so the model lacks a part, the angle is inaccurate, "
+        "or the minimum is a wrong one, and the intervals are too narrow; see the notes, compare the residuals over speed, and "
+        "start from better values"
     )
     undetermined = "the records do not determine all unknowns: see `undetermined` for the directions and how to determine them"
     contradicted = "the records contradict a known value or the calibration of a sensor: see the notes, and check that value"
@@ -44,12 +49,21 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
     """Return the status of a fit, the smallest chance of its residuals under pure noise, and notes."""
     chance, notes = 1.0, list(_contradictions(fitted))
     contradicted = bool(notes)
-    explained = []
+    explained, is_inaccurate = [], False
     for k, (samples, left, raw, mask) in enumerate(
         zip(fitted.problem.runs, fitted.residuals, fitted.problem.raw, fitted.problem.masks, strict=True)
     ):
         for c, channel in enumerate(samples.channels):
             valid = mask[:, c]
+            by_angle = fitted.problem.angle_errors[k] * float(np.std(raw[valid, c]))
+            if by_angle > _ANGLE_SHARE * np.std(left[valid, c]):
+                is_inaccurate = True
+                size = np.std(left[valid, c])
+                notes.append(
+                    f"the standard error of the rotor's angle in run {k + 1}, {fitted.problem.angle_errors[k]:.2g} rad, "
+                    f"changes channel {channel.name!r} by {by_angle:.2g}, and its residuals are {size:.2g}; the "
+                    "intervals do not include this error: use more pulses per turn, or sample them faster"
+                )
             explained.append(np.std(left[valid, c]) / max(float(np.std(raw[valid, c])), 1e-300))
             one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], fitted.problem.angles[k][:, 0], fitted.x.size)
             if one < _CHANCE:
@@ -59,7 +73,7 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
         return FitStatus.not_converged, chance, notes
     if contradicted:
         return FitStatus.contradicted, chance, notes
-    if chance < _CHANCE:
+    if chance < _CHANCE or is_inaccurate:
         return FitStatus.patterned, chance, notes
     return FitStatus.undetermined if found.undetermined.size else FitStatus.found, chance, notes
 

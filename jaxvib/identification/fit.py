@@ -213,9 +213,7 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
     if _largest_change([each / size for each, size in zip(found.noise, deviations, strict=True)]) < 0.3:
         return found._replace(converged=False)  # the model does not resemble the records, and their noise is unknown
     found = _pass(problem, white, found.noise, [found.x])
-    for _ in range(_MAX_PASSES):
-        if not found.converged:
-            break
+    for _ in range(_MAX_PASSES):  # goes on after a pass that has not converged, since its weights were not final
         models = [[autoregression(each[:, k]) for k in range(each.shape[1])] for each in found.residuals]
         new = [np.array([deviation for _, deviation in of_run]) for of_run in models]
         change = _largest_change([after / before for after, before in zip(new, deviations, strict=True)])

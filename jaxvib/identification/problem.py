@@ -62,6 +62,7 @@ class Problem(NamedTuple):
     - `means` and `precisions` (p,): known values of x, and 1/error^2, 0 for a free number
     - `marked`: True if the zero of the rotor's angle is the same mark in all runs
     - `unbalances`: for each exciter its known value, None if it is free
+    - `angle_errors`, rad: standard error of the rotor's angle in each run
     - `notes`: sentences for the reader
     """
 
@@ -76,6 +77,7 @@ class Problem(NamedTuple):
     precisions: np.ndarray
     marked: bool
     unbalances: tuple[Known | None, ...]
+    angle_errors: tuple[float, ...]
     notes: tuple[str, ...]
 
 
@@ -169,6 +171,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
         precisions=1.0 / errors**2,
         marked=all(marked),
         unbalances=unbalances,
+        angle_errors=tuple(max(angle.error for angle in each) for each in angles),
         notes=tuple(dict.fromkeys(notes)),
     )
 
