@@ -31,7 +31,7 @@ def agreement_maps(
 ) -> Drawn:
     """Draw maps over rotor speed and load mass, coloured by the agreement of predicted and exact balancing.
 
-    **Arguments**
+    **Arguments** (S speeds, H load masses)
 
     - `speed` (S,): rotor speed, rad/s, drawn in `unit`
     - `height` (H,): load mass relative to that of the scene, on a log scale

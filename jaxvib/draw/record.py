@@ -81,7 +81,8 @@ def fit_chart(
 ) -> Drawn:
     """Draw the readings of channels and their fit over time, and the residuals relative to their noise in a second panel.
 
-    `time` (n,) is in s, `readings` and `fitted` (n, C) are in SI units, `noise` (C,) is that of the channels `names`.
+    `time` (n,) is in s, `readings` and `fitted` (n, channels) are in SI units, `noise` (channels,) is that of the channels
+    `names`.
 
     >>> import numpy as np
     >>> len(fit_chart(np.arange(3.0), np.zeros((3, 1)), np.ones((3, 1)), np.ones(1), ["frame"]).axes)

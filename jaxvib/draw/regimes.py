@@ -24,8 +24,8 @@ def regime_chart(
 ) -> Drawn:
     """Draw the fractions of regimes as stacked bars, and the speeds of the loads, over their drag.
 
-    `drag` (nd,) is in N s/m, `shares` are fractions (nd,) by regime, and `omega` (nd, ns) and `rotor_speed` are in rad/s, drawn
-    in `unit`.
+    `drag` (n,) is in N s/m, `shares` are fractions (n,) by regime, and `omega` (n, starts) and `rotor_speed` are in rad/s,
+    drawn in `unit`.
 
     >>> import numpy as np
     >>> figure = regime_chart(np.array([1.0, 2.0]), {"jammed": np.array([1.0, 0.5])}, np.ones((2, 3)), 2.0)

@@ -21,7 +21,7 @@ def campbell_diagram(
 ) -> Drawn:
     """Draw whirl speeds over the rotor speed: forward whirls as solid lines, backward whirls dashed.
 
-    **Arguments**
+    **Arguments** (ns rotor speeds, nd whirls at each)
 
     - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl speeds, rad/s, drawn in `unit`
     - `forward` (ns, nd): True for forward whirls
@@ -72,7 +72,8 @@ def _critical_marks(axis: Axes, speed: np.ndarray, forward: np.ndarray, right: f
 
 
 def whirl_lines(speed: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return the lines (k, ns) of whirls of one sense from all speeds (ns, nd); `own` (ns, nd) is True for this sense.
+    """Return the lines (k, ns) of whirls of one sense from all speeds (ns, nd) at ns rotor speeds; `own` is True for this
+    sense.
 
     Each line is the k-th speed of its sense in ascending order, and therefore continuous if speeds of different sense cross. It
     is NaN where fewer speeds have this sense.

@@ -44,7 +44,7 @@ class Dynamics(eqx.Module):
     """Equations of a scene for time integration. Everything that does not change with time is computed once.
 
     The accelerations of the carrier are those without exciters plus those due to the forces of the exciters. P contains, one
-    below the other, the rows of all mounts on which loads or an unbalanced rotor act.
+    below the other, the nP rows of all mounts on which loads or an unbalanced rotor act.
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
     - `input_matrix` M^-1 P^T (nd, nP): acceleration per force on the rows

@@ -53,7 +53,7 @@ class StateSpace(NamedTuple):
 
     Returned by `state_space`.
 
-    **Attributes**
+    **Attributes** (nx states, nu inputs, ny outputs)
 
     - `A` (nx, nx), `B` (nx, nu), `C` (ny, nx), `D` (ny, nu), SI units
     - `states`, `inputs`, `outputs`: a `Signal` (`name`, `unit`) for each entry of x, u and y
@@ -74,12 +74,13 @@ class StateSpace(NamedTuple):
     about: str
 
     def poles(self) -> np.ndarray:
-        """Return the eigenvalues of A, (nx,) complex, 1/s."""
+        """Return the eigenvalues of A, complex, 1/s."""
         return np.linalg.eigvals(self.A)
 
     @validated
     def frequency_response(self, omega: Numbers) -> np.ndarray:
-        """Return C (i w - A)^-1 B + D, the amplitudes of outputs per input at `omega` (nw,) rad/s; shape (nw, ny, nu)."""
+        """Return C (i w - A)^-1 B + D, the amplitudes of outputs per input at `omega`, rad/s; shape (omega, outputs,
+        inputs)."""
         frequencies = np.ravel(np.asarray(numbers(omega, "rad/s", "omega", None), float))[:, None, None]
         inner = np.linalg.solve(1j * frequencies * np.eye(len(self.A)) - self.A, self.B.astype(complex))
         return self.C @ inner + self.D

@@ -35,7 +35,7 @@ _FILTER_LENGTHS = (1, 9, 49, 129, 513)
 """Lengths to which filters are extended, so that a few programs serve all of them."""
 
 _DELAY_MARGIN = 2
-"""Samples before the delayed one in the interpolation of six samples."""
+"""Steps by which readings and model are both delayed in addition, so that the interpolation has samples on both sides."""
 
 
 class Known(NamedTuple):
@@ -53,7 +53,7 @@ class Known(NamedTuple):
 class Problem(NamedTuple):
     """Least-squares problem of an identification.
 
-    **Attributes** (p unknowns x, E exciters)
+    **Attributes** (p unknowns x, E exciters, C channels, n samples)
 
     - `scene` with the known values; `unknowns`, see `Unknowns`
     - `runs`: the samples of each run, padded to whole stretches
@@ -196,7 +196,8 @@ def _require_linear(scene: Scene) -> None:
 
 
 def _singles(scene: Scene, names: Sequence[str], field: str = "unknown") -> list[NamedNumber]:
-    """Return the single numbers of names of numbers and arrays; zeros of arrays, which are absent parts, are left out."""
+    """Return the named numbers, each entry of a named array as one number; zeros of arrays, which are absent parts, are left
+    out."""
     found: dict[str, NamedNumber] = {}
     for name in names:
         for part in present_numbers(scene, find_number(scene, name, field), field):
@@ -293,7 +294,7 @@ def _samples(
 
 
 def with_noise(problem: Problem, filters: Sequence[Sequence[np.ndarray]], noise: Sequence[np.ndarray]) -> Problem:
-    """Return the problem with readings and models filtered to white noise.
+    """Return the problem with readings and models filtered such that the noise of the readings is white.
 
     **Arguments**: for each run and channel, the `filters` (1, a_1, ...), and the standard deviation of the white noise.
     """

@@ -164,7 +164,8 @@ class MeasuredRun(eqx.Module):
         return 1.0 / float(np.median(np.diff(self.times[name])))
 
     def rotor_speed(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return times, s, and the speed of the rotor, rad/s, from the pulses, or else the angle or the speed; None without.
+        """Return times, s, and the speed of the rotor, rad/s, from pulses, else from angle or speed; None without such a
+        channel.
 
         The speed from pulses is the average over each turn.
         """

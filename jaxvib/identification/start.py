@@ -30,7 +30,8 @@ _TIE = 0.05
 def amplitudes(
     readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the speeds (W,), rad/s, the amplitudes (W, C) of the readings at the rotor's angle, and their weights (W, C).
+    """Return the speeds (W,), rad/s, of W stretches, the amplitudes (W, C) of C channels at the rotor's angle, and their
+    weights.
 
     Each stretch of whole turns is fitted by c + a cos(angle) + b sin(angle). The weight compares the amplitude with the rest.
 

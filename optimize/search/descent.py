@@ -1,5 +1,8 @@
 """Descent by Adam (optax) from many starts at once; it keeps held quantities and includes demands by an augmented
-Lagrangian."""
+Lagrangian.
+
+Sizes of arrays: d free parameters, m equations.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Quadratic model of the Lagrangian at a design: second derivatives and the step to the minimum."""
+"""Quadratic model of the Lagrangian at a design: second derivatives and the step to the minimum.
+
+Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), p or
+`parts` pieces of the objective, k pieces beside the largest one, m equations."""
 
 from __future__ import annotations
 
@@ -188,7 +191,7 @@ def solve_model(
 
 
 def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return True (designs, demands) for demands (slopes, excess) that are active after the step.
+    """Return True (s, mi) for demands (slopes, excess) that are active after the step.
 
     An interior-point method leaves small multipliers of inactive demands, which are not small relative to an objective near 0.
     """

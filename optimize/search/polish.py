@@ -1,4 +1,7 @@
-"""Sequential quadratic programming from many designs at once, and the optimality of the results."""
+"""Sequential quadratic programming from many designs at once, and the optimality of the results.
+
+Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), m
+equations."""
 
 from __future__ import annotations
 
@@ -86,7 +89,8 @@ def restore(
     """Change designs as little as possible, to first order, so that they meet their constraints within the bounds.
 
     The constraints are the held quantities, the demands that are violated or marked in `demanded` (designs, demands), and the
-    equality of those pieces of the objective whose weight in `shares` (designs, pieces) is not 0."""
+    equality of those pieces of the objective whose weight in `shares` (designs, pieces) is not 0.
+    """
     m, mi = problem.equalities, len(problem.demands)
     if m + mi == 0 and shares is None:
         return point

@@ -4,6 +4,9 @@ Jams are followed from one design to the next: each search for a jam starts near
 
 Two functions are compiled: the evaluation of a chunk of designs, and a number of steps of the descent (`descent`). Chunks run
 in parallel on all cores.
+
+Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), p pieces of the
+objective, q quantities.
 """
 
 from __future__ import annotations
@@ -44,9 +47,9 @@ class Problem(eqx.Module):
     **Attributes**
 
     - `space`; `objective`
-    - `demands`, without their limits if these are numbers (`Demand.form`); `constants` (demands,): these limits
+    - `demands`, without their limits if these are numbers (`Demand.form`); `constants` (mi,): these limits
     - `keys`: the jams and folds whose load speeds are followed, see `Key`
-    - `scales` (demands,): positive numbers by which the excesses of the demands are divided
+    - `scales` (mi,): positive numbers by which the excesses of the demands are divided
     - `batch_size`: the number of designs in a batch
     - `parts`: the number of smooth pieces whose maximum is the objective
     """

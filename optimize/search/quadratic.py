@@ -1,4 +1,7 @@
-"""Many small quadratic programs at once, by a primal-dual interior-point method."""
+"""Many small quadratic programs at once, by a primal-dual interior-point method.
+
+Sizes of arrays: s problems, d unknowns, me equalities, mi inequalities; n unknowns and m inequalities with slacks.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,7 @@ def solve_penalized(
     Method: Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers have an
     error of at most about a millionth of the penalty.
 
-    **Arguments** (s problems, d unknowns, me equalities, mi inequalities): `hessian` B (s, d, d), positive semidefinite;
+    **Arguments** (s problems): `hessian` B (s, d, d), positive semidefinite;
     `slope` g (s, d); `held` A (s, me, d) and a (s, me); `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d);
     `penalty` (s,).
 

@@ -164,7 +164,8 @@ def amplitude_histories(
 
     `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
     (nt, count) and `rotor_speed` (nt, exciters) are in rad/s, drawn in `unit`, and the foundation force `force` (nt,
-    directions) is in N."""
+    directions) is in N.
+    """
     unit, scale = speed_unit(unit)
     kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)

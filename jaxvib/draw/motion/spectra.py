@@ -25,10 +25,10 @@ def spectrum_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw amplitudes (nf,) by name with unit, on a log scale, over frequency (nf,), with reference lines.
+    """Draw amplitudes (nf,) by name with unit, on a log scale, over nf frequencies, with reference lines.
 
-    Vertical lines are the rotor speeds (1, E), the load speeds (1, L) and the resonances. Frequencies and speeds are in rad/s,
-    drawn in `unit`.
+    Vertical lines are the rotor speeds (1, exciters), the load speeds (1, loads) and the resonances. Frequencies and speeds are
+    in rad/s, drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
@@ -63,10 +63,10 @@ def waterfall_chart(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw amplitudes (P, nf) as shades of grey over time (P,), s, and frequency (nf,); `name` includes their unit.
+    """Draw amplitudes (P, nf) as shades of grey over P times, s, and nf frequencies; `name` includes their unit.
 
-    The rotor speeds (P, E) and the load speeds (P, L) are drawn as lines, resonances as horizontal lines. Frequencies and
-    speeds are in rad/s, drawn in `unit`.
+    The rotor speeds (P, exciters) and the load speeds (P, loads) are drawn as lines, resonances as horizontal lines.
+    Frequencies and speeds are in rad/s, drawn in `unit`.
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.4), ax=ax)

@@ -128,7 +128,7 @@ def _cluster_balance(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalan
 
 
 def starts_of(balance: TorqueBalance, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find speeds (n,) and phases (n, count) close to jams, from sets of `phases` (ns, count) and regular sets.
+    """Find speeds (n,) and phases (n, count) close to jams, from `phases` (sets, count) and regular sets.
 
     At many load speeds the equations are solved for the phases at which all loads need the same multiple of their drag. Each
     pattern is followed to the neighbouring load speeds. If this multiple crosses 1 between two speeds, a jam lies between, and

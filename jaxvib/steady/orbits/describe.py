@@ -63,7 +63,7 @@ class Orbit(Result):
 
     Values are NaN if the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
 
-    **Attributes** (nd coordinates, nb directions of the force)
+    **Attributes** (nd coordinates, nb directions of the force, J and K harmonics)
 
     - `status`: an `OrbitStatus`
     - `residual` of the torque balance, relative
@@ -248,8 +248,8 @@ def orbits(
 ) -> tuple[Orbit, Floquet]:
     """Solve for several exact jams of one machine.
 
-    **Arguments**: `value` (P,): the given speed of each; `start` (P,): initial values of the other speed; `deviation` (P, G,
-    M): initial psi; `steps`, `implicit`: see `floquet`.
+    **Arguments** (P jams, G bodies of loads, M points of the grid): `value` (P,): the given speed of each; `start` (P,):
+    initial values of the other speed; `deviation` (P, G, M): initial psi; `steps`, `implicit`: see `floquet`.
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`.
     """

@@ -1,4 +1,7 @@
-"""Floquet multipliers of periodic jams."""
+"""Floquet multipliers of periodic jams.
+
+Sizes of arrays: P orbits, G bodies of loads (1 if all loads are equal), nd coordinates, K harmonics, m angles.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +106,7 @@ def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: b
 
 class _Coefficients(NamedTuple):
     """Coefficients of the linear equations at one angle: `moving` s e' with its derivatives `moving1` and `moving2`, and
-    `coupling`, s e' minus the part of dry friction, (directions of the port, G, P); derivatives of the torque `by_angle`,
+    `coupling`, s e' minus the part of dry friction, (directions, G, P); derivatives of the torque `by_angle`,
     `by_rate`, (G, P)."""
 
     moving: Array
@@ -197,7 +200,7 @@ class _Disturbances(NamedTuple):
         return acceleration if self.gyroscopic is None else acceleration + self.n * _times(self.gyroscopic, q1) / self.w
 
     def whole_motion(self, c: _Coefficients, x: Array, x1: Array) -> Array:
-        """Return second derivatives of carrier and bodies of loads, x = (Q, d)."""
+        """Return second derivatives of carrier and bodies of loads; x contains their displacements, those of the carrier first."""
         nd = self.stiffness.shape[0]
         (q, d), (q1, d1) = ((part[:nd], part[nd:]) for part in (x, x1))
         t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))

@@ -146,8 +146,8 @@ class WholeMotion(NamedTuple):
 
 
 class _Collocation(NamedTuple):
-    """Equations at the points of a grid: `residual` (n, M); `scale` of its terms; `matrix`, its derivative with respect to all
-    unknowns."""
+    """Equations at the M points of a grid: `residual` (n, M); `scale` of its terms; `matrix`, its derivative with respect to
+    all unknowns."""
 
     residual: Array
     scale: Array
@@ -159,7 +159,7 @@ def _rates(grid: Grid, x: Array) -> tuple[Array, Array]:
 
 
 def residual_of(scene: PeriodicScene, grid: Grid, x: Array, omega: Array) -> Array:
-    """Return d^2 x/dtheta^2 minus the acceleration by the equations of motion at the points, (n, M)."""
+    """Return d^2 x/dtheta^2 minus the acceleration by the equations of motion at the M points, (n, M)."""
     rate, second = _rates(grid, x)
     theta = jnp.asarray(grid.theta, x.dtype)
     return second - jax.vmap(scene.acceleration, in_axes=(0, 1, 1, None), out_axes=1)(theta, x, rate, omega)

@@ -40,9 +40,9 @@ class HarmonicConvergence(Result):
     **Attributes**
 
     - `harmonics` (n,): the highest harmonic of the carrier
-    - `omega` (w,), rad/s, of the jams
-    - `error` (n, w): relative error of the rotor speed, by comparison with twice the largest number of points
-    - `known` (n, w): estimate of this error from each jam alone
+    - `omega` (jams,), rad/s
+    - `error` (n, jams): relative error of the rotor speed, by comparison with twice the largest number of points
+    - `known` (n, jams): estimate of this error from each jam alone
     """
 
     status = Computed.done

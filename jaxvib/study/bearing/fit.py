@@ -41,9 +41,9 @@ class Unknowns(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Result of a fit: the `unknowns`; their `covariance` (p, p), in their order, from the Fisher information with the
-    estimated noise if it is white; `slopes` (n, p), derivatives of the fitted angles; `residual` (n,) rad, fit minus record;
-    `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
+    """Result of a fit with p unknowns and n samples: the `unknowns`; their `covariance` (p, p), in their order, from the Fisher
+    information with the estimated noise if it is white; `slopes` (n, p), derivatives of the fitted angles; `residual` (n,) rad,
+    fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
 
     unknowns: Unknowns
     covariance: Array
