@@ -1,7 +1,8 @@
 """Sequential quadratic programming from many designs at once, and the optimality of the results.
 
 Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), m
-equations."""
+equations.
+"""
 
 from __future__ import annotations
 

@@ -200,7 +200,7 @@ class _Disturbances(NamedTuple):
         return acceleration if self.gyroscopic is None else acceleration + self.n * _times(self.gyroscopic, q1) / self.w
 
     def whole_motion(self, c: _Coefficients, x: Array, x1: Array) -> Array:
-        """Return second derivatives of carrier and bodies of loads; x contains their displacements, those of the carrier first."""
+        """Return second derivatives of carrier and bodies; x contains their displacements, those of the carrier first."""
         nd = self.stiffness.shape[0]
         (q, d), (q1, d1) = ((part[:nd], part[nd:]) for part in (x, x1))
         t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
