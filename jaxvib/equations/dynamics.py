@@ -33,8 +33,8 @@ from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, t
 
 
 class _Support(eqx.Module):
-    """Place of a `SupportForce`: `rows` (k, nd) of its displacements; `input_matrix` (nd, k), accelerations per force at this
-    place."""
+    """Place of a `SupportForce`: `rows` (k, nd), rows q are its k displacements; `input_matrix` (nd, k), accelerations per
+    force at this place."""
 
     rows: Array
     input_matrix: Array

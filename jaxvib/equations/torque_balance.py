@@ -1,8 +1,8 @@
 """Balance of the mean torques on rotating masses that turn at one speed: influence coefficients, vibrational torques.
 
 The angle of rotating mass k in the fixed frame is th_k = sigma_k (Omega t + alpha_k), with sigma_k = +1 anticlockwise, -1
-clockwise, and e_k = (1, -i sigma_k). B_k (np, nd) are the rows of its point, S_k is its unbalance, and L_k its driving torque:
-that of the drag on a load, T(Omega) of the motor of an unbalance. With D(w) = K - w^2 M + i w (C + n G),
+clockwise, and e_k = (1, -i sigma_k). The displacement of its point is B_k q, S_k is its unbalance, and L_k its driving
+torque: that of the drag on a load, T(Omega) of the motor of an unbalance. With D(w) = K - w^2 M + i w (C + n G),
 
     H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k
     V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 @click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
 @click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
 @click.option(
-    "--until", help="Duration of the run if no jam is compared, such as 20s [100 slowest natural periods after the run-up]."
+    "--until",
+    help="Duration of the run if no jam is compared, such as 20s [100 periods of the lowest natural frequency after the "
+    "run-up].",
 )
 @click.option("--start", type=click.Choice(["rest", "turning"]), help="Initial state of a run, in place of a jam.")
 @click.option(

@@ -162,7 +162,7 @@ class Stop(_Support):
         return (SupportForce(self.rows, self.energy, self.resistance),)
 
     def rows(self, machine: Machine) -> Array:
-        """Return the rows of the place on a `machine`, (1, nd) or (2, nd).
+        """Return the matrix (1, nd) or (2, nd) that gives the displacement of the place on a `machine` with nd coordinates.
 
         **Raises** `InputError` for a ring with a `side` other than "both".
         """

@@ -221,8 +221,8 @@ class SupportForce:
 
     **Attributes**
 
-    - `rows`: function of the machine that returns rows (k, nd); rows q are the displacements x of the supported point, see
-      `Machine.rows_at`
+    - `rows`: function of the machine that returns a matrix (k, nd); rows q are the k displacements x of the supported point,
+      see `Machine.rows_at`
     - `energy`, J: function of x
     - `resistance`: function of x and its rate, the dissipative force on the foundation, (k,) N; or None
     - `is_smooth`: True if the force has all derivatives

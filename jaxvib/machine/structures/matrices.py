@@ -54,7 +54,7 @@ class MatrixMachine(Machine):
         return Mount(rows=(rows[: len(axes)],), axes=axes, gyroscopic=self.gyroscopic, turn=turn)
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the rows of the place with this number, from 1; None is the first place."""
+        """Return the matrix that gives the displacement of the place with this number, from 1; None is the first place."""
         return self._all_rows(place, name)[:2]
 
     def _all_rows(self, place: Place, name: str) -> Array:
@@ -82,14 +82,14 @@ def from_matrices(
     and rotation. The coordinates of the machine are then the modal amplitudes r. Displacements, forces and speeds at the
     places are those of the model; amplitudes of coordinates are not.
 
-    **Arguments** (numbers and arrays in SI; nd coordinates of the model)
+    **Arguments** (numbers and arrays in SI; nd coordinates of the model, nb directions of the force)
 
     - `mass` M and `stiffness` K (nd, nd), symmetric, M positive definite, K without negative eigenvalues
     - `damping` C (nd, nd)
     - `gyroscopic` G (nd, nd): G times the rotor speed n times q' is a force; skew-symmetric. None without a rotor
     - `places`: a list of points at which exciters may sit, numbered from 1 in `Exciter(at=)`. Each is a list of the indices
-      of its coordinates, [up], [across, up] or [across, up, rotation], or an array (1 to 3, nd) of rows; all places have the
-      same number of directions
+      of its coordinates, [up], [across, up] or [across, up, rotation], or a matrix (1 to 3, nd) that gives its
+      displacement from q; all places have the same number of directions. "Across" is horizontal
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or across
       and up (nb = 2); default: the force is not known and given as 0
     - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
@@ -169,7 +169,7 @@ def _read_places(places: Any, size: int) -> Array:
 
 
 def _read_rows(place: Any, name: str, size: int) -> Array:
-    """Return the rows of a place from the indices of its coordinates, or from rows."""
+    """Return the matrix that gives the displacement of a place, from the indices of its coordinates or from a matrix."""
     if np.ndim(place) == 1 and all(is_real(each) and int(each) == each for each in place):
         wrong = [int(each) for each in place if not 0 <= each < size]
         if wrong or not 1 <= len(place) <= 3:

@@ -162,7 +162,8 @@ class _Bodies(Machine):
         return Mount(rows=(rows,), axes=(0, 1), turn=jnp.asarray(turn, rows.dtype))
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the rows of the point (x, y) of a body, m from its centre of mass; None is the centre of mass."""
+        """Return the matrix that gives the displacement of a point (x, y) of a body, m from its centre of mass; None: the
+        centre."""
         point, body = (place.at, place.body) if isinstance(place, BodyPoint) else (place, 0)
         dtype = self._inertias()[0][0].dtype
         if point is None:

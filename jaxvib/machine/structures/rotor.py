@@ -96,7 +96,7 @@ class Rotor(Machine):
         )
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the rows of the point of the axis at a distance from the mass centre, m.
+        """Return the matrix that gives the displacement of the point of the axis at a distance from the mass centre, m.
 
         None is the common station of the loads, or the mass centre if each load has its own.
         """
