@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.exchange.recordings import formats
+from jaxvib.exchange.recordings.overview import overview_of
 
 T = np.arange(0.0, 2.0, 1e-3)
 FRAME = np.sin(60.0 * T) + 0.2 * np.cos(131.0 * T)
@@ -243,3 +245,17 @@ def test_missing_library_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "nptdms", None)
     with pytest.raises(jv.InputError, match=r"nptdms is not installed; install it with: pip install '.\[tdms\]'"):
         jv.read_recording(tmp_path / "run.tdms")
+
+
+def test_rate_of_a_recording_does_not_depend_on_its_start(tmp_path):
+    rows = [f"{5.0 + 0.01 * k:.2f},{np.sin(0.3 * k):.6f}" for k in range(200)]
+    (tmp_path / "run.csv").write_text("time [s],frame [g]\n" + "\n".join(rows) + "\n")
+    (found,) = map(overview_of, jv.read_recording(tmp_path / "run.csv"))
+    assert found.rate == pytest.approx(100.0, rel=1e-6) and (found.start, found.end) == (5.0, 6.99)
+
+
+def test_file_above_the_limit_of_size_is_refused(tmp_path, monkeypatch):
+    write_csv(tmp_path / "run.csv")
+    monkeypatch.setattr(formats, "_MAX_BYTES", 1000)
+    with pytest.raises(jv.InputError, match=r"is larger than .* GB; split it"):
+        jv.read_recording(tmp_path / "run.csv")

@@ -115,11 +115,21 @@ def fit_swing(
     def states(at: Unknowns) -> tuple[Array, Array]:
         # Give the pendulum the gravity with which its small swings have the trial frequency.
         gravity = at.frequency**2 * inertia / (pendulum.mass * length)
-        retuned = eqx.tree_at(lambda p: p.g, pendulum, gravity)
+        with_frequency = eqx.tree_at(lambda p: p.g, pendulum, gravity)
         solver, adjoint = diffrax.Tsit5(), diffrax.ForwardMode()
         smooth = None if at.dry is None else width
         run = swing_states(
-            retuned, time, at.angle, at.rate, at.viscous, at.dry, smooth, controller_to(TOLERANCE), solver, adjoint, max_steps
+            with_frequency,
+            time,
+            at.angle,
+            at.rate,
+            at.viscous,
+            at.dry,
+            smooth,
+            controller_to(TOLERANCE),
+            solver,
+            adjoint,
+            max_steps,
         )
         return at.offset + run.angle, run.stopped_at
 
