@@ -155,6 +155,10 @@ ONE = np.eye(2)
         (lambda: jv.from_matrices(ONE, ONE, [[1, 1], [0, 1]], places=[[0]]), "machine.stiffness is not symmetric"),
         (lambda: jv.from_matrices(ONE, ONE, ONE * np.nan, places=[[0]]), "machine.stiffness has an entry that is not finite"),
         (lambda: jv.from_matrices("a", ONE, ONE, places=[[0]]), "machine.mass is 'a'; it must be a square array"),
+        (
+            lambda: jv.from_matrices(np.array([[1.0, 2.0], [2.0, 1.0]]), ONE, ONE, places=[[0]]),
+            "machine.mass has the eigenvalue -1; all must be greater than 0",
+        ),
         (lambda: jv.from_matrices(ONE, ONE, ONE, places=[]), r"machine.places is \[\]; it must be a list of places"),
         (
             lambda: jv.from_matrices(ONE, ONE, ONE, places=[[2]]),
