@@ -18,6 +18,11 @@ _BASE: Mapping[str, Mapping[str, int]] = {
     "s": {"s": 1},
     "rad": {"rad": 1},
     "N": {"kg": 1, "m": 1, "s": -2},
+    "W": {"kg": 1, "m": 2, "s": -3},
+    "A": {"A": 1},
+    "V": {"kg": 1, "m": 2, "s": -3, "A": -1},
+    "ohm": {"kg": 1, "m": 2, "s": -3, "A": -2},
+    "H": {"kg": 1, "m": 2, "s": -2, "A": -2},
 }
 """Units as exponents of SI base units."""
 

@@ -51,9 +51,10 @@ class TorqueTable(Motor):
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Speed without a load: the last one at which the torque becomes 0, rad/s."""
-        last = self.torques.shape[0] - 2 - jnp.argmax(self.torques[-2::-1] > 0.0)
-        n, m, torque, after = self.speeds[last], self.speeds[last + 1], self.torques[last], self.torques[last + 1]
-        return n + (m - n) * torque / (torque - after)
+        torque, after = self.torques[:-1], self.torques[1:]
+        is_zero = (torque > 0.0) & (after <= 0.0)  # within the segment
+        share = torque / jnp.where(is_zero, torque - after, 1.0)
+        return jnp.max(jnp.where(is_zero, self.speeds[:-1] + jnp.diff(self.speeds) * share, 0.0))
 
     def torque(self, speed: Array) -> Array:
         """Return the torque on the line of the two nearest points."""
