@@ -41,7 +41,7 @@ class _AppliedForce(Effect):
         def rows(machine: Machine) -> Array:
             return jnp.eye(size, dtype=self.force.dtype)
 
-        return (SupportForce(rows, lambda displacement: -jnp.sum(self.force * displacement), is_smooth=True),)
+        return (SupportForce(rows, lambda displacement: -jnp.sum(self.force * displacement)),)
 
 
 class _SpeedInput(IdealDrive):

@@ -1,6 +1,7 @@
 """State-space models against branches, whirl, averaged growth and finite differences."""
 
 import control
+import equinox as eqx
 import numpy as np
 import pytest
 import scipy.io
@@ -90,6 +91,14 @@ def test_jam_of_opposite_loads_has_its_growth():
     for k in range(len(jams.omega)):
         jam = jams.select(k)
         assert np.max(jv.state_space(scene(), jam).poles().real) == pytest.approx(float(jam.growth), rel=1e-7)
+
+
+def test_state_of_a_jam_does_not_depend_on_its_common_phase():
+    """All phases are shifted by 0.3 rad, and the complex amplitudes with them."""
+    jam = jv.phase_jams(scene()).select(0)
+    turned = (jam.phase + 0.3, jam.displacement * np.exp(0.3j))
+    shifted = eqx.tree_at(lambda j: (j.phase, j.displacement), jam, turned)
+    np.testing.assert_allclose(jv.state_space(scene(), shifted).x0, jv.state_space(scene(), jam).x0, atol=1e-12)
 
 
 def test_jam_outputs_follow_the_jam_over_rotor_speed():

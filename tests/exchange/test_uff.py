@@ -238,6 +238,12 @@ def test_wrong_arguments_of_files_end_in_one_sentence(change, says, tmp_path):
     assert str(error.value).startswith(says) and list(tmp_path.iterdir()) == []
 
 
+def test_frequencies_in_single_precision_are_even(tmp_path):
+    frequencies = np.linspace(1.0, 100.0, 991, dtype=np.float32)
+    path = jv.export_uff(rotor_scene(), tmp_path / "single.unv", frequencies=frequencies)
+    np.testing.assert_allclose(jv.read_uff(path).functions[0].x, frequencies, rtol=1e-5)
+
+
 def test_a_run_has_no_acceleration_and_no_frequencies(run, tmp_path):
     with pytest.raises(jv.InputError, match="quantity is 'acceleration', which a run does not save"):
         jv.export_uff(run, tmp_path / "m.unv", quantity="acceleration")
