@@ -25,7 +25,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError, require_one_of, written
 from jaxvib.exchange.c_code import Written, number_text, write_program
 from jaxvib.exchange.description import Fmi, Variable, describe_model
-from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, named_entries
+from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, named_entries, without_motor_states
 from jaxvib.exchange.optional import require_writable
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
@@ -242,9 +242,9 @@ def _flat(tree: object) -> list[str]:
 def _variables(scene: Scene, equations: Equations, branches: int, step: float) -> list[Variable]:
     """Return all variables in the order of their value references."""
     signals, state = equations.state_signals, equations.states.machine
-    scales = _flat(
-        jax.tree.map(lambda size, leaf: np.full(np.shape(leaf), size), error_scale(state, natural_units(scene)), state)
-    )
+    units = natural_units(scene)
+    units = without_motor_states(units) if equations.by_input else units
+    scales = _flat(jax.tree.map(lambda size, leaf: np.full(np.shape(leaf), size), error_scale(state, units), state))
     nominals = [*scales, *["1.0"] * (len(signals) - len(scales))]
     states = [
         Variable(each.name, each.unit, "output", start, nominal=nominal)

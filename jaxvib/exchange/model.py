@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drives.drive import IdealDrive, Motor
+from jaxvib.machine.drives.drive import IdealDrive, Motor, MotorWrapper
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import SupportForce, Term
 from jaxvib.machine.numbers.named import NamedNumber, numbers_of
@@ -65,30 +66,24 @@ class _SpeedInput(IdealDrive):
         return self.acceleration
 
 
-class _TorqueInput(Motor):
-    """Motor with an additional torque on its rotor. If `motor` is None, only the additional torque acts."""
+class _TorqueInput(MotorWrapper):
+    """Motor with an additional torque on its rotor, or, if `is_alone`, with this torque in place of its own."""
 
-    speed: Array
-    inertia: Array
+    motor: Motor
     extra: Array
-    motor: Motor | None
-    kind: str = eqx.field(static=True, kw_only=True, default="torque_input")
+    is_alone: bool = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, motor: Motor, extra: Array, *, is_alone: bool):
+        self.motor, self.extra, self.is_alone, self.kind = motor, extra, is_alone, "torque_input"
 
     def torque(self, speed: Array) -> Array:
-        """Return the sum of the motor's torque and the additional torque."""
-        return self.extra if self.motor is None else self.motor.torque(speed) + self.extra
+        """Return the steady torque of the motor, unless it is replaced, and the additional torque."""
+        return self.extra if self.is_alone else self.motor.torque(speed) + self.extra
 
     def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
-        """Return the sum of the motor's torque at time `t` and the additional torque."""
-        return self.extra if self.motor is None else self.motor.torque_at(t, speed, states) + self.extra
-
-    def state_units(self) -> tuple[Array, ...]:
-        """Return the typical magnitudes of the states of the motor."""
-        return () if self.motor is None else self.motor.state_units()
-
-    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the time derivatives of the states of the motor."""
-        return () if self.motor is None else self.motor.state_rates(t, speed, states)
+        """Return the torque of the motor at time `t`, unless it is replaced, and the additional torque."""
+        return self.extra if self.is_alone else self.motor.torque_at(t, speed, states) + self.extra
 
 
 class RotorInputs(NamedTuple):
@@ -132,7 +127,7 @@ class Equations(NamedTuple):
     **Attributes**: `rates`: a function (scene, time, states, inputs) -> (rates of the states, outputs); `states` and `inputs`:
     their initial values; `state_signals`, `rate_signals`, `input_signals` and `output_signals`: a `Signal` for each entry, in
     the order of the arrays of the tree (leaves of `jax.tree`). In `rate_signals` only the rates of velocities have a signal;
-    the other entries are None.
+    the other entries are None. `by_input`: True if inputs replace the drives.
     """
 
     rates: Callable[[Scene, Array, States, Inputs], tuple[States, Outputs]]
@@ -142,6 +137,7 @@ class Equations(NamedTuple):
     rate_signals: list[Signal | None]
     input_signals: list[Signal]
     output_signals: list[Signal]
+    by_input: bool
 
 
 def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
@@ -149,6 +145,8 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
     carrier = scene.machine.structure()
     zero = np.zeros((), carrier.mass.dtype)
     by_input = drive == "input"
+    if by_input:
+        start = without_motor_states(start)
     rotors, angles = [], []
     input_signals, output_signals = list(force_inputs(carrier)), list(foundation_forces(carrier))
     angle_signals = []
@@ -186,7 +184,13 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
     acceleration = iter(coordinate_signals(carrier, "acceleration", 2))
     own = [next(acceleration) if each.name.startswith("velocity.") else None for each in signals]
     inputs, states = Inputs(np.zeros(carrier.mass.shape[0], zero.dtype), tuple(rotors)), States(start, tuple(angles))
-    return Equations(rates, states, inputs, signals, own, input_signals, output_signals)
+    return Equations(rates, states, inputs, signals, own, input_signals, output_signals, by_input)
+
+
+def without_motor_states(state: State) -> State:
+    """Return a state, or its units, without the states of motors beside the angle and the speed of the rotor."""
+    exciters = [replace(own, rotor=None if own.rotor is None else own.rotor[:2]) for own in state.exciters]
+    return replace(state, exciters=exciters)
 
 
 def _rotor_signals(place: str) -> list[Signal]:
@@ -199,7 +203,7 @@ def _driven(exciter: Exciter, angle: Array | None, given: RotorInputs, by_input:
     """Return the exciter with a drive to which the inputs are applied."""
     drive, sign = exciter.drive, float(exciter.direction)
     if isinstance(drive, Motor):
-        turned = _TorqueInput(drive.speed, drive.inertia, sign * given.torque, None if by_input else drive)
+        turned = _TorqueInput(drive, sign * given.torque, is_alone=by_input)
     elif angle is not None:
         turned = _SpeedInput(sign * given.speed, sign * angle, sign * given.acceleration)
     else:

@@ -25,6 +25,9 @@ from jaxvib.units import Bounds, Number
 MOTIONS = ("acceleration", "velocity", "displacement", "force")
 """Kinds of channels that are compared with the model."""
 
+UNUSED = ("torque", "current")
+"""Kinds of channels that a fit does not use."""
+
 _UNEVEN = 0.02
 """Largest deviation of a sample from the even grid, in steps."""
 
@@ -147,6 +150,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
             errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
 
     notes = [note for run in runs for note in run.notes]
+    notes += [f"{run.source}: channel {c.name!r} of kind {c.kind} is not used" for run in runs for c in run.of_kind(*UNUSED)]
     angles = [rotor_angles(_changed(scene, run), run) for run in runs]
     notes += [note for each in angles for angle in each for note in angle.notes]
     marked = [all(angle.marked for angle in each) for each in angles]

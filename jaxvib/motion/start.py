@@ -265,6 +265,10 @@ def validate_state(scene: Scene, state: State, mode: int | None, separation: Num
                 )
                 problem = f"under the drive {quoted(exciter.drive.kind)} it must be {motor if own.rotor is None else ideal}"
                 raise InputError("start.rotor", f"is {quoted(own.rotor)}; {problem}")
+            needed = 2 + len(exciter.drive.state_units())
+            if own.rotor is not None and len(own.rotor) != needed:
+                problem = f"has {len(own.rotor)} entries; {needed} are needed: angle, speed and the states of the motor"
+                raise InputError("start.rotor", problem)
             if exciter.loads is not None:
                 _require_shapes(own, angle=exciter.loads.count, rate=exciter.loads.count)
             elif own.angle or own.rate:

@@ -320,6 +320,16 @@ def test_force_on_a_platform_enters_its_equation(opened):
 
 
 @needs_compiler
+def test_torque_input_replaces_a_motor_and_its_current(tmp_path):
+    motor = jv.DCMotorElectrical("24 V", "0.6 ohm", 0.08, inertia=0.05, inductance="2 mH")
+    scene = jv.Scene(machines()["one_mass"], exciters=[jv.Exciter(drive=motor, unbalance=1e-9)])
+    unit = jv.export_fmu(scene, tmp_path / "m.fmu", drive="input")
+    names = {each.name for each in fmpy.read_model_description(str(unit.path)).modelVariables}
+    assert validate_fmu(str(unit.path)) == [] and {"rotor.angle", "rotor.speed", "rotor.torque"} <= names
+    assert not any(name.startswith("motor.state") for name in names)
+
+
+@needs_compiler
 def test_rotor_of_a_motor_follows_the_torque_input_alone(opened):
     found = exported("imbalance and a motor", drive="input")
     assert validate_fmu(found.path) == []

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.drives.drive import INERTIA, ConstantSpeed, Drive, IdealDrive, Motor
+from jaxvib.machine.drives.drive import INERTIA, ConstantSpeed, Drive, IdealDrive, Motor, MotorWrapper
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, Numbers
 from jaxvib.units.known import when_known
@@ -169,7 +169,7 @@ def _require_steady_speed(speeds: np.ndarray) -> None:
         raise InputError("drive.speeds", problem)
 
 
-class Converter(Motor):
+class Converter(MotorWrapper):
     """Motor on a frequency or voltage converter, which varies the motor's no-load speed over time.
 
         T(t, theta') = T_motor(theta' + n_motor - n(t))
@@ -207,11 +207,6 @@ class Converter(Motor):
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Working speed of the reference."""
         return self.reference.speed
-
-    @property
-    def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Inertia of the motor's rotor."""
-        return self.motor.inertia
 
     def torque(self, speed: Array) -> Array:
         """Return the torque at the rotor's `speed` while the reference is at its working speed."""

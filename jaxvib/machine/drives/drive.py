@@ -466,7 +466,35 @@ def kloss_torque(slip: Array, breakdown_torque: Array, breakdown_slip: Array) ->
     return 2.0 * breakdown_torque * slip * breakdown_slip / (slip**2 + breakdown_slip**2)
 
 
-class SwitchedOff(Motor):
+class MotorWrapper(Motor):
+    """Motor that changes the torque of another one, `motor`; everything else is that of `motor`."""
+
+    motor: eqx.AbstractVar[Motor]
+
+    @property
+    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Speed of the motor without a load."""
+        return self.motor.speed
+
+    @property
+    def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Inertia of the motor's rotor."""
+        return self.motor.inertia
+
+    def state_units(self) -> tuple[Array, ...]:
+        """Return the typical magnitudes of the states of the motor."""
+        return self.motor.state_units()
+
+    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the rates of the `states` of the motor at time `t` (s) and the rotor's `speed` (rad/s)."""
+        return self.motor.state_rates(t, speed, states)
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        """Return the times of the motor's jumps."""
+        return self.motor.jump_ts()
+
+
+class SwitchedOff(MotorWrapper):
     """Motor that is switched off at a time and then turns with the friction of its bearings only.
 
         T = torque of the motor  (t < at),    T = -bearing theta'  (t >= at)
@@ -499,16 +527,6 @@ class SwitchedOff(Motor):
         self.motor, self.kind = motor, "switched_off"
         self.at, self.bearing = read_numbers(SwitchedOff, "drive", at=at, bearing=bearing).values()
 
-    @property
-    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Speed of the motor without a load."""
-        return self.motor.speed
-
-    @property
-    def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Inertia of the motor's rotor."""
-        return self.motor.inertia
-
     def torque(self, speed: Array) -> Array:
         """Return the friction of the bearings."""
         return -self.bearing * speed
@@ -516,14 +534,6 @@ class SwitchedOff(Motor):
     def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
         """Return the torque of the motor at `speed` before the time `at`, afterwards the friction of the bearings."""
         return jnp.where(t < self.at, self.motor.torque_at(t, speed, states), self.torque(speed))
-
-    def state_units(self) -> tuple[Array, ...]:
-        """Return the typical magnitudes of the states of the motor."""
-        return self.motor.state_units()
-
-    def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the rates of the `states` of the motor at time `t` (s) and the rotor's `speed` (rad/s)."""
-        return self.motor.state_rates(t, speed, states)
 
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the time at which the motor is switched off, and the times of the motor's jumps."""

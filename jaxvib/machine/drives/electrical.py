@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -209,6 +211,8 @@ class InductionMotorCircuit(Motor):
     pole_pairs: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
 
+    _KIND: ClassVar[str] = "induction_motor_circuit"
+
     def __init__(
         self,
         voltage: Number,
@@ -233,12 +237,7 @@ class InductionMotorCircuit(Motor):
         }
         for name, value in read_numbers(InductionMotorCircuit, "drive", **given).items():
             setattr(self, name, value)
-        self.pole_pairs = count(pole_pairs, "drive.pole_pairs")
-        self.kind = self._kind()
-
-    @staticmethod
-    def _kind() -> str:
-        return "induction_motor_circuit"
+        self.pole_pairs, self.kind = count(pole_pairs, "drive.pole_pairs"), self._KIND
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -280,9 +279,7 @@ class InductionMotorElectrical(InductionMotorCircuit):
     frame.
     """
 
-    @staticmethod
-    def _kind() -> str:
-        return "induction_motor_electrical"
+    _KIND = "induction_motor_electrical"
 
     def currents(self, states: tuple[Array, ...]) -> tuple[Array, ...]:
         """Return the currents i_s and i_r, two components each, A, from the flux linkages `states`, V s."""

@@ -13,7 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import quantity_text, speed_text
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
-from jaxvib.machine.drives.drive import Motor
+from jaxvib.machine.drives.drive import Motor, MotorWrapper
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene
@@ -101,7 +101,7 @@ class MotorRunUp(Result):
         return self.run.plot(unit=unit, ax=ax)
 
 
-class _Scaled(Motor):
+class _Scaled(MotorWrapper):
     """Motor whose torque is that of another one times a factor."""
 
     motor: Motor
@@ -111,22 +111,11 @@ class _Scaled(Motor):
     def __init__(self, motor: Motor, factor: Array):
         self.motor, self.factor, self.kind = motor, factor, "scaled"
 
-    @property
-    def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.motor.speed
-
-    @property
-    def inertia(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.motor.inertia
-
     def torque(self, speed: Array) -> Array:
         return self.factor * self.motor.torque(speed)
 
     def torque_at(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> Array:
         return self.factor * self.motor.torque_at(t, speed, states)
-
-    def jump_ts(self) -> tuple[Array, ...]:
-        return self.motor.jump_ts()
 
 
 @validated

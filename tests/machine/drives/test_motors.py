@@ -207,3 +207,12 @@ def test_exact_motions_refuse_motors_with_states():
     scene = jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=0.01), jv.Exciter(drive=motor, unbalance=0.01)])
     with pytest.raises(jv.InputError, match=r"^exciters\[0\].drive .*states"):
         jv.synchronous_orbit(scene)
+
+
+def test_start_without_the_states_of_a_motor_is_refused():
+    motor = jv.DCMotorElectrical("24 V", "0.6 ohm", 0.08, 0.05, "1 mH")
+    scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0), exciters=[jv.Exciter(drive=motor, unbalance=0.01)])
+    zero = np.zeros(())
+    start = jv.State(np.zeros(1), np.zeros(1), rotor=(zero, zero))
+    with pytest.raises(jv.InputError, match=r"^start.rotor has 2 entries; 3 are needed: angle, speed and the states"):
+        jv.simulate(scene, 1.0, start=start)
