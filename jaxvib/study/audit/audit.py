@@ -223,6 +223,7 @@ def _comparison(
         except InputError:
             if mode is not None:
                 raise
+    _ = scene.loads  # refuses exciters without loads
     run = RunComparison.of_arguments(scene, until, start)
     name = "a state" if isinstance(run.start, State) else run.start
     return run, f"the motion {run.until:.4g} s after {name}"

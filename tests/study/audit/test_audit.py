@@ -374,3 +374,10 @@ def test_a_status_of_the_computation_is_no_kind_of_motion(status, kind, words, m
     monkeypatch.setattr("jaxvib.study.audit.comparisons.jam_orbit", orbit)
     found = JamComparison(1).exact(BARE)
     assert (found.kind, found.words) == (kind, words)
+
+
+@pytest.mark.parametrize("drive", [jv.ConstantSpeed(40.0), jv.DCMotor(100.0, 3.0, 0.05)], ids=lambda drive: drive.kind)
+def test_exciters_without_loads_are_refused(drive):
+    scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0), exciters=[jv.Exciter(drive=drive, unbalance=0.02)])
+    with pytest.raises(jv.InputError, match=r"^scene.exciters\[0\] has an unbalance; this function needs"):
+        jv.audit(scene)
