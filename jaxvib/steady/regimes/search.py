@@ -174,9 +174,7 @@ def _related(phases: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
         swaps.append(order)
     swapped = [sign * phases[:, order] for order in swaps for sign in (1.0, -1.0)]
     turned = [phases + np.pi * (np.arange(count) == k) for k in range(count)]
-    sets = np.concatenate([*swapped, *turned])
-    sets = np.where(prescribed, 0.0, sets if prescribed.any() else sets - sets[:, :1])
-    return np.asarray(sets, phases.dtype)
+    return np.where(prescribed, 0.0, np.concatenate([*swapped, *turned])).astype(phases.dtype)
 
 
 def _solutions(balance: TorqueBalance, omega: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
