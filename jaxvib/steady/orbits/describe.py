@@ -267,11 +267,7 @@ def orbits(
     resolved = jnp.asarray(steps) <= _MAX_INTEGRATION_STEPS
     limited = min(steps, _MAX_INTEGRATION_STEPS) if isinstance(steps, int) else jnp.where(resolved, steps, 1)
     growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit)
-    roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
-    multipliers = roots**2 if grid.symmetric else roots
-    trivial = growth.trivial**2 if grid.symmetric else growth.trivial
-    largest = jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
-
+    multipliers, trivial, largest = _multipliers_of(growth, grid)
     slope, residual, speed_error, deviation_error, amplitude, force, power, contact_torque = measured
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
@@ -279,25 +275,17 @@ def orbits(
     speed_error = speed_error + tiny  # near a fold the load speed magnifies rounding too
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), deviation_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
-
-    parts = contact_torque < 0.0
-
-    def status(is_met: Array, is_flat: Array, is_good: Array, pulls: Array) -> OrbitStatus:
-        known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.under_resolved)
-        known = OrbitStatus.where(resolved, known, OrbitStatus.unresolved)
-        known = OrbitStatus.where(is_flat, OrbitStatus.at_fold, known)
-        known = OrbitStatus.where(pulls, OrbitStatus.would_separate, known)
-        return OrbitStatus.where(is_met, known, OrbitStatus.not_converged)
+    separates = contact_torque < 0.0
 
     def or_nan(values: Array) -> Array:
         return jnp.moveaxis(jnp.where(met, values, jnp.nan), -1, 0)
 
     orbit = Orbit(
-        status=jax.vmap(status)(met, flat, error <= accuracy, parts),
+        status=jax.vmap(_status, in_axes=(0, 0, 0, None, 0))(met, separates, flat, resolved, error <= accuracy),
         omega=or_nan(motion.omega),
         rotor_speed=or_nan(motion.rotor_speed),
         slope=or_nan(slope),
-        stable=met & resolved & (largest < 1.0) & ~parts,
+        stable=met & resolved & (largest < 1.0) & ~separates,
         multiplier=or_nan(jnp.where(resolved, largest, jnp.nan)),
         multipliers=or_nan(jnp.where(resolved, multipliers, jnp.nan)),
         trivial=or_nan(jnp.where(resolved, trivial, jnp.nan)),
@@ -315,6 +303,24 @@ def orbits(
         offsets=jnp.broadcast_to(model.offsets, (value.shape[0], model.loads.count)),
     )
     return orbit, growth
+
+
+def _multipliers_of(growth: Floquet, grid: Grid) -> tuple[Array, Array, Array]:
+    """Return all multipliers of a period, the trivial one, and the largest modulus."""
+    roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
+    multipliers = roots**2 if grid.symmetric else roots
+    trivial = growth.trivial**2 if grid.symmetric else growth.trivial
+    return multipliers, trivial, jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
+
+
+def _status(met: Array, separates: Array, flat: Array, resolved: Array, accurate: Array) -> OrbitStatus:
+    """Return the status of one motion, the first that applies: equations not met, loads that separate, a fold, stability not
+    resolved, error above the accuracy."""
+    known = OrbitStatus.where(accurate, OrbitStatus.found, OrbitStatus.under_resolved)
+    known = OrbitStatus.where(resolved, known, OrbitStatus.unresolved)
+    known = OrbitStatus.where(flat, OrbitStatus.at_fold, known)
+    known = OrbitStatus.where(separates, OrbitStatus.would_separate, known)
+    return OrbitStatus.where(met, known, OrbitStatus.not_converged)
 
 
 def numbers_of(
