@@ -6,6 +6,7 @@ equations.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -203,67 +204,128 @@ def polish(problem: Problem, point: Point, steps: int, report: Callable[[float, 
     Second derivatives of the Lagrangian are central differences of exact first ones. Violated constraints are penalized; if a
     violation does not vanish at the largest penalty, the constraints contradict each other.
     """
+    searches = _begin(problem, point)
+    history = [searches.point.values[:, 0]]
+    for k in range(steps + 1):
+        index = np.flatnonzero(searches.active)
+        if len(index):
+            here = searches.point.take(index)
+            models, penalty_is_small = _build_models(problem, searches, index, here)
+            if k == steps:
+                break
+            _move(problem, searches, index, here, models, penalty_is_small)
+        history.append(searches.point.values[:, 0])
+        report(min(k + 1, steps) / max(steps, 1), searches.point)
+    point = searches.point
+    return Polished(
+        point, np.asarray(history), searches.remaining_decrease, violation(problem, point), optimality(problem, point)
+    )
+
+
+@dataclasses.dataclass
+class _Searches:
+    """State of the searches from all starts; arrays have a leading axis over the s starts.
+
+    **Attributes**
+
+    - `point`: the best designs so far; `size` of the objective, by which it is scaled
+    - `penalty` of violated constraints, and `trust_radius`: the largest change of a free parameter, relative to its range
+    - `multipliers` of the constraints and `shares` of the pieces of the objective, from the last models
+    - `second`: second derivatives; they are computed anew for designs that have `changed`
+    - `active`: True until a search ends
+    - `remaining_decrease` of the objective that the model predicts, relative
+    """
+
+    point: Point
+    size: np.ndarray
+    penalty: np.ndarray
+    trust_radius: np.ndarray
+    multipliers: np.ndarray
+    shares: np.ndarray
+    second: np.ndarray
+    active: np.ndarray
+    changed: np.ndarray
+    remaining_decrease: np.ndarray
+
+
+def _begin(problem: Problem, point: Point) -> _Searches:
+    """Return the searches at their starts, after a correction of the constraints."""
     if problem.parts > 1:  # the descent does not compute the pieces of the objective
         point = evaluate(problem, point.z, point.speeds)
     size = np.maximum(np.abs(point.values[:, 0]), 1e-9 * np.max(np.abs(point.slopes[:, 0]), axis=1))
     size = np.where(size > 0.0, size, 1.0)
-    penalty, trust_radius = np.full(len(point.z), 10.0), np.full(len(point.z), 0.2)
     point = restore(problem, point, 2)
+    starts, free = point.z.shape
     multipliers = _initial_multipliers(problem, point) / size[:, None]
-    shares = np.zeros((len(point.z), problem.parts))
-    shares[np.arange(len(shares)), np.argmax(point.pieces, axis=1) if problem.parts > 1 else 0] = 1.0
-    second = np.zeros((len(point.z), point.z.shape[1], multipliers.shape[1] + problem.parts + 1, point.z.shape[1]))
+    shares = np.zeros((starts, problem.parts))
+    shares[np.arange(starts), np.argmax(point.pieces, axis=1) if problem.parts > 1 else 0] = 1.0
     active = point.exists()
-    changed = active.copy()
-    remaining_decrease = np.full(len(point.z), np.inf)
-    history = [point.values[:, 0]]
-    for k in range(steps + 1):
-        index = np.flatnonzero(active)
-        if len(index):
-            here = point.take(index)
-            if np.any(changed):
-                second[changed] = second_derivatives(problem, point.take(np.flatnonzero(changed)))
-            hessians = curvatures(problem, here, second[index], multipliers[index], shares[index], size[index])
-            models = [
-                solve_model(problem, here, hessian, size[index], penalty[index], trust_radius[index]) for hessian in hessians
-            ]
-            model = models[0]
-            decreases = [predicted_decrease(problem, here, b, m, size[index]) for b, m in zip(hessians, models, strict=True)]
-            remaining_decrease[index] = np.minimum(decreases[0], decreases[-1])
-            dual = np.concatenate([model.held, model.demands], axis=1)
-            # A constraint whose penalty is below its multiplier stays violated although it could be met.
-            penalty_is_small = np.max(np.abs(dual), axis=1, initial=0.0) > 0.9 * penalty[index]
-            penalty[index] = np.where(penalty_is_small, np.minimum(10.0 * penalty[index], _MAX_PENALTY), penalty[index])
-            if k == steps:
-                break
-            trials = [_trial_point(problem, here, each, size[index], penalty[index]) for each in models]
-            merits = [_merit(problem, each, size[index], penalty[index]) for each in trials]
-            first = merits[0] <= merits[-1]
-            new, new_merit = trials[0].where(first, trials[-1]), np.minimum(merits[0], merits[-1])
-            merit = _merit(problem, here, size[index], penalty[index])
-            better = _is_better(problem, here, new, merit, new_merit, remaining_decrease[index])
-            point = point.put(index, new.where(better, here))
-            step = np.max(np.abs(np.where(first[:, None], models[0].p, models[-1].p)), axis=1)
-            radius = trust_radius[index]
-            trust_radius[index] = np.where(better, np.where(step > 0.9 * radius, 2.0 * radius, radius), 0.25 * step)
-            trust_radius = np.clip(trust_radius, 1e-9, 0.5)
-            multipliers[index] = np.clip(dual, -1e6, 1e6)
-            shares[index] = model.shares
-            least = violation(problem, here) < 1e-10
-            at_rest = (
-                least
-                & ~penalty_is_small
-                & (
-                    (remaining_decrease[index] < _HIDDEN_DECREASE)
-                    | (~better & (remaining_decrease[index] < _UNREACHABLE_DECREASE))
-                )
-            )
-            active[index] = ~(at_rest | (~better & (trust_radius[index] <= 1e-9)))
-            changed = np.zeros_like(active)
-            changed[index] = better & active[index]
-        history.append(point.values[:, 0])
-        report(min(k + 1, steps) / max(steps, 1), point)
-    return Polished(point, np.asarray(history), remaining_decrease, violation(problem, point), optimality(problem, point))
+    return _Searches(
+        point,
+        size,
+        np.full(starts, 10.0),
+        np.full(starts, 0.2),
+        multipliers,
+        shares,
+        np.zeros((starts, free, multipliers.shape[1] + problem.parts + 1, free)),
+        active,
+        active.copy(),
+        np.full(starts, np.inf),
+    )
+
+
+def _build_models(problem: Problem, searches: _Searches, index: np.ndarray, here: Point) -> tuple[list[Step], np.ndarray]:
+    """Return steps of the searches `index` from `here` by quadratic models, and True where the penalty was too small.
+
+    Updates the second derivatives, the penalties and the remaining decreases.
+    """
+    size = searches.size[index]
+    if np.any(searches.changed):
+        searches.second[searches.changed] = second_derivatives(problem, searches.point.take(np.flatnonzero(searches.changed)))
+    hessians = curvatures(problem, here, searches.second[index], searches.multipliers[index], searches.shares[index], size)
+    penalty, radius = searches.penalty[index], searches.trust_radius[index]
+    models = [solve_model(problem, here, hessian, size, penalty, radius) for hessian in hessians]
+    decreases = [predicted_decrease(problem, here, b, m, size) for b, m in zip(hessians, models, strict=True)]
+    searches.remaining_decrease[index] = np.minimum(decreases[0], decreases[-1])
+    # A constraint whose penalty is below its multiplier stays violated although it could be met.
+    penalty_is_small = np.max(np.abs(_dual(models[0])), axis=1, initial=0.0) > 0.9 * penalty
+    searches.penalty[index] = np.where(penalty_is_small, np.minimum(10.0 * penalty, _MAX_PENALTY), penalty)
+    return models, penalty_is_small
+
+
+def _dual(model: Step) -> np.ndarray:
+    """Return the multipliers of all constraints of a model."""
+    return np.concatenate([model.held, model.demands], axis=1)
+
+
+def _move(
+    problem: Problem,
+    searches: _Searches,
+    index: np.ndarray,
+    here: Point,
+    models: list[Step],
+    penalty_is_small: np.ndarray,
+) -> None:
+    """Take the better one of the steps if it improves the design, adapt the trust region, and end searches at rest."""
+    size, penalty, radius = searches.size[index], searches.penalty[index], searches.trust_radius[index]
+    remaining_decrease = searches.remaining_decrease[index]
+    trials = [_trial_point(problem, here, each, size, penalty) for each in models]
+    merits = [_merit(problem, each, size, penalty) for each in trials]
+    first = merits[0] <= merits[-1]
+    new, new_merit = trials[0].where(first, trials[-1]), np.minimum(merits[0], merits[-1])
+    merit = _merit(problem, here, size, penalty)
+    better = _is_better(problem, here, new, merit, new_merit, remaining_decrease)
+    searches.point = searches.point.put(index, new.where(better, here))
+    step = np.max(np.abs(np.where(first[:, None], models[0].p, models[-1].p)), axis=1)
+    radius = np.clip(np.where(better, np.where(step > 0.9 * radius, 2.0 * radius, radius), 0.25 * step), 1e-9, 0.5)
+    searches.trust_radius[index] = radius
+    searches.multipliers[index] = np.clip(_dual(models[0]), -1e6, 1e6)
+    searches.shares[index] = models[0].shares
+    is_met, is_stuck = violation(problem, here) < 1e-10, ~better & (remaining_decrease < _UNREACHABLE_DECREASE)
+    at_rest = is_met & ~penalty_is_small & ((remaining_decrease < _HIDDEN_DECREASE) | is_stuck)
+    searches.active[index] = ~(at_rest | (~better & (radius <= 1e-9)))
+    searches.changed = np.zeros_like(searches.active)
+    searches.changed[index] = better & searches.active[index]
 
 
 def _is_better(
