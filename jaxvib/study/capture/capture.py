@@ -223,15 +223,7 @@ def capture(
     if rotation == "none" and not has_term(scene.all_effects, SlipRelease):
         problem = "is 'none', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
         raise InputError("rotation", problem)
-    first_speeds = np.linspace(-1.0, 0.0, _SCAN_SPEEDS + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
-    allowed = (
-        first_speeds.ndim == 1
-        and first_speeds.size > 0
-        and np.all(np.isfinite(first_speeds))
-        and np.all(np.diff(first_speeds) > 0.0)
-    )
-    if not allowed or first_speeds[0] < -1.0 or first_speeds[-1] > 0.0:
-        raise InputError("speeds", f"is {quoted(speeds)}; ascending numbers from -1 to 0 are needed")
+    first_speeds = _ascending(speeds)
     end = 2.0 * np.pi * count(turns, "turns") / float(scene.drive.speed)
     width = float(number(spread, "rad", "spread", low=0.0))
     shifts = random_numbers(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
@@ -273,6 +265,17 @@ def capture(
     uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
     status = CaptureStatus.not_converged if last_change > tolerance else result.status
     return dataclasses.replace(result, last_change=jnp.asarray(last_change), uncertainty=uncertainty, status=status)
+
+
+def _ascending(speeds: Sequence[float] | np.ndarray | None) -> np.ndarray:
+    """Return the initial speeds of a scan, relative to the rotor; by default evenly spaced ones."""
+    if speeds is None:
+        return np.linspace(-1.0, 0.0, _SCAN_SPEEDS + 1)[:-1]
+    given = np.asarray(speeds, dtype=float)
+    is_list = given.ndim == 1 and given.size > 0 and np.all(np.isfinite(given))
+    if not is_list or np.any(np.diff(given) <= 0.0) or given[0] < -1.0 or given[-1] > 0.0:
+        raise InputError("speeds", f"is {quoted(speeds)}; ascending numbers from -1 to 0 are needed")
+    return given
 
 
 def _rolling_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:

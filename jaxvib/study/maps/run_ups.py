@@ -169,24 +169,7 @@ def run_ups(
     if drag is None and given.ndim:
         raise InputError("loads.drag", "differs from load to load; give the values of `drag` for the run-ups")
     drags = jnp.atleast_1d(given)
-    n = scene.loads.count
-    if starts is not None and angles is not None:
-        raise InputError("starts", "cannot be combined with angles; give a number of random starts or the angles")
-    if separation is not None and not (starts is None and angles is None):
-        raise InputError(
-            "separation",
-            f"is {quoted(separation)}; it is only for a single start, leave out starts and angles",
-        )
-    if angles is not None:
-        sets = np.asarray(angles, dtype=float)
-        if sets.ndim != 2 or sets.shape[1] != n or not np.all(np.isfinite(sets)):
-            raise InputError("angles", f"has shape {sets.shape}; (starts, {n}) finite numbers are needed")
-    elif starts is not None:
-        sets = random_numbers(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
-        if has_term(scene.all_effects, LoadInteraction):
-            sets = np.sort(sets, axis=1)  # loads on one track keep the order of their numbers
-    else:
-        sets = np.asarray(initial_state(scene, separation=separation).azimuth)[None]
+    sets = _sets_of_angles(scene, starts, seed, angles, separation)
     count(batch, "batch")
     require_start(scene, State(jnp.zeros(0), jnp.zeros(0), (jnp.asarray(sets),)))
 
@@ -217,6 +200,34 @@ def run_ups(
         omega=folded(omega),
         finished=folded(finished),
     )
+
+
+def _sets_of_angles(
+    scene: Scene,
+    starts: int | None,
+    seed: int,
+    angles: Sequence[Sequence[float]] | None,
+    separation: Number | None,
+) -> np.ndarray:
+    """Return the sets (sets, count) of initial angles: the given ones, `starts` random ones, or that of `initial_state`."""
+    n = scene.loads.count
+    if starts is not None and angles is not None:
+        raise InputError("starts", "cannot be combined with angles; give a number of random starts or the angles")
+    if separation is not None and not (starts is None and angles is None):
+        raise InputError(
+            "separation",
+            f"is {quoted(separation)}; it is only for a single start, leave out starts and angles",
+        )
+    if angles is not None:
+        sets = np.asarray(angles, dtype=float)
+        if sets.ndim != 2 or sets.shape[1] != n or not np.all(np.isfinite(sets)):
+            raise InputError("angles", f"has shape {sets.shape}; (starts, {n}) finite numbers are needed")
+        return sets
+    if starts is None:
+        return np.asarray(initial_state(scene, separation=separation).azimuth)[None]
+    sets = random_numbers(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
+    # Loads on one track keep the order of their numbers.
+    return np.sort(sets, axis=1) if has_term(scene.all_effects, LoadInteraction) else sets
 
 
 @cached
