@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Self, cast
+from typing import TYPE_CHECKING, Self, cast
 
 import equinox as eqx
 import jax
@@ -102,6 +102,15 @@ class LinearModel(Model):
         """
         return jnp.vdot(velocity, self.carrier.damping @ velocity).real / 2.0
 
+    def peak_matrices(self) -> tuple[Array, Array, Array]:
+        """Return M, C and K (nd, nd) at the working speed: peaks of the response are at the poles s of s^2 M + s C + K."""
+        return self.mass, self.damping(self.scene.drive.speed), self.carrier.stiffness
+
+    @property
+    def highest_speed(self) -> Array | None:
+        """Speed, rad/s, above which no steady motion exists; None if there is no such limit."""
+        return None
+
     def modes(self) -> tuple[Array, Array]:
         """Return the undamped natural frequencies (nd,) rad/s, ascending, and the mass-normalised mode shapes (nd, nd).
 
@@ -116,7 +125,7 @@ class LinearModel(Model):
 
         Models of up to 3 coordinates are returned without it, because a direct solution takes no longer.
         """
-        if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mount.gyroscopic is not None:
+        if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mounts[0].gyroscopic is not None:
             return self
         frozen = jax.lax.stop_gradient(self)
         frequencies, shapes = frozen.modes()
@@ -142,38 +151,28 @@ def linear_model(scene: Scene) -> LinearModel:
     return LinearModel(scene, model.carrier, model.mounts, model.supports, mass)
 
 
-class JammedModel(LinearModel):
-    """Linear model of a scene with jammed loads.
+class ExcitedModel(LinearModel):
+    """Linear model under the force of masses that turn together at the speed w: S w^2 Re(f exp(i w t)) on the coordinates.
 
-    It contains the quantities that are equal at all load speeds, so that an analysis computes them once.
-
-    **Attributes**, in addition to those of `LinearModel`: `unbalance` S of the coincident loads, kg m; `drag` sum b_W R^2,
-    N m s; `force_direction` (nd,) complex, the `direction` of the loads' force.
+    **Attributes**, in addition to those of `LinearModel`: `unbalance` S, kg m; `force_direction` f (nd,) complex.
     """
 
-    unbalance: Array
-    drag: Array
-    force_direction: Array
+    if TYPE_CHECKING:  # fields of the subclasses, in their own order
+        unbalance: Array = eqx.field(init=False)
+        force_direction: Array = eqx.field(init=False)
 
     @property
     def direction(self) -> Array:
         """Return `force_direction`."""
         return self.force_direction
 
-    @property
-    def loads(self) -> CircularLoads:
-        """Loads of the scene."""
-        return cast(CircularLoads, self.scene.loads)
-
     def force(self, omega: Array) -> Array:
-        """Return the amplitudes (nd,), N, of the force that loads turning at `omega` exert on the coordinates."""
+        """Return the amplitudes (nd,), N, of the force on the coordinates at the speed `omega` of the masses."""
         return self.unbalance * omega**2 * self.force_direction
 
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
-        """Return `steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
-        if self.mount.gyroscopic is not None and speed is None:
-            problem = "jam modes are defined for platforms; use phase_jams, or jam_orbit near a load speed"
-            raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
+        """Return the complex amplitudes Y (nd,) of the coordinates at the speed `omega` of the masses, and the `speed` of the
+        rotor (default: `omega`), rad/s."""
         modal = self.modal
         if modal is None:
             return small_solve(self.dynamic_stiffness(omega, speed), self.force(omega))
@@ -190,13 +189,39 @@ class JammedModel(LinearModel):
         return jax.lax.custom_linear_solve(product, self.force(omega), solve, symmetric=True)
 
     def forward_acceleration(self, omega: Array) -> Array:
-        """Return w^2 e^H B Y (scalar, m/s^2) at the load speed `omega`: minus the forward circular acceleration of the mount.
+        """Return w^2 f^H Y (scalar, m/s^2) at the speed `omega`: minus the forward circular acceleration of the masses' point.
 
         If the model has a modal form, the cost is O(nd), and there are no derivatives with respect to parameters of the scene.
         """
         if self.modal is None:
             return omega**2 * jnp.sum(jnp.conj(self.force_direction) * self.displacement(omega))
         return self.modal.receptance(omega, self.unbalance * omega**4)
+
+
+class JammedModel(ExcitedModel):
+    """Linear model of a scene with jammed loads.
+
+    It contains the quantities that are equal at all load speeds, so that an analysis computes them once.
+
+    **Attributes**, in addition to those of `LinearModel`: `unbalance` S of the coincident loads, kg m; `drag` sum b_W R^2,
+    N m s; `force_direction` (nd,) complex, the `direction` of the loads' force.
+    """
+
+    unbalance: Array
+    drag: Array
+    force_direction: Array
+
+    @property
+    def loads(self) -> CircularLoads:
+        """Loads of the scene."""
+        return cast(CircularLoads, self.scene.loads)
+
+    def displacement(self, omega: Array, speed: Array | None = None) -> Array:
+        """Return `steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
+        if self.mount.gyroscopic is not None and speed is None:
+            problem = "jam modes are defined for platforms; use phase_jams, or jam_orbit near a load speed"
+            raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
+        return super().displacement(omega, speed)
 
 
 def _real_times(matrix: Array, vector: Array) -> Array:

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
-from jaxvib.equations.linear import LinearModel, linear_model, rotating_direction
+from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
@@ -112,6 +112,76 @@ def assemble_torque_balance(scene: Scene) -> TorqueBalance:
     averaged = eqx.tree_at(lambda field: field.drives, averaged, drives)
     direction = directions[0] if len(directions) == 1 else jnp.concatenate(directions)
     return TorqueBalance(model, averaged, direction, _motor_torque(averaged))
+
+
+class UnbalancedModel(ExcitedModel):
+    """Linear model under the unbalances of exciters that turn at one speed Omega with given phases alpha_k.
+
+        Y = Omega^2 D(Omega)^-1 f,      f = sum_k S_k exp(i alpha_k) B_k^T e_k,     braking torque = -(Omega^4/2) Im(f^H D^-1 f)
+
+    **Attributes**, in addition to those of `ExcitedModel`: the `balance` of torques; `turn` (count,), the complex numbers
+    exp(i alpha_k); `resultant` (np,) kg m, complex: sum_k S_k exp(i alpha_k) e_k, the force per Omega^2 in each direction.
+    Here `unbalance` is 1 and `force_direction` is f.
+    """
+
+    balance: TorqueBalance
+    turn: Array
+    resultant: Array
+    unbalance: Array
+    force_direction: Array
+
+    def dynamic_stiffness(self, omega: Array, speed: Array | None = None) -> Array:
+        """Return D(w) (nd, nd) complex, N/m, of rotors that turn at w; `speed` has no effect."""
+        return super().dynamic_stiffness(omega, self._sense * omega)
+
+    @property
+    def _sense(self) -> float:
+        """Mean direction of rotation: 1 if all rotors turn anticlockwise."""
+        return float(np.mean(self.balance.averaged.directions))
+
+    def peak_matrices(self) -> tuple[Array, Array, Array]:
+        """Return M - i G, C and K, whose poles are those of the response to unbalances."""
+        gyroscopic, carrier = self.mounts[0].gyroscopic, self.carrier
+        mass = self.mass if gyroscopic is None else self.mass - 1j * self._sense * gyroscopic
+        return mass, carrier.damping, carrier.stiffness
+
+    @property
+    def highest_speed(self) -> Array | None:
+        """Speed without a load, up to a small distance; None if an ideal drive turns an unbalance."""
+        if any(self.balance.is_prescribed):
+            return None
+        return self.balance.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
+
+    def motor_torque(self, omega: Array) -> Array:
+        """Return the sum of the torques of all motors at the speed `omega`, N m, at least a tiny positive value."""
+        total = jnp.sum(self.balance.driving_torque(omega))
+        least = jnp.finfo(total.dtype).eps * jnp.sum(self.balance.motor_torque)
+        return jnp.where(total > least, total, least)
+
+    def required_torque(self, omega: Array, displacement: Array) -> Array:
+        """Return the mean torque that each rotor needs, (count,) N m, at the speed `omega` and the amplitudes (nd,)."""
+        forward = omega**2 * (self.balance.direction.conj() @ displacement)
+        return mean_torque(self.balance.unbalance, jnp.conj(self.turn) * forward)
+
+
+def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
+    """Assemble the model of a scene whose exciters have unbalances with `phases` (count,), rad."""
+    balance = assemble_torque_balance(scene)
+    model, turn = balance.model, jnp.exp(1j * phases)
+    each = balance.unbalance * turn
+    ways = [rotating_direction(mount, exciter.direction) for mount, exciter in zip(model.mounts, scene.exciters, strict=True)]
+    return UnbalancedModel(
+        scene=model.scene,
+        carrier=model.carrier,
+        mounts=model.mounts,
+        supports=model.supports,
+        mass=model.mass,
+        balance=balance,
+        turn=turn,
+        resultant=each @ jnp.stack(ways),
+        unbalance=jnp.ones((), model.mass.dtype),
+        force_direction=each @ balance.direction,
+    )
 
 
 def _motor_torque(averaged: Averaged) -> Array:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, overload
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -20,7 +19,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
-from jaxvib.steady.jams.folds import Folds, fold_points
+from jaxvib.steady.jams.folds import Folds, fold_points, spread_points
 from jaxvib.steady.jams.jam import STABILITY_CRITERION, AbstractJam, Jam, branch_points
 from jaxvib.units import Number, count, number
 
@@ -159,10 +158,6 @@ def branches(
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     model = jammed_model(scene).decomposed()
     crowded, resonances = fold_points(model, per_side)
-    # The requested number of points is taken evenly from the dense grid. Points above the range get evenly spaced places in it.
-    inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
-    share = jnp.linspace(0.0, 1.0, points)
-    omega = jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))
-    jams, folds = branch_points(model, omega)
+    jams, folds = branch_points(model, spread_points(crowded, points, top))
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
     return Branches(**fields, resonances=resonances, folds=folds, scene=scene)

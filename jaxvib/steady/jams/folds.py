@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,13 +14,16 @@ from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.coincident import friction_on_light_loads
-from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model
+from jaxvib.equations.linear import ExcitedModel, JammedModel, LinearModel, jammed_model
+from jaxvib.equations.torque_balance import UnbalancedModel
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
+
+Excited = TypeVar("Excited", bound=ExcitedModel)
 
 _GRID_POINTS = 64
 """Number of grid points on each side of each pole in the search for folds."""
@@ -71,8 +74,11 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
     return rotor_speed_at(jammed_model(scene), omega, speed)
 
 
-def rotor_speed_at(model: JammedModel, omega: Array, speed: Array | None = None) -> Array:
-    """Return `jam_rotor_speed` for an assembled scene."""
+def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None) -> Array:
+    """Return `jam_rotor_speed` for an assembled scene.
+
+    For unbalances it is the ratio of the torque of the vibration to that of the motors. Its folds have the same meaning.
+    """
     return _balance(model, omega, speed)[0]
 
 
@@ -95,16 +101,19 @@ def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
     return bracketed_root(residual, speeds[first - 1], speeds[first])
 
 
-def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
-    """Return the rotor speed of `rotor_speed_at` and the amplitudes of the carrier."""
+def _balance(model: ExcitedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
+    """Return the value of `rotor_speed_at` and the amplitudes of the carrier."""
     displacement = model.displacement(omega, speed)
     return _speed_for(model, omega, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement)), displacement
 
 
-def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
-    """Return the rotor speed of light loads at `omega`, from w^2 e^H B Y, m/s^2, see `JammedModel.forward_acceleration`."""
+def _speed_for(model: ExcitedModel, omega: Array, acceleration: Array) -> Array:
+    """Return the value of `rotor_speed_at` at `omega`, from w^2 e^H B Y, m/s^2, see `ExcitedModel.forward_acceleration`."""
     # The torque of the drag is opposite to that of the acceleration -w^2 Y.
     torque = mean_torque(model.unbalance, acceleration)
+    if isinstance(model, UnbalancedModel):
+        return torque / model.motor_torque(omega)
+    assert isinstance(model, JammedModel)
     free = omega + torque / model.drag
     effects = model.scene.all_effects
     if not has_term(effects, ContactFriction):
@@ -116,27 +125,27 @@ def _speed_for(model: JammedModel, omega: Array, acceleration: Array) -> Array:
     return bracketed_root(residual, omega, free)
 
 
-def scanned_speed(model: JammedModel, omega: Array) -> Array:
+def scanned_speed(model: ExcitedModel, omega: Array) -> Array:
     """Return `rotor_speed_at` in modal form, for a search: O(nd) operations, without derivatives with respect to parameters."""
     return _speed_for(model, omega, model.forward_acceleration(omega))
 
 
-def branch_tangent(model: JammedModel, omega: Array) -> tuple[Array, Array, Array]:
+def branch_tangent(model: ExcitedModel, omega: Array) -> tuple[Array, Array, Array]:
     """Return the rotor speed at a load speed, dn/dOmega along the branch, and the amplitudes (nd,) of the carrier."""
     return jax.jvp(lambda w: _balance(model, w), (omega,), (jnp.ones_like(omega),), has_aux=True)
 
 
-def branch_slope(model: JammedModel, omega: Array) -> Array:
+def branch_slope(model: ExcitedModel, omega: Array) -> Array:
     """Return the slope dn/dOmega of the branch."""
     return branch_tangent(model, omega)[1]
 
 
-def scanned_slope(model: JammedModel, omega: Array) -> Array:
+def scanned_slope(model: ExcitedModel, omega: Array) -> Array:
     """Return the slope dn/dOmega of `scanned_speed`."""
     return jax.jvp(partial(scanned_speed, model), (omega,), (jnp.ones_like(omega),))[1]
 
 
-def scanned_slopes(model: JammedModel, omegas: Array) -> Array:
+def scanned_slopes(model: ExcitedModel, omegas: Array) -> Array:
     """Return `scanned_slope` at many load speeds, in blocks if there are many; for 200 platforms this takes a sixth of the
     time."""
     each, block = partial(scanned_slope, model), _BLOCK_SIZE // (2 * model.mass.shape[0])
@@ -144,7 +153,7 @@ def scanned_slopes(model: JammedModel, omegas: Array) -> Array:
 
 
 @eqx.filter_custom_jvp
-def _fold_speed(model: JammedModel, omega: Array) -> Array:
+def _fold_speed(model: ExcitedModel, omega: Array) -> Array:
     """Return `rotor_speed_at` in modal form, with the derivatives of the dense form.
 
     The derivatives are computed only if they are needed.
@@ -159,9 +168,9 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def branch_root(
-    model: JammedModel,
-    exact: Callable[[JammedModel, Array], Array],
-    scanned: Callable[[JammedModel, Array], Array],
+    model: Excited,
+    exact: Callable[[Excited, Array], Array],
+    scanned: Callable[[Excited, Array], Array],
     low: Array,
     high: Array,
     ends: tuple[Array, Array],
@@ -191,10 +200,12 @@ class Pieces(NamedTuple):
     folds: Folds
 
 
-def branch_pieces(model: JammedModel) -> Pieces:
+def branch_pieces(model: ExcitedModel) -> Pieces:
     """Divide the branch at its folds into monotone pieces with mode numbers; empty pieces have low = high."""
     frozen = jax.lax.stop_gradient(model)
     grid, resonances = fold_points(model, _GRID_POINTS)
+    highest = frozen.highest_speed
+    grid = grid if highest is None else jnp.minimum(grid, highest)
     nd = resonances.shape[0]
     grid, slopes = _with_close_folds(partial(scanned_slopes, frozen), grid, 2 * nd)
     falling = slopes < 0.0
@@ -203,7 +214,7 @@ def branch_pieces(model: JammedModel) -> Pieces:
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
     omega = jax.vmap(partial(branch_root, model, branch_slope, scanned_slope))(*ends)
-    end = jnp.maximum(grid[-1:], 2.0 * frozen.scene.drive.speed)
+    end = jnp.maximum(grid[-1:], 2.0 * frozen.scene.drive.speed) if highest is None else highest[None]
     speed = partial(rotor_speed_at, model) if model.modal is None else partial(scanned_speed, frozen)
     speeds = jax.vmap(speed)(jnp.concatenate([omega, end]))
     speeds, speed_end = speeds[:-1], jax.lax.stop_gradient(speeds[-1:])
@@ -268,11 +279,7 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
     """
     resonances, _ = model.modes()
     fixed = jax.lax.stop_gradient(resonances)
-    if model.modal is None:
-        matrices = (model.mass, model.damping(model.scene.drive.speed), model.carrier.stiffness)
-        poles = _poles(*jax.lax.stop_gradient(matrices))
-    else:
-        poles = model.modal.poles
+    poles = _poles(*jax.lax.stop_gradient(model.peak_matrices())) if model.modal is None else model.modal.poles
     top = jnp.maximum(jnp.max(fixed), jnp.max(jnp.abs(poles)))
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]
@@ -289,12 +296,23 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
     return jnp.sort(jnp.maximum(points.ravel(), low)), resonances
 
 
+def spread_points(crowded: Array, points: int, top: Array) -> Array:
+    """Return a number of `points` along a grid of load speeds, ascending, up to `top`.
+
+    They are taken evenly from the dense grid. Points above the range get evenly spaced places in it.
+    """
+    inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
+    share = jnp.linspace(0.0, 1.0, points)
+    return jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))
+
+
 def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
-    """Return the poles: the 2 nd complex s with det(K + s C + s^2 M) = 0."""
+    """Return the poles: the 2 nd complex s with det(K + s C + s^2 M) = 0; of complex matrices also their conjugates."""
     n = mass.shape[0]
-    solved = small_solve(mass, jnp.concatenate([stiffness, damping], axis=1))
+    solved = small_solve(mass, jnp.concatenate([stiffness, damping], axis=1).astype(mass.dtype))
     shift = jnp.concatenate([jnp.zeros((n, n), mass.dtype), jnp.eye(n, dtype=mass.dtype)], axis=1)
-    return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
+    poles = jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
+    return jnp.concatenate([poles, poles.conj()]) if jnp.iscomplexobj(mass) else poles
 
 
 def _first_places(there: Array, size: int, otherwise: int) -> Array:

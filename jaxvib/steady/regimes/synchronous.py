@@ -40,6 +40,7 @@ from jaxvib.steady.jams.phases import degrees
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.steady.regimes.local import (
+    decays,
     implicit_step,
     margin_of,
     quasi_static_growth,
@@ -58,9 +59,6 @@ if TYPE_CHECKING:
 
 _REGIMES_PER_PROGRAM = 16
 """Number of regimes in one program; typical scenes have 2 to 20."""
-
-_MIN_DAMPING = 1e-9
-"""Decay rate, relative to the speed, below which a motion is not called stable, because rounding hides weaker damping."""
 
 
 class RegimeStatus(eqx.Enumeration):
@@ -332,7 +330,7 @@ def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
         "residual": residual,
     }
     kept = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
-    stable = there & (growth < -jnp.maximum(_MIN_DAMPING, 100.0 * eps) * w)
+    stable = there & decays(growth, w)
     return {"status": status, "stable": stable, "can_start": can_start(scene), **kept}
 
 
