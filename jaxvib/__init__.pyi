@@ -70,6 +70,9 @@ from jaxvib.steady.jams.phase_search import PhaseJams, phase_jams
 from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus
 from jaxvib.steady.shapes import ModeShapes, mode_shapes
 
+# Response to unbalances
+from jaxvib.steady.response import Response, ResponseStatus, response
+
 # Synchronous regimes
 from jaxvib.steady.regimes.synchronous import (
     RegimeSearchStatus,
@@ -260,6 +263,10 @@ __all__ = [
     "PhaseJam",
     "PhaseStatus",
     "PhasePattern",
+    # Response to unbalances
+    "response",
+    "Response",
+    "ResponseStatus",
     # Synchronous regimes
     "synchronous_regimes",
     "SynchronousRegimes",

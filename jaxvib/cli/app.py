@@ -132,6 +132,7 @@ _GROUPS = {
         "modes": "modes",
         "criterion": "criterion",
         "whirl": "whirl",
+        "response": "motion.response",
         "regimes": "motion.regimes",
         "stability-map": "motion.stability",
         "onset": "motion.stability",

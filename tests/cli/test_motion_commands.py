@@ -18,6 +18,14 @@ from jaxvib.machine.structures.screens import SCREENS
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
 
+UNBALANCED = """
+machine = { kind = "one_mass", mass = 200.0, stiffness = "800 N/mm", damping = 600.0 }
+
+[[exciters]]
+unbalance = "0.2 kg m"
+drive = { kind = "dc_motor", speed = "1500 rpm", stall_torque = 12.0, inertia = 0.1 }
+"""
+
 
 def read(path):
     with path.open() as file:
@@ -228,3 +236,17 @@ def test_help_imports_nothing_slow_and_lists_the_choices():
     assert options["cost", "quantity"] == QUANTITIES and options["cost", "solvers"] == tuple(SOLVERS)
     machines = tuple(name.replace("_", "-") for name in (*TEMPLATES, *SCREENS))
     assert options["new", "kind"] == (*machines, "design", "identification", "measurement", "sweep")
+
+
+def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
+    (tmp_path / "table.toml").write_text(UNBALANCED)
+    code, out, err = typed("response", "table.toml", "--csv", "curve.csv")
+    assert (code, err) == (0, "") and max(map(len, out.splitlines())) <= 80
+    assert out.count("zone D, ISO 20816-3") == 2 and "jump to, rpm" in out
+    document = json.loads(typed("response", "table.toml", "--json")[1])
+    found = jv.response(jv.load_scene(tmp_path / "table.toml"))
+    speeds = [each["speed"] for each in document["operating_points"]]
+    np.testing.assert_allclose(speeds, found.operating.speed[np.asarray(found.operating.exists)], rtol=1e-12)
+    head, *rows = read(tmp_path / "curve.csv")
+    np.testing.assert_allclose(float(rows[9][head.index("torque (N m)")]), found.torque[9, 0], rtol=1e-7)
+    assert typed("response", "machine.toml")[0] == 2

@@ -1,0 +1,119 @@
+"""jaxvib response."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.output import CSV
+
+
+@app.command("response")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--most", type=SPEED_TYPE, help="Highest speed, such as '2000 rpm' [4/3 of the working speed].")
+@click.option("--points", type=int, default=500, show_default=True, help="Number of speeds.")
+@WITHOUT
+@CSV
+@shared
+def response(scene: Path, most: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
+    """Compute the vibration of SCENE under the unbalances of its exciters over their speed, and the torque that it needs; --out
+    adds a figure.
+
+    The operating points are the speeds at which the torque of the motor is equal to the torque that the vibration needs.
+    Several exciters have the phases of their first stable synchronous regime (`jaxvib regimes`), or equal phases."""
+    import jax  # slow imports, which --help does not need
+    import numpy as np
+
+    loaded = loaded_scene(scene, without)
+    phases = np.zeros(len(loaded.exciters))
+    if len(loaded.exciters) > 1 and all(exciter.loads is None for exciter in loaded.exciters):
+        regimes = jv.synchronous_regimes(loaded)
+        phases = np.asarray(regimes.phases[0]) if np.any(regimes.stable) else phases
+    found = jax.device_get(jv.response(loaded, phases=phases, points=points, most=most))
+    output.picture("response.png", found.plot)
+    output.csv(csv, found, "speed")
+    operating = np.flatnonzero(found.operating.exists).tolist()
+    folds = np.flatnonzero(found.folds.exists).tolist()
+    peaks = found.peaks()
+    measures = ("speed", "amplitude", "phase", "acceleration", "velocity", "exciter_force", "foundation_force")
+    rest = ("transmissibility", "torque", "motor_torque", "power")
+
+    def rows_of(of: object, places: list[int], *names: str) -> list[dict[str, object]]:
+        return [{name: getattr(of, name)[k] for name in names} for k in places]
+
+    document = {
+        "resonances": found.resonances,
+        "phases": phases,
+        "operating_points": rows_of(found.operating, operating, *measures, *rest, "growth", "stable"),
+        "peaks": rows_of(found, peaks, *measures, *rest),
+        "folds": rows_of(found.folds, folds, "speed", "factor", "torque", "lands_at"),
+    }
+
+    def text() -> str:
+        from jaxvib.display import shown_unit, speed_text, speed_unit  # slow import, which --help does not need
+
+        unit, scale = speed_unit()
+        structure = found.scene.machine.structure()
+        kinds = [shown_unit(each, float(np.max(found.amplitude[:, k]))) for k, each in enumerate(structure.units)]
+        moves = [f"{name}, {shown}" for name, (shown, _) in zip(structure.coordinates, kinds, strict=True)]
+
+        def motion(of: jv.Response, k: int, *texts: str) -> list[str]:
+            sizes = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
+            last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
+            return [f"{scale * of.speed[k]:.5g}", *texts, *sizes, *last]
+
+        lines = [f"natural frequencies {speed_text(found.resonances)}"]
+        end = ["force, N", "torque, N m"]
+        if operating:
+            points = found.operating
+            rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]
+            lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
+            lines += [_measures(found, k) for k in operating if points.stable[k]]
+        elif len(found.scene.exciters) > 1:
+            written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases))
+            lines.append(f"phases of the unbalances {written} deg; for speeds and stability use: jaxvib regimes")
+        else:
+            lines.append("the motor supplies the torque that the vibration needs at no speed")
+        if peaks:
+            lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(found, k) for k in peaks]))
+        if folds:
+            rows = [
+                [
+                    f"{scale * found.folds.speed[k]:.5g}",
+                    f"{found.folds.torque[k]:.4g}",
+                    f"{found.folds.factor[k]:.4g}",
+                    f"{scale * found.folds.lands_at[k]:.5g}" if np.isfinite(found.folds.lands_at[k]) else "-",
+                ]
+                for k in folds
+            ]
+            head = [unit, "torque, N m", "times the motor's torque", f"jump to, {unit}"]
+            lines.append(table("folds: the speed jumps if the motor has this torque", head, rows))
+        return "\n".join(lines)
+
+    output.done(document, text, "response", found)
+
+
+def _measures(found: jv.Response, k: int) -> str:
+    """Return the measures of a stable operating point as text."""
+    import numpy as np
+
+    from jaxvib.display import quantity_text, speed_text
+
+    points, structure = found.operating, found.scene.machine.structure()
+    lengths = [name for name, unit in zip(structure.coordinates, structure.units, strict=True) if unit == "m"]
+    amplitudes = points.amplitude[k][[unit == "m" for unit in structure.units]]
+    lines = [
+        f"  {name}: stroke {quantity_text(2.0 * a, 'm', 4)} peak to peak, {g:.3g} g, {1e3 * v:.4g} mm/s RMS "
+        f"(zone {jv.vibration_zone(float(v))}, ISO 20816-3)"
+        for name, a, g, v in zip(lengths, amplitudes, points.acceleration[k], points.velocity[k], strict=True)
+    ]
+    ratio = float(points.transmissibility[k])
+    lines.append(
+        f"  of the exciter's {quantity_text(points.exciter_force[k], 'N', 4)}, {100.0 * ratio:.4g} % reach the foundation"
+    )
+    power = float(np.sum(points.power[k]))
+    lines.append(f"  shaft: {float(np.sum(points.torque[k])):.4g} N m, {power:.4g} W")
+    return "\n".join([f"at {speed_text(points.speed[k])}:", *lines])

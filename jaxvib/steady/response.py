@@ -1,0 +1,406 @@
+"""Response to unbalances over the speed, and the torque that it needs in comparison with that of the motor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.display import quantity_text, speed_text
+from jaxvib.equations.averaged import require_rotating_masses
+from jaxvib.equations.linear import peak_force
+from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, fold_points, scanned_speed, spread_points
+from jaxvib.steady.measures import acceleration_of, rms_velocity_of
+from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.steady.regimes.local import decays, regime_growth
+from jaxvib.units import Number, Numbers, count, number, numbers
+
+if TYPE_CHECKING:
+    from jaxvib.display import SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto
+
+_POINTS_PER_SIDE = 64
+"""Number of speeds on each side of a resonance in the default range."""
+
+
+class ResponseStatus(eqx.Enumeration):
+    """Outcomes of a response at one speed. The value of each member is the message shown to the user."""
+
+    done = "the vibration was computed"
+    unbounded = "an undamped resonance: the vibration grows without bounds"
+    refused = REFUSED
+
+
+class AbstractResponse(eqx.Module):
+    """Vibration q = Re(displacement exp(i w t)) under unbalances that turn at the speed w, for several speeds.
+
+    **Attributes** (nd coordinates, of which nt are displacements in m)
+
+    - `speed` w, rad/s
+    - `displacement` (nd,): complex amplitudes, m or rad; at w t = 0 an unbalance with the phase 0 points in the direction x, or
+      is at the angle 0 for machines that move only up
+    - `amplitude` (nd,), zero to peak, and `phase` (nd,) rad: moduli and arguments of `displacement`
+    - `acceleration` (nt,), in g, and `velocity` (nt,), m/s root mean square, of the coordinates in m
+    - `exciter_force` and `foundation_force`, N zero to peak: resultant of the centrifugal forces, and force on the foundation;
+      for two directions the root of the sum of the squares of their peaks (sqrt 2 times the force that turns)
+    - `transmissibility`: their ratio; inf if the centrifugal forces cancel
+    - `torque` (exciter,), N m: mean torque that each rotor needs to sustain the vibration; `power` (exciter,), W
+    - `motor_torque` (exciter,), N m: torque of each motor at this speed; that of an ideal drive is equal to `torque`
+    - `torque_share`: the sum of `torque` divided by that of `motor_torque`
+
+    Values at an undamped resonance are infinite.
+    """
+
+    speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))
+    displacement: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    phase: Array = eqx.field(metadata=in_unit("rad", "*", "coordinate"))
+    acceleration: Array = eqx.field(metadata=in_unit("", "*", "translation"))
+    velocity: Array = eqx.field(metadata=in_unit("m/s", "*", "translation"))
+    exciter_force: Array = eqx.field(metadata=in_unit("N", "*"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))
+    transmissibility: Array = eqx.field(metadata=in_unit("", "*"))
+    torque: Array = eqx.field(metadata=in_unit("N m", "*", "exciter"))
+    motor_torque: Array = eqx.field(metadata=in_unit("N m", "*", "exciter"))
+    torque_share: Array = eqx.field(metadata=in_unit("", "*"))
+    power: Array = eqx.field(metadata=in_unit("W", "*", "exciter"))
+
+
+class OperatingPoints(AbstractResponse):
+    """Speeds at which the torque of the drive equals the torque that the vibration needs, of a machine with one exciter.
+
+    **Additional attributes**, ascending in `speed`; entries whose `exists` is False are NaN
+
+    - `exists`: True for an operating point
+    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative
+    """
+
+    outer_axes = ("operating_point",)
+
+    exists: Array = eqx.field(metadata=in_unit("", "*"))
+    growth: Array = eqx.field(metadata=in_unit("1/s", "*"))
+    stable: Array = eqx.field(metadata=in_unit("", "*"))
+
+
+class TorqueFolds(eqx.Module):
+    """Folds: speeds at which `torque_share` is a maximum (at a resonance) or a minimum (beyond it).
+
+    **Attributes** (2 nd,), ascending in `speed`; entries whose `exists` is False are NaN
+
+    - `speed`, rad/s
+    - `factor`: `torque_share` at the fold. With a motor of `factor` times the torque, two operating points merge here. At a
+      maximum above 1 the resonance catches the rotor, and a motor that runs up slowly needs `factor` times its torque to pass
+    - `torque`, N m, that the vibration needs at the fold
+    - `lands_at`, rad/s: speed to which a motor of `factor` times the torque jumps, up from a maximum, down from a minimum; NaN
+      if there is no such speed. It has no derivatives
+    - `exists`: True for a fold
+    """
+
+    speed: Array = eqx.field(metadata=in_unit("rad/s", "fold"))
+    factor: Array = eqx.field(metadata=in_unit("", "fold"))
+    torque: Array = eqx.field(metadata=in_unit("N m", "fold"))
+    lands_at: Array = eqx.field(metadata=in_unit("rad/s", "fold"))
+    exists: Array = eqx.field(metadata=in_unit("", "fold"))
+
+
+class Response(AbstractResponse, Result):
+    """Response to unbalances over the speed: the arrays of `AbstractResponse` with a leading axis over the speeds.
+
+    Returned by `response`.
+
+    **Additional attributes**
+
+    - `status`: a `ResponseStatus` for each speed
+    - `operating`: the `OperatingPoints`; no entries for several exciters, see `synchronous_regimes`
+    - `folds`: the `TorqueFolds`; no entries for an ideal drive and for several exciters
+    - `resonances` (nd,), rad/s: natural frequencies, ascending
+    - `scene`
+    """
+
+    outer_axes = ("speed",)
+
+    status: ResponseStatus
+    operating: OperatingPoints = eqx.field(metadata=part(prefix="operating_"))
+    folds: TorqueFolds = eqx.field(metadata=part(prefix="fold_"))
+    resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
+    scene: Scene = eqx.field(metadata=SCENE)
+
+    def peaks(self) -> list[int]:
+        """Return the indices of the speeds at which the foundation force has a maximum."""
+        order = np.unique(np.asarray(self.speed), return_index=True)[1]
+        force = np.asarray(self.foundation_force)[order]
+        inner = (force[1:-1] > force[:-2]) & (force[1:-1] >= force[2:])
+        return order[np.flatnonzero(inner) + 1].tolist()
+
+    def summary(self) -> str:
+        """Return the resonances, the operating points, the peaks of the force and the folds as text."""
+        structure = self.scene.machine.structure()
+        lines = [f"resonances {speed_text(self.resonances)}"]
+
+        def motion(of: AbstractResponse, k: int) -> str:
+            pairs = zip(structure.coordinates, np.asarray(of.amplitude)[k], structure.units, strict=True)
+            moves = ", ".join(f"{name} {quantity_text(a, unit, 4)}" for name, a, unit in pairs)
+            return f"{speed_text(of.speed[k])}: {moves}, foundation force {quantity_text(of.foundation_force[k], 'N', 4)}"
+
+        for k in np.flatnonzero(np.asarray(self.operating.exists)).tolist():
+            stable = "stable" if bool(self.operating.stable[k]) else "unstable"
+            share = f"{float(np.sum(self.operating.torque[k])):.4g} N m"
+            lines.append(f"operating point, {stable}, {share}, at {motion(self.operating, k)}")
+        lines += [f"peak of the force at {motion(self, k)}" for k in self.peaks()]
+        for k in np.flatnonzero(np.asarray(self.folds.exists)):
+            lands = float(self.folds.lands_at[k])
+            jump = f", jump to {speed_text(lands)}" if np.isfinite(lands) else ""
+            lines.append(
+                f"fold at {speed_text(self.folds.speed[k])}: {float(self.folds.factor[k]):.4g} times the motor's torque{jump}"
+            )
+        return "\n".join(lines)
+
+    @validated
+    def plot(
+        self,
+        *,
+        unit: SpeedUnit | None = None,
+        show: Sequence[str] = ("amplitude", "phase", "force", "torque"),
+        ax: Onto = None,
+    ) -> Drawn:
+        """Plot amplitudes, phases, foundation force and torque over the speed, with operating points and folds.
+
+        **Arguments**
+
+        - `unit` of the speeds, "rad/s", "rpm" or "Hz"
+        - `show`: names of the panels, such as `("force",)`
+        - `ax`: axes to draw onto, as many as there are panels
+
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or number of axes.
+        """
+        from jaxvib.draw.motion.response import response_chart  # slow import
+
+        structure, folds, there = self.scene.machine.structure(), self.folds, np.asarray(self.operating.exists)
+        names = ("speed", "amplitude", "phase", "foundation_force")
+
+        def arrays(of: AbstractResponse) -> dict[str, np.ndarray]:
+            torques = {name: np.sum(np.asarray(getattr(of, name)), axis=1) for name in ("torque", "motor_torque")}
+            return {name: np.asarray(getattr(of, name)) for name in names} | torques
+
+        points = arrays(self.operating) | {"stable": np.asarray(self.operating.stable)}
+        return response_chart(
+            arrays(self),
+            {name: values[there] for name, values in points.items()},
+            {"speed": np.asarray(folds.speed), "torque": np.asarray(folds.torque)},
+            np.asarray(self.resonances),
+            names=structure.coordinates,
+            units=structure.units,
+            has_motor=not any(exciter.drive.ideal for exciter in self.scene.exciters),
+            unit=unit,
+            show=show,
+            ax=ax,
+        )
+
+
+@validated
+def response(
+    scene: Scene,
+    speeds: Numbers | None = None,
+    *,
+    phases: Numbers | None = None,
+    points: int = 500,
+    most: Number | None = None,
+) -> Response:
+    """Return the response of a machine to the unbalances of its exciters over their speed, and the torque that it needs.
+
+        Y = w^2 D(w)^-1 f,    f = sum_k S_k exp(i alpha_k) B_k^T e_k,    D = K - w^2 M + i w (C + w G)
+        torque of exciter k = (S_k/2) Im(exp(-i alpha_k) e_k^H B_k w^2 Y)
+
+    S, alpha, e, B: see `synchronous_regimes`. The curve of the torque over the speed has a peak at each resonance (Sommerfeld
+    effect). A motor turns at the speeds at which its torque equals that of the curve, `operating`. If the torque of the motor
+    changes, operating points appear and merge at the `folds` of the curve.
+
+    **Arguments**
+
+    - `scene`, whose exciters have an unbalance and no loads, and whose only effect may be gravity
+    - `speeds`, rad/s, one or a list; typical: 100 to 1000 values; default: `points` from 0 to `most`, denser near resonances
+    - `phases` (exciter,), rad or text, of the unbalances in their directions of rotation, which gears or an ideal
+      synchronisation keep; default: 0
+    - `points`: typical: 200 to 2000 (default: 500), and `most`, rad/s or text: number and highest of the default speeds;
+      default: 4/3 of the working speed
+
+    **Returns** `Response`. Derivatives with respect to all parameters of the scene are exact, except for `growth`, `stable` and
+    `lands_at`, which have none. An undamped resonance has the status `unbounded` and infinite values.
+
+    **Raises** `InputError` for exciters with loads and for effects that this function does not include.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=200.0, stiffness=8e5, damping=600.0)                      # resonance at 604 rpm
+    >>> weak = jv.DCMotor("1500 rpm", stall_torque=12.0, inertia=0.1)
+    >>> found = jv.response(jv.Scene(machine, exciters=[jv.Exciter(drive=weak, unbalance=0.2)]))
+    >>> [round(float(w), 2) for w in found.operating.speed[found.operating.exists]]          # caught below 604 rpm, or passed
+    [61.71, 64.48, 152.13]
+    >>> [round(float(f), 3) for f in found.folds.factor]
+    [1.447, 0.097]
+
+    Source: Sommerfeld 1902; I. I. Blekhman, Vibrational Mechanics, 2000, for the torque; the folds are those of `branches`.
+    """
+    scene = validate_scene(scene)
+    for k, exciter in enumerate(scene.exciters):
+        if exciter.loads is not None:
+            problem = "turn at a speed of their own; this function needs exciters with an unbalance and no loads, use branches"
+            raise InputError(f"{scene.place_of(k)}loads", problem)
+    require_rotating_masses(scene)
+    n = len(scene.exciters)
+    angles = jnp.zeros(n, scene.top_speed.dtype) if phases is None else numbers(phases, "rad", "phases", n)
+    if speeds is None:
+        top = scene.top_speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
+        w = _default_speeds(scene, top, count(points, "points", low=2, each=1e3))
+    else:
+        w = jnp.atleast_1d(numbers(speeds, "rad/s", "speeds", None, low=0.0))
+    return outcome(_response(scene, w, angles), scene)
+
+
+@cached
+def _default_speeds(scene: Scene, top: Array, points: int) -> Array:
+    model = unbalanced_model(scene, jnp.zeros(len(scene.exciters), top.dtype)).decomposed()
+    crowded, _ = fold_points(model, _POINTS_PER_SIDE)
+    return spread_points(crowded, points, top)
+
+
+@cached
+def _response(scene: Scene, speeds: Array, phases: Array) -> Response:
+    model = unbalanced_model(scene, phases).decomposed()
+    status, curve = jax.vmap(partial(_motion_at, model))(speeds)
+    operating, folds = _operation(model)
+    resonances = jax.lax.stop_gradient(model).modes()[0]
+    return Response(**curve, status=status, operating=operating, folds=folds, resonances=resonances, scene=scene)
+
+
+def _motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dict[str, Any]]:
+    """Return the status and the fields of `AbstractResponse` at one speed, rad/s."""
+    # Within a few units in the last place of an undamped resonance the amplitude consists of rounding errors.
+    size = jnp.max(magnitude(model.force_direction)) / jnp.min(jnp.diagonal(model.mass))
+    trial = magnitude(jax.lax.stop_gradient(model).displacement(jax.lax.stop_gradient(omega)))
+    bounded = jnp.all(trial * 100.0 * jnp.finfo(size.dtype).eps < size)
+    z = model.displacement(jnp.where(bounded, omega, 1.01 * omega + 1.0))
+    lengths = np.flatnonzero(np.asarray(model.carrier.units) == "m")
+    amplitude = magnitude(z)
+    exciter, force = peak_force(model.resultant * omega**2), peak_force(model.carrier.foundation_force(z, 1j * omega * z))
+    torque = model.required_torque(omega, z)
+    motor = jnp.where(model.balance.is_prescribed, torque, model.balance.driving_torque(omega))
+    forced = exciter > 0.0
+    ratio = jnp.where(forced, force / jnp.where(forced, exciter, 1.0), jnp.where(omega > 0.0, jnp.inf, 0.0))
+    share = jnp.sum(torque) / model.motor_torque(omega) if model.highest_speed is not None else jnp.ones_like(omega)
+    fields = {
+        "displacement": z,
+        "amplitude": amplitude,
+        "phase": jnp.angle(jnp.where(z == 0.0, 1.0, z)),
+        "acceleration": acceleration_of(amplitude[lengths], omega),
+        "velocity": rms_velocity_of(amplitude[lengths], omega),
+        "foundation_force": force,
+        "transmissibility": ratio,
+        "torque": torque,
+        "torque_share": share,
+        "power": omega * torque,
+    }
+    finite = {name: jnp.where(bounded, value, jnp.inf) for name, value in fields.items()}
+    status = ResponseStatus.where(bounded, ResponseStatus.done, ResponseStatus.unbounded)
+    return status, {**finite, "speed": omega, "exciter_force": exciter, "motor_torque": motor}
+
+
+def _operation(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
+    """Return the operating points and the folds of a machine with one exciter."""
+    none = jnp.zeros(0, model.mass.dtype)
+    no_folds = TorqueFolds(none, none, none, none, none.astype(bool))
+    if len(model.scene.exciters) > 1:
+        return _operating_points(model, none, none.astype(bool)), no_folds
+    if model.highest_speed is None:
+        working = model.balance.speed[None]
+        return _operating_points(model, working, jnp.ones(1, bool)), no_folds
+    pieces = branch_pieces(model)
+    speed, exists = _balanced_speeds(model, pieces)
+    folds = pieces.folds
+    torque = folds.rotor_speed * jax.vmap(model.motor_torque)(folds.omega)
+    lands = _landing_speeds(jax.lax.stop_gradient(model), jax.lax.stop_gradient(pieces))
+    return _operating_points(model, speed, exists), TorqueFolds(folds.omega, folds.rotor_speed, torque, lands, folds.exists)
+
+
+def _balanced_speeds(model: UnbalancedModel, pieces: Pieces) -> tuple[Array, Array]:
+    """Return the speed on each piece of the curve at which the motor supplies the required torque, and if it exists."""
+    top = model.balance.speed
+    # The torque of the motor vanishes at the end of the last piece, whose root can be closer to it than the end of the grid.
+    high = jax.lax.stop_gradient(jnp.where(pieces.high < pieces.high[-1], pieces.high, top))
+    gaps = (jax.vmap(partial(_torque_gap, model))(w) for w in (pieces.low, high))
+    low_gap, high_gap = (jax.lax.stop_gradient(gap) for gap in gaps)
+    high_gap = jnp.where(high < top, high_gap, jnp.maximum(high_gap, 0.0))
+    root = partial(branch_root, model, _torque_gap, _scanned_gap)
+    exists = (pieces.high > pieces.low) & (low_gap * high_gap <= 0.0)
+    return jax.vmap(root)(pieces.low, high, (low_gap, high_gap)), exists
+
+
+def _torque_gap(model: UnbalancedModel, omega: Array) -> Array:
+    """Return the required torque minus that of the motor, N m."""
+    required = jnp.sum(model.required_torque(omega, model.displacement(omega)))
+    return required - jnp.sum(model.balance.driving_torque(omega))
+
+
+def _scanned_gap(model: UnbalancedModel, omega: Array) -> Array:
+    """Return `_torque_gap` in modal form, for a search."""
+    required = scanned_speed(model, omega) * model.motor_torque(omega)
+    return required - jnp.sum(model.balance.driving_torque(omega))
+
+
+def _landing_speeds(model: UnbalancedModel, pieces: Pieces) -> Array:
+    """Return the speed to which the rotor jumps from each fold, (2 nd,) rad/s: the nearest one on a rising piece that has the
+    same share of the torque, above a maximum or below a minimum; NaN if there is none."""
+    number = np.arange(pieces.low.shape[0])
+    rising = (number % 2 == 0) & (pieces.high > pieces.low)
+
+    def landing(fold: Array, share: Array, exists: Array) -> Array:
+        covers = rising & (pieces.speed_low <= share) & (share <= pieces.speed_high)
+        up = covers & (number > fold + 1) & (fold % 2 == 0)
+        down = covers & (number < fold) & (fold % 2 == 1)
+        at = jnp.where(fold % 2 == 0, jnp.argmax(up), number[-1] - jnp.argmax(down[::-1]))
+
+        def gap(model: UnbalancedModel, omega: Array) -> Array:
+            return scanned_speed(model, omega) - share
+
+        ends = pieces.speed_low[at] - share, pieces.speed_high[at] - share
+        root = branch_root(model, gap, gap, pieces.low[at], pieces.high[at], ends)
+        return jnp.where(exists & jnp.any(up | down), root, jnp.nan)
+
+    folds = pieces.folds
+    return jax.vmap(landing)(jnp.asarray(number[:-1]), folds.rotor_speed, folds.exists)
+
+
+def _operating_points(model: UnbalancedModel, speed: Array, exists: Array) -> OperatingPoints:
+    """Return the operating points at speeds, rad/s, of which those `exists` are True."""
+    order = jnp.argsort(jnp.where(exists, speed, jnp.inf))
+    speed, exists = speed[order], exists[order]
+    safe = jnp.where(exists, speed, model.balance.speed)
+    fields = jax.vmap(partial(_motion_at, model))(safe)[1]
+    frozen, at = jax.lax.stop_gradient((model.balance, safe))
+    growth = jax.vmap(lambda w: regime_growth(frozen, w, jnp.zeros(1, w.dtype), 0))(at) if at.size else at
+
+    def kept(value: Array) -> Array:
+        return jnp.where(exists.reshape(exists.shape + (1,) * (value.ndim - 1)), value, jnp.nan)
+
+    return OperatingPoints(
+        **{name: kept(value) for name, value in fields.items()},
+        exists=exists,
+        growth=kept(growth),
+        stable=exists & decays(growth, at),
+    )

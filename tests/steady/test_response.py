@@ -1,0 +1,225 @@
+"""Response to unbalances, and the torque that it needs: against closed forms, dense solutions, SciPy and time integration."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+import jaxvib as jv
+
+MASS, SPRING, DAMPER, S = 200.0, 8e5, 600.0, 0.2
+SPEEDS = np.array([5.0, 40.0, 63.0, 90.0, 160.0])
+
+
+def one_mass(damping=DAMPER, drive=None):
+    drive = jv.ConstantSpeed("1500 rpm") if drive is None else drive
+    machine = jv.one_mass(mass=MASS, stiffness=SPRING, damping=damping)
+    return jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=S)])
+
+
+def motor(torque=12.0):
+    return jv.DCMotor("1500 rpm", stall_torque=torque, inertia=0.1)
+
+
+def needed(w):
+    """Torque b w |Y|^2 / 2 of one mass, N m."""
+    size = S * w**2 / np.abs(SPRING - MASS * w**2 + 1j * w * DAMPER)
+    return DAMPER * w * size**2 / 2.0
+
+
+def body(exciters, at=(0.1, 0.0)):
+    springs = [jv.support(at=(x, -0.2), stiffness=(3e4, 5e4), damping=(150.0, 200.0), angle=0.2) for x in (-0.6, 0.7)]
+    return jv.Scene(jv.plane_body(mass=300.0, inertia=75.0, supports=springs), exciters=exciters)
+
+
+def test_one_mass_has_the_closed_form():
+    found = jv.response(one_mass(), SPEEDS)
+    stiff = SPRING - MASS * SPEEDS**2 + 1j * SPEEDS * DAMPER
+    exact = -1j * S * SPEEDS**2 / stiff  # at w t = 0 the unbalance is at the angle 0, across
+    np.testing.assert_allclose(found.displacement[:, 0], exact, rtol=1e-12)
+    np.testing.assert_allclose(found.phase[:, 0], np.angle(exact), rtol=1e-11)
+    np.testing.assert_allclose(found.torque[:, 0], needed(SPEEDS), rtol=1e-10)
+    np.testing.assert_allclose(found.power[:, 0], SPEEDS * needed(SPEEDS), rtol=1e-10)
+    force = np.abs(exact) * np.hypot(SPRING, SPEEDS * DAMPER)
+    np.testing.assert_allclose(found.foundation_force, force, rtol=1e-12)
+    np.testing.assert_allclose(found.transmissibility, force / (S * SPEEDS**2), rtol=1e-12)
+    np.testing.assert_allclose(found.velocity[:, 0], SPEEDS * np.abs(exact) / np.sqrt(2.0), rtol=1e-12)
+    np.testing.assert_allclose(found.acceleration[:, 0], SPEEDS**2 * np.abs(exact) / 9.80665, rtol=1e-12)
+    assert found.operating.speed.tolist() == [pytest.approx(50.0 * np.pi)] and bool(found.operating.stable[0])
+
+
+def dense(scene, w, phases, senses):
+    """Response of a body in its plane, with its matrices from the machine and the forces written out here."""
+    carrier = scene.machine.carrier()
+    force = np.zeros(3, complex)
+    for exciter, phase, sense in zip(scene.exciters, phases, senses, strict=True):
+        x, y = np.asarray(exciter.at)
+        turning = float(exciter.unbalance) * np.exp(1j * phase) * np.array([1.0, -1j * sense])
+        force += np.array([turning[0], turning[1], x * turning[1] - y * turning[0]])
+    m, c, k = (np.asarray(each) for each in (carrier.mass, carrier.damping, carrier.stiffness))
+    return np.linalg.solve(k - w**2 * m + 1j * w * c, w**2 * force)
+
+
+def test_a_body_under_two_exciters_is_a_dense_solution():
+    drive = jv.ConstantSpeed(80.0)
+    places, senses, phases = ((-0.3, 0.4), (0.35, 0.3)), (1, -1), np.array([0.3, -0.8])
+    scene = body([jv.Exciter(drive=drive, unbalance=0.4, at=at, direction=way) for at, way in zip(places, senses, strict=True)])
+    found = jv.response(scene, SPEEDS, phases=phases)
+    exact = np.stack([dense(scene, w, phases, senses) for w in SPEEDS])
+    np.testing.assert_allclose(found.displacement, exact, rtol=1e-11)
+    damping = np.asarray(scene.machine.carrier().damping)
+    lost = SPEEDS**2 / 2.0 * np.einsum("sa,ab,sb->s", exact.conj(), damping, exact).real
+    np.testing.assert_allclose(np.sum(found.power, axis=1), lost, rtol=1e-9)
+    assert found.operating.speed.size == 0 and "jaxvib" not in found.summary()
+
+
+def test_many_platforms_are_a_dense_solution():
+    n = 8
+    machine = jv.network(
+        mass=np.linspace(20.0, 60.0, n), stiffness=np.full(n, 4e4), damping=np.full(n, 30.0),
+        links=[(k, k + 1) for k in range(1, n)], link_stiffness=np.full(n - 1, 9e4), link_damping=np.full(n - 1, 25.0),
+        exciter=1,
+    )  # fmt: skip
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=motor(30.0), unbalance=0.3, at=3)])
+    found = jv.response(scene, SPEEDS)
+    m, c, k = (np.asarray(each) for each in (machine.carrier().mass, machine.carrier().damping, machine.carrier().stiffness))
+    force = -0.3j * np.eye(n)[2]
+    exact = np.stack([np.linalg.solve(k - w**2 * m + 1j * w * c, w**2 * force) for w in SPEEDS])
+    np.testing.assert_allclose(found.displacement, exact, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(found.torque[:, 0], -0.15 * SPEEDS**2 * np.imag(1j * exact[:, 2]), rtol=1e-8)
+
+
+def test_a_gyroscopic_rotor_is_a_dense_solution():
+    machine = jv.rotor(
+        mass=37.0, transverse_inertia=0.479, polar_inertia=0.4, stiffness=(6e5, 5e5), damping=(440.0, 400.0),
+        position=(0.165, -0.155), stations=0.2,
+    )  # fmt: skip
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=motor(60.0), unbalance=0.02, at=0.1, direction=-1)])
+    speeds = np.array([50.0, 170.0, 300.0])
+    found = jv.response(scene, speeds)
+    carrier, skew = machine.carrier(), np.zeros((4, 4))
+    skew[2, 3], skew[3, 2] = 0.4, -0.4
+    m, c, k = (np.asarray(each) for each in (carrier.mass, carrier.damping, carrier.stiffness))
+    force = 0.02 * np.array([1.0, 1j, 0.1, 0.1j])  # clockwise
+    exact = np.stack([np.linalg.solve(k - w**2 * m + 1j * w * (c - w * skew), w**2 * force) for w in speeds])
+    np.testing.assert_allclose(found.displacement, exact, rtol=1e-11)
+
+
+def test_operating_points_and_folds_are_scipys():
+    scene = one_mass(drive=motor())
+    found = jv.response(scene)
+
+    def share(w):
+        return needed(w) / (12.0 * (1.0 - w / (50.0 * np.pi)))
+
+    grid = np.linspace(1.0, 157.0, 200_000)
+    values = share(grid)
+    turns = 1 + np.flatnonzero(np.diff(np.sign(np.diff(values))))
+    folds = []
+    for k in turns:
+        side = np.sign(values[k] - values[k - 50])
+        near = {"bounds": (grid[k - 5], grid[k + 5]), "method": "bounded", "options": {"xatol": 1e-10}}
+        folds.append(scipy.optimize.minimize_scalar(lambda w, side=side: -side * share(w), **near).x)
+    assert found.folds.exists.tolist() == [True, True]
+    np.testing.assert_allclose(found.folds.speed, folds, rtol=1e-7)
+    np.testing.assert_allclose(found.folds.factor, share(found.folds.speed), rtol=1e-10)
+    np.testing.assert_allclose(found.folds.torque, needed(found.folds.speed), rtol=1e-10)
+    places = np.flatnonzero(np.diff(np.sign(values - 1.0)))
+    roots = [scipy.optimize.brentq(lambda w: share(w) - 1.0, grid[k], grid[k + 1], xtol=1e-13) for k in places]
+    np.testing.assert_allclose(found.operating.speed, roots, rtol=1e-11)
+    assert found.operating.stable.tolist() == [True, False, True]
+    for fold, low, high in ((0, folds[1], 157.0), (1, 1.0, folds[0])):
+        lands = scipy.optimize.brentq(lambda w, fold=fold: share(w) - share(folds[fold]), low, high, xtol=1e-12)
+        np.testing.assert_allclose(found.folds.lands_at[fold], lands, rtol=1e-7)
+
+
+def test_operating_points_are_the_synchronous_regimes_of_one_exciter():
+    drive = jv.InductionMotor("1000 rpm", breakdown_torque=1.2, breakdown_slip=0.3, inertia=0.5)
+    scene = body([jv.Exciter(drive=drive, unbalance=0.4, at=(0.1, 0.3))])
+    operating, regimes = jv.response(scene).operating, jv.synchronous_regimes(scene)
+    there, order = np.asarray(operating.exists), np.argsort(regimes.speed)
+    assert there.sum() == order.size >= 3
+    np.testing.assert_allclose(operating.speed[there], regimes.speed[order], rtol=1e-8)
+    assert operating.stable[there].tolist() == regimes.stable[order].tolist()
+    np.testing.assert_allclose(operating.growth[there], regimes.growth[order], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(operating.foundation_force[there], regimes.foundation_force[order], rtol=1e-7)
+
+
+def test_a_run_at_constant_speed_settles_in_the_response():
+    scene = body([jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.4, at=(0.1, 0.3))])
+    run = jv.simulate(scene, "40 s", save="window")
+    found = jv.response(scene, [60.0])
+    np.testing.assert_allclose(run.amplitude, found.amplitude[0], rtol=1e-5)
+
+
+def test_a_caught_motor_runs_at_the_operating_point():
+    found = jv.response(one_mass(drive=motor()))
+    heavy = jv.DCMotor("1500 rpm", stall_torque=12.0, inertia=4.0)  # runs up slowly
+    run = jv.simulate(one_mass(drive=heavy), "90 s", save="window")
+    speed = float(np.mean(run.window.rotor_speeds[0]))
+    np.testing.assert_allclose(speed, found.operating.speed[0], rtol=2e-3)  # the torque of light unbalances, first order
+    np.testing.assert_allclose(run.amplitude[0], found.operating.amplitude[0, 0], rtol=1e-2)
+
+
+def test_derivatives_are_finite_differences():
+    def values(stiffness):
+        machine = jv.one_mass(mass=MASS, stiffness=stiffness, damping=DAMPER)
+        found = jv.response(jv.Scene(machine, exciters=[jv.Exciter(drive=motor(), unbalance=S)]), [55.0])
+        operating, folds = found.operating, found.folds
+        points = [operating.speed[0], operating.foundation_force[2], folds.factor[0], folds.torque[1], folds.speed[1]]
+        return jnp.stack([*points, found.amplitude[0, 0], found.foundation_force[0], found.torque[0, 0]])
+
+    step = 1e-4 * SPRING
+    near = [np.asarray(values(SPRING + k * step)) for k in (-2, -1, 1, 2)]
+    difference = (near[0] - 8.0 * near[1] + 8.0 * near[2] - near[3]) / (12.0 * step)
+    np.testing.assert_allclose(jax.jacrev(values)(SPRING), difference, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(values)(SPRING), difference, rtol=1e-6)
+
+
+def test_an_undamped_resonance_is_named_without_nan():
+    at = np.sqrt(SPRING / MASS)
+    found = jv.response(one_mass(damping=0.0), [at, 1.01 * at])
+    assert "an undamped resonance" in found.message
+    assert np.isinf(found.amplitude[0, 0]) and np.isinf(found.foundation_force[0]) and np.isfinite(found.amplitude[1, 0])
+    numbers = [leaf for leaf in jax.tree.leaves(found) if np.issubdtype(np.asarray(leaf).dtype, np.inexact)]
+    assert not any(np.any(np.isnan(each)) for each in numbers)
+
+    def total(mass):
+        machine = jv.one_mass(mass=mass, stiffness=SPRING, damping=0.0)
+        scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(100.0), unbalance=S)])
+        curve = jv.response(scene, [at, 1.01 * at])
+        return jnp.sum(jnp.where(jnp.isfinite(curve.amplitude), curve.amplitude, 0.0))
+
+    assert np.isfinite(jax.grad(total)(MASS))
+
+
+def test_an_undamped_machine_lets_its_motor_idle():
+    found = jv.response(one_mass(damping=0.0, drive=motor()))
+    assert not np.any(found.folds.exists) and found.operating.exists.sum() == 1
+    speed = found.operating.speed[np.asarray(found.operating.exists)][0]
+    np.testing.assert_allclose(speed, 50.0 * np.pi, rtol=1e-12)
+
+
+def test_a_batch_is_its_scenes():
+    def speed(stiffness):
+        machine = jv.one_mass(mass=MASS, stiffness=stiffness, damping=DAMPER)
+        return jv.response(jv.Scene(machine, exciters=[jv.Exciter(drive=motor(), unbalance=S)]), [50.0]).operating.speed
+
+    many = jax.vmap(speed)(jnp.array([6e5, SPRING]))
+    np.testing.assert_allclose(many[1], speed(SPRING), rtol=1e-12)
+
+
+def test_scenes_with_loads_are_refused():
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    with pytest.raises(jv.InputError, match=r"^loads turn at a speed of their own.*use branches$"):
+        jv.response(scene)
+
+
+def test_the_figure_shows_curves_motor_and_folds():
+    found = jv.response(one_mass(drive=motor()))
+    labels = [text for axis in found.plot().axes for text in axis.get_legend_handles_labels()[1]]
+    assert {"y1", "force on the foundation", "needed by the vibration", "of the motor", "fold: the speed jumps"} <= set(labels)
+    with pytest.raises(jv.InputError, match="show"):
+        found.plot(show=["speed"])
