@@ -134,7 +134,7 @@ def test_operating_points_and_folds_are_scipys():
         np.testing.assert_allclose(found.folds.lands_at[fold], lands, rtol=1e-7)
 
 
-def test_operating_points_are_the_synchronous_regimes_of_one_exciter():
+def test_operating_points_are_the_regimes_of_one_exciter():
     drive = jv.InductionMotor("1000 rpm", breakdown_torque=1.2, breakdown_slip=0.3, inertia=0.5)
     scene = body([jv.Exciter(drive=drive, unbalance=0.4, at=(0.1, 0.3))])
     operating, regimes = jv.response(scene).operating, jv.synchronous_regimes(scene)
