@@ -85,7 +85,7 @@ class Front(Result):
         from jaxvib.draw.charts import front_chart  # slow import
 
         labels, values = self._shown()
-        return front_chart(values[1], values[0], across=labels[1], up=labels[0], ax=ax)
+        return front_chart(values[1], values[0], x_label=labels[1], y_label=labels[0], ax=ax)
 
 
 @validated

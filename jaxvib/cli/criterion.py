@@ -42,7 +42,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         import jax.numpy as jnp
         import numpy as np
 
-        from jaxvib.draw.criterion import pull_chart
+        from jaxvib.draw.criterion import criterion_chart
         from jaxvib.draw.style import panels
         from jaxvib.steady.balance.criterion import criterion_functional
 
@@ -50,7 +50,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
         pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
         figure, (axis,) = panels(1)
-        pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
+        criterion_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
         return figure
 
     output.picture("criterion.png", figure)

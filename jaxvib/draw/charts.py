@@ -55,12 +55,12 @@ def branch_diagram(
     **Arguments** (n points, nd coordinates)
 
     - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
-    - `stable` (n,): stability; `judged` states the criterion below the figure
+    - `stable` (n,): True if stable; `judged`: the criterion of stability, written below the figure
     - `amplitude` (n, nd): amplitudes, m, drawn in mm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units` None:
       all m
     - `force` (n,): foundation force, N
     - `resonances`: resonances, rad/s, drawn as horizontal lines
-    - `modes` (n,): numbers of the jam modes, written at the line of `at`
+    - `modes` (n,): numbers of the jam modes, written on the line of the operating speed
     - `marks`: points, each (label, rotor speeds, load speeds), rad/s
     - `names` (nd,): names of the coordinates
     - `at`: operating speed, rad/s, drawn as a vertical line
@@ -267,10 +267,10 @@ def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None =
     return figure if ax is None else ax
 
 
-def front_chart(x: np.ndarray, y: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Drawn:
-    """Draw a Pareto front of points `x` (P,), `y` (P,), both of which are minimized, each with its number.
+def front_chart(x: np.ndarray, y: np.ndarray, *, x_label: str, y_label: str, ax: Axes | None = None) -> Drawn:
+    """Draw a Pareto front: P points, each with its number, of two minimized quantities `x` (P,) and `y` (P,).
 
-    >>> figure = front_chart(np.array([2.0, 1.0]), np.array([1.0, 3.0]), across="power, W", up="force, N")
+    >>> figure = front_chart(np.array([2.0, 1.0]), np.array([1.0, 3.0]), x_label="power, W", y_label="force, N")
     >>> figure.axes[0].get_ylabel()
     'force, N'
     """
@@ -280,7 +280,7 @@ def front_chart(x: np.ndarray, y: np.ndarray, *, across: str, up: str, ax: Axes 
     for k, place in enumerate(zip(x, y, strict=True)):
         axis.annotate(f"{k}", place, xytext=(5, 4), textcoords="offset points", fontsize="small")
     axis.margins(0.08)
-    axis.set_xlabel(across)
-    axis.set_ylabel(up)
+    axis.set_xlabel(x_label)
+    axis.set_ylabel(y_label)
     legend_above(axis)
     return figure if ax is None else ax

@@ -111,14 +111,14 @@ def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], loo
 
 
 def convergence_chart(
-    harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
+    harmonics: np.ndarray, error: np.ndarray, estimate: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
 ) -> Drawn:
-    """Draw errors (n, w) over the highest harmonic (n,) on a log scale, with their estimates `known` (n, w) as dashed lines."""
+    """Draw errors (n, w) over the highest harmonic (n,) on a log scale; the dashed lines are estimates of the errors (n, w)."""
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     floor = np.finfo(float).eps
     for k, (color, name) in enumerate(zip(itertools.cycle(COLORS), names, strict=False)):
         axes.semilogy(harmonics, np.maximum(error[:, k], floor), "o-", color=color, ms=4.5, label=name)
-        axes.semilogy(harmonics, np.maximum(known[:, k], floor), ls=(0, (3, 2)), lw=1.0, color=color)
+        axes.semilogy(harmonics, np.maximum(estimate[:, k], floor), ls=(0, (3, 2)), lw=1.0, color=color)
     axes.plot([], [], ls=(0, (3, 2)), lw=1.0, color="black", label="estimate")
     axes.set_xlabel("highest harmonic")
     axes.set_ylabel("relative error of the rotor speed")
@@ -176,7 +176,7 @@ def audit_chart(
     *,
     ax: Onto = None,
 ) -> Drawn:
-    """Draw the relative changes (n,) by n effects with these `labels`, a marker for each quantity, and the operations added.
+    """Draw the relative changes (n,) that n effects with these `labels` cause, a marker for each quantity, and their cost.
 
     A line marks the requested `accuracy`; the range below the `uncertainty` (n,) is grey. A second panel shows the operations
     that the effects add, `added` (n,), relative to those of the scene.
@@ -215,7 +215,7 @@ def audit_chart(
 
 def steps_chart(
     steps: np.ndarray,
-    off: np.ndarray,
+    difference: np.ndarray,
     best: np.ndarray,
     at_best: np.ndarray,
     tolerance: float,
@@ -224,14 +224,14 @@ def steps_chart(
     route: str,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw relative differences `off` (n, k) between central differences and a derivative over the relative `steps` (k,).
+    """Draw the relative `difference` (n, k) between central differences and a derivative over the relative `steps` (k,).
 
     Each of n `names` has a line. A ring marks its `best` step (n,) with the extrapolated difference `at_best` (n,), and a
     dotted line marks the tolerance.
     """
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
     floor = np.finfo(float).eps
-    for color, name, line, x, y in zip(itertools.cycle(COLORS), names, off, best, at_best, strict=False):
+    for color, name, line, x, y in zip(itertools.cycle(COLORS), names, difference, best, at_best, strict=False):
         axes.loglog(steps, np.maximum(line, floor), color=color, label=name)
         axes.loglog([x], [max(y, floor)], "o", color=color, mfc="none", ms=8)
     axes.axhline(tolerance, color="black", ls=":", lw=1.2, label="tolerance; rings: best step")

@@ -64,29 +64,29 @@ def agreement_maps(
     return figure if ax is None else ax
 
 
-def pull_chart(
+def criterion_chart(
     ax: Axes,
     speed: np.ndarray,
-    pull: np.ndarray,
+    functional: np.ndarray,
     balancing: list[list[float | None]],
     exact: list[list[float]] | None = None,
     unit: SpeedUnit | None = None,
 ) -> None:
-    """Draw the functional of the criterion (S,), kg m^2, over rotor speed (S,), rad/s, drawn in `unit`.
+    """Draw the `functional` of the criterion (S,), kg m^2, over the rotor `speed` (S,), rad/s, drawn in `unit`.
 
-    Balancing intervals are shaded, and exact ones are bars at the bottom. The functional spans many decades near resonances;
-    therefore its sign and magnitude are drawn on a symmetric log scale.
+    The intervals of `balancing` are shaded, and the `exact` ones are bars at the bottom. The functional spans many decades near
+    resonances; therefore its sign and magnitude are drawn on a symmetric log scale.
 
     >>> import matplotlib.pyplot as plt, numpy as np
     >>> ax = plt.figure().subplots()
-    >>> pull_chart(ax, np.array([1.0, 2.0, 3.0]), np.array([1.0, -2.0, -1.0]), [[1.5, None]])
+    >>> criterion_chart(ax, np.array([1.0, 2.0, 3.0]), np.array([1.0, -2.0, -1.0]), [[1.5, None]])
     >>> ax.get_ylabel()
     'f, kg m², gathering > 0, balancing < 0'
     """
-    size = np.abs(pull[np.isfinite(pull)])
+    size = np.abs(functional[np.isfinite(functional)])
     unit, scale = speed_unit(unit)
     speed = scale * speed
-    ax.plot(speed, pull, color="black", linewidth=1.0)
+    ax.plot(speed, functional, color="black", linewidth=1.0)
     ax.set_yscale("symlog", linthresh=np.median(size[size > 0.0]) if np.any(size > 0.0) else 1.0)
     ax.axhline(0.0, color=GUIDE, linewidth=0.8)
     for start, end in balancing:

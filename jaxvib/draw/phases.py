@@ -35,7 +35,7 @@ def drag_diagram(
     - `rotor_speed`: rotor speed, rad/s, drawn as a horizontal line
     - `label`: label of the drag axis
     - `at`: drag of the scene, drawn as a vertical line
-    - `jams`: jams (speed, stable) on this line; unstable ones are hollow
+    - `jams`: jams (speed, stable) at the drag of the scene; unstable ones are hollow
     - `within`: factor of the range of the axis, from `at` / `within` to `at` x `within`; None: automatic range
     - `unit`: unit in which speeds, rad/s, are drawn
 

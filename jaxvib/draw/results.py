@@ -206,13 +206,12 @@ def speeds_chart(
 
 
 def signals_chart(
-    x: np.ndarray, signals: Sequence[tuple[str, np.ndarray, Sequence[str]]], *, across: str, ax: Onto = None
+    x: np.ndarray, signals: Sequence[tuple[str, np.ndarray, Sequence[str]]], *, x_label: str, ax: Onto = None
 ) -> Drawn:
-    """Draw one panel for each signal against `x` (n,), whose label is `across`. A signal is (label with unit, values (n, k),
-    names of its k curves).
+    """Draw one panel for each signal over `x` (n,). A signal is (label with unit, values (n, k), names of its k curves).
 
     >>> import numpy as np
-    >>> len(signals_chart(np.arange(3.0), [("angle, rad", np.ones((3, 1)), ["load"])], across="time, s").axes)
+    >>> len(signals_chart(np.arange(3.0), [("angle, rad", np.ones((3, 1)), ["load"])], x_label="time, s").axes)
     1
     """
     figure, axes = panels(len(signals), size=(7.5, 2.2), share_x=True, ax=ax)
@@ -222,23 +221,23 @@ def signals_chart(
         axis.set_ylabel(label)
         if len(names) > 1:
             legend_above(axis, 6)
-    axes[-1].set_xlabel(across)
+    axes[-1].set_xlabel(x_label)
     return figure if ax is None else ax
 
 
-def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Drawn:
-    """Draw values (n, k) as points against their index 1 to n.
+def points_chart(values: np.ndarray, *, x_label: str, y_label: str, ax: Axes | None = None) -> Drawn:
+    """Draw values (n, k) as points over their index 1 to n.
 
     >>> import numpy as np
-    >>> points_chart(np.ones((3, 2)), across="run", up="speed, rad/s").axes[0].get_xlabel()
+    >>> points_chart(np.ones((3, 2)), x_label="run", y_label="speed, rad/s").axes[0].get_xlabel()
     'run'
     """
     figure, (axis,) = panels(1, size=(7.0, 3.2), ax=ax)
     for k in range(values.shape[1]):
         mark = MARKERS[k % len(MARKERS)]
         axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], mark, ms=3.5, color=COLORS[k % len(COLORS)])
-    axis.set_xlabel(across)
-    axis.set_ylabel(up)
+    axis.set_xlabel(x_label)
+    axis.set_ylabel(y_label)
     return figure if ax is None else ax
 
 

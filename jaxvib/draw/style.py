@@ -158,7 +158,7 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
     to_share = axis.transScale + axis.transLimits
     for k in inside:
         axis.plot([x], [heights[k]], "o", ms=4.5, mfc="black" if filled[k] else "white", mec="black", zorder=4)
-    for share, text in together([(float(to_share.transform((x, heights[k]))[1]), names[k]) for k in inside]):
+    for share, text in join_names([(float(to_share.transform((x, heights[k]))[1]), names[k]) for k in inside]):
         axis.annotate(
             text,
             (x, to_share.inverted().transform((0.0, share))[1]),
@@ -172,12 +172,12 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
         )
 
 
-def together(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
+def join_names(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
     """Join names that would overlap; their heights, in ascending order, are fractions of the height of the panel.
 
     A joined text is placed at the mean height of its names.
 
-    >>> together([(0.1, "1"), (0.5, "4"), (0.52, "3")])
+    >>> join_names([(0.1, "1"), (0.5, "4"), (0.52, "3")])
     [(0.1, '1'), (0.51, '3, 4')]
     """
     groups: list[list[tuple[float, str]]] = []

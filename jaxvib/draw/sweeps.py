@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from jaxvib.draw.style import COLORS, Drawn, log_ticks, panels
 
 _NO_ANSWER_COLOR = "#f4f4f4"
-"""Colour of cases without a result."""
+"""Background colour of a map, which is visible for cases without a result."""
 
 _DASHES = {"fold": "-", "torus": "--", "period doubling": "-.", "symmetry": ":"}
 
@@ -24,8 +24,8 @@ def label_map(
     codes: np.ndarray,
     names: Sequence[str],
     *,
-    across: str,
-    up: str,
+    x_label: str,
+    y_label: str,
     lines: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]] | None = None,
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
@@ -36,7 +36,7 @@ def label_map(
     kind of bifurcation.
 
     >>> import numpy as np
-    >>> figure = label_map(np.arange(2.0), np.arange(3.0), np.eye(3, 2, dtype=int), ["a", "b"], across="x", up="y")
+    >>> figure = label_map(np.arange(2.0), np.arange(3.0), np.eye(3, 2, dtype=int), ["a", "b"], x_label="x", y_label="y")
     >>> figure.axes[0].get_xlabel()
     'x'
     """
@@ -59,7 +59,7 @@ def label_map(
             entries.append(Line2D([], [], color="black", lw=1.1, ls=dashes, label=f"{kind} bifurcations of exact jams"))
     axis.set_xlim(edges[0])
     axis.set_ylim(edges[1])
-    _scales(axis, across, up, log)
+    _scales(axis, x_label, y_label, log)
     axis.grid(False)
     axis.legend(handles=entries, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small")
     return figure if ax is None else ax
@@ -71,9 +71,9 @@ def _light(colour: str) -> tuple[float, float, float]:
     return 0.55 * red + 0.45, 0.55 * green + 0.45, 0.55 * blue + 0.45
 
 
-def _scales(axis: Axes, across: str, up: str, log: tuple[bool, bool]) -> None:
-    axis.set_xlabel(across)
-    axis.set_ylabel(up)
+def _scales(axis: Axes, x_label: str, y_label: str, log: tuple[bool, bool]) -> None:
+    axis.set_xlabel(x_label)
+    axis.set_ylabel(y_label)
     if log[0]:
         axis.set_xscale("log")
         log_ticks(axis, "x")
@@ -87,8 +87,8 @@ def value_map(
     y: np.ndarray,
     values: np.ndarray,
     *,
-    across: str,
-    up: str,
+    x_label: str,
+    y_label: str,
     label: str,
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
@@ -96,29 +96,31 @@ def value_map(
     """Draw a map over x (n,) and y (m,), coloured by values (m, n); NaN is grey.
 
     >>> import numpy as np
-    >>> len(value_map(np.arange(2.0), np.arange(3.0), np.ones((3, 2)), across="x", up="y", label="z").axes)
+    >>> len(value_map(np.arange(2.0), np.arange(3.0), np.ones((3, 2)), x_label="x", y_label="y", label="z").axes)
     2
     """
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     axis.set_facecolor("#dddddd")
     drawn = axis.pcolormesh(x, y, values, cmap="viridis", shading="nearest", rasterized=True)
     figure.colorbar(drawn, ax=axis, label=label)
-    _scales(axis, across, up, log)
+    _scales(axis, x_label, y_label, log)
     axis.grid(False)
     return figure if ax is None else ax
 
 
-def points_over(x: np.ndarray, values: np.ndarray, *, across: str, up: str, log: bool = False, ax: Axes | None = None) -> Drawn:
+def points_over(
+    x: np.ndarray, values: np.ndarray, *, x_label: str, y_label: str, log: bool = False, ax: Axes | None = None
+) -> Drawn:
     """Draw values (n, k) as points over x (n,).
 
     >>> import numpy as np
-    >>> points_over(np.arange(3.0), np.ones((3, 2)), across="x", up="y").axes[0].get_ylabel()
+    >>> points_over(np.arange(3.0), np.ones((3, 2)), x_label="x", y_label="y").axes[0].get_ylabel()
     'y'
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     for k in range(values.shape[1]):
         axis.plot(x, values[:, k], ".", color=COLORS[k % len(COLORS)], ms=4.0)
-    _scales(axis, across, up, (log, False))
+    _scales(axis, x_label, y_label, (log, False))
     return figure if ax is None else ax
 
 
@@ -126,7 +128,7 @@ def shares_chart(
     x: np.ndarray,
     shares: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
     *,
-    across: str,
+    x_label: str,
     log: bool = False,
     level: str = "95 %",
     ax: Axes | None = None,
@@ -137,7 +139,7 @@ def shares_chart(
 
     >>> import numpy as np
     >>> share = np.array([0.1, 0.5])
-    >>> len(shares_chart(np.arange(2.0), {"mode 3": (share, share - 0.1, share + 0.1)}, across="x").axes[0].lines)
+    >>> len(shares_chart(np.arange(2.0), {"mode 3": (share, share - 0.1, share + 0.1)}, x_label="x").axes[0].lines)
     1
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
@@ -146,22 +148,22 @@ def shares_chart(
         axis.fill_between(x, low, high, color=colour, alpha=0.25, lw=0.0)
         axis.plot(x, share, color=colour, marker=".", ms=4.0, lw=1.0, label=name)
     axis.set_ylim(-0.03, 1.03)
-    _scales(axis, across, f"fraction of the cases (band: {level} confidence)", (log, False))
+    _scales(axis, x_label, f"fraction of the cases (band: {level} confidence)", (log, False))
     axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small")
     return figure if ax is None else ax
 
 
-def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax: Axes | None = None) -> Drawn:
+def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, x_label: str, ax: Axes | None = None) -> Drawn:
     """Draw a histogram of `counts` (n,) between edges (n + 1,), and the cumulative fraction on a second axis.
 
     >>> import numpy as np
-    >>> distribution_chart(np.arange(4.0), np.ones(3), across="force, N").axes[0].get_xlabel()
+    >>> distribution_chart(np.arange(4.0), np.ones(3), x_label="force, N").axes[0].get_xlabel()
     'force, N'
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     axis.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color=COLORS[0], alpha=0.55)
     axis.set_ylabel("cases")
-    axis.set_xlabel(across)
+    axis.set_xlabel(x_label)
     share = axis.twinx()
     share.plot(edges, np.concatenate([[0.0], np.cumsum(counts)]) / max(np.sum(counts), 1), color=COLORS[1])
     share.set_ylim(0.0, 1.02)
@@ -171,14 +173,14 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax
 
 
 def tornado_chart(
-    names: list[str], low: np.ndarray, high: np.ndarray, middle: float, *, across: str, ax: Axes | None = None
+    names: list[str], low: np.ndarray, high: np.ndarray, middle: float, *, x_label: str, ax: Axes | None = None
 ) -> Drawn:
     """Draw bars from `low` (n,) to `high` (n,) about `middle`, the longest at the top.
 
-    They are values of a quantity for the lowest and the highest fifth of each number in `names`.
+    They are values of a quantity for the lowest and the highest fifth of the values of each parameter in `names`.
 
     >>> import numpy as np
-    >>> figure = tornado_chart(["a", "b"], np.array([1.0, 0.0]), np.array([3.0, 9.0]), 2.0, across="force, N")
+    >>> figure = tornado_chart(["a", "b"], np.array([1.0, 0.0]), np.array([3.0, 9.0]), 2.0, x_label="force, N")
     >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
     ['a', 'b']
     """
@@ -189,7 +191,7 @@ def tornado_chart(
             axis.barh(height, end - middle, left=middle, color=colour, height=0.55, alpha=0.8)
     axis.axvline(middle, color="black", lw=0.8)
     axis.set_yticks(np.arange(len(names)), [names[k] for k in order])
-    axis.set_xlabel(across)
+    axis.set_xlabel(x_label)
     axis.grid(False, axis="y")
     entries = [Patch(color=COLORS[0], label="lowest fifth"), Patch(color=COLORS[1], label="highest fifth")]
     axis.legend(handles=entries, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize="small")

@@ -71,19 +71,20 @@ def _critical_marks(axis: Axes, speed: np.ndarray, forward: np.ndarray, right: f
         axis.annotate(word, at, xytext=(3, 0), textcoords="offset points", rotation=90, va="bottom", fontsize="small")
 
 
-def whirl_lines(speed: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return the lines (k, ns) of whirls of one sense from all speeds (ns, nd) at ns rotor speeds; `own` is True for this
-    sense.
+def whirl_lines(speed: np.ndarray, has_sense: np.ndarray) -> np.ndarray:
+    """Return the lines (k, ns) of the forward or of the backward whirls over ns rotor speeds.
 
-    Each line is the k-th speed of its sense in ascending order, and therefore continuous if speeds of different sense cross. It
-    is NaN where fewer speeds have this sense.
+    **Arguments**: `speed` (ns, nd): all whirl speeds; `has_sense` (ns, nd): True for whirls of the requested sense.
+
+    Line k has the k-th lowest speed of this sense, and is therefore continuous if lines of different sense cross. It is NaN at
+    rotor speeds with fewer whirls of this sense.
 
     >>> import numpy as np
     >>> whirl_lines(np.array([[1.0, 2.0], [1.5, 1.4]]), np.array([[True, False], [False, True]])).tolist()
     [[1.0, 1.4]]
     """
-    count = int(np.max(np.sum(own, axis=1), initial=0))
-    return np.sort(np.where(own, speed, np.nan), axis=1)[:, :count].T
+    count = int(np.max(np.sum(has_sense, axis=1), initial=0))
+    return np.sort(np.where(has_sense, speed, np.nan), axis=1)[:, :count].T
 
 
 def critical_groups(speed: np.ndarray, forward: np.ndarray, right: float) -> list[tuple[list[int], str]]:

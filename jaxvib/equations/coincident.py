@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import JAM_TERMS, JammedModel, jammed_loads, require_terms
-from jaxvib.machine.effects.base import Effect, has_half_turn, has_term, terms_of, total_gravity
+from jaxvib.machine.effects.base import Effect, has_half_turn_symmetry, has_term, terms_of, total_gravity
 from jaxvib.machine.effects.terms import ContactFriction, LoadPotential, RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
@@ -34,7 +34,7 @@ class CoincidentModel(eqx.Module):
     - `unbalance` S, kg m, `inertia` I = sum kappa m R^2 (kappa: inertia factor, 7/5 for balls) and `drag` sum b_W R^2 of each
       body, (G,)
     - `offsets` (count,) rad: angle of each load minus the angle of its body
-    - `half_turn`: True if phi -> phi + pi, q -> -q leaves the equations unchanged, see `has_half_turn` of effects
+    - `half_turn`: True if phi -> phi + pi, q -> -q leaves the equations unchanged, see `has_half_turn_symmetry` of effects
 
     In the methods, `rate` is the angular velocity of the bodies or loads and `speed` that of the rotor, rad/s; M is the number
     of samples and np the number of directions of the port.
@@ -116,7 +116,7 @@ def coincident_model(linear: JammedModel) -> CoincidentModel:
     else:
         each = loads.mass * loads.radius, inertia, loads.drag * loads.radius**2
         unbalance, whole, drag = (jnp.broadcast_to(x, (loads.count,)) for x in each)
-    return CoincidentModel(linear, loads, effects, unbalance, whole, drag, loads.offsets(), has_half_turn(effects))
+    return CoincidentModel(linear, loads, effects, unbalance, whole, drag, loads.offsets(), has_half_turn_symmetry(effects))
 
 
 def require_coincident(scene: Scene) -> CircularLoads:

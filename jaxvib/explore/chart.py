@@ -8,7 +8,7 @@ from jaxvib.display import speed_unit
 from jaxvib.draw.charts import crossings, log_limits, stretches
 from jaxvib.draw.machine.parts import Text
 from jaxvib.draw.machine.svg import svg
-from jaxvib.draw.style import COLORS, GUIDE, together
+from jaxvib.draw.style import COLORS, GUIDE, join_names
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
 from jaxvib.steady.branches import Branches
 from jaxvib.steady.jams.branch_plot import MARKS
@@ -68,7 +68,7 @@ def chart(found: Branches, most: float) -> str:
                 parts.append(dot(x, y, {"fc": "black" if filled else "white", "ec": "black", "lw": 1.0, "zorder": 4.0}))
         look = {"fontsize": "small", "fontweight": "bold", "bbox": {"fc": "white"}}
         x, _ = panel.at(scale * at, panel.y[0])
-        texts += [Text(x + 0.1, TALL * share, name, look) for share, name in together(sorted(jams))]
+        texts += [Text(x + 0.1, TALL * share, name, look) for share, name in join_names(sorted(jams))]
     folds = [
         (scale * n, scale * w)
         for n, w, there in zip(*map(np.ravel, (found.folds.rotor_speed, found.folds.omega, found.folds.exists)), strict=True)

@@ -14,8 +14,8 @@ from jaxvib.draw.machine.parts import Part, Text, box, circle
 from jaxvib.draw.style import GUIDE, Look, log_places
 
 WIDE, TALL, FIRST, APART, LAST = 6.3, 3.6, 0.75, 1.1, 0.25
-"""Width and height of a panel, and the space left of the first, between two and right of the last panel, in units of the
-drawing."""
+"""Width and height of a panel; space to the left of the first panel, between two panels and to the right of the last one; in
+units of the drawing."""
 
 ROTOR = {"color": GUIDE, "lw": 0.8}
 OPERATING = {"color": "black", "lw": 1.0, "ls": "-."}

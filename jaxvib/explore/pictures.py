@@ -22,19 +22,20 @@ from jaxvib.steady.branches import branches
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
 
-ABOUT = """Springs and dampers, masses and drags of loads: a tenth to ten times the file's. Arrow keys move a slider by a
-step. Each number of loads is a program of its own: the seven next to the file's are compiled while the page is open, any
-other takes a second or two the first time. Afterwards it is stored.
+ABOUT = """The sliders of springs, dampers, masses and drags of loads range from a tenth to ten times the value in the file. The
+arrow keys move a slider by one step. Each number of loads needs its own compiled program. The programs for the seven numbers
+next to the number in the file are compiled while the page is open; any other takes one or two seconds the first time and is
+then stored.
 
-Amplitudes and forces are zero to peak. What is seen here is the theory of light loads; `jaxvib simulate` and
-`jaxvib modes --exact` answer for the saved machine exactly."""
+Amplitudes and forces are zero to peak. The page shows the theory of light loads. For exact results, save the machine and run
+`jaxvib simulate` or `jaxvib modes --exact`."""
 """Text below the sliders, as Markdown."""
 
 _SPEEDS = 81
 """Number of rotor speeds of a Campbell diagram."""
 
 _PREPARED_COUNTS = 7
-"""Count of the other numbers of loads that are compiled while the page is open."""
+"""How many other numbers of loads are compiled while the page is open."""
 
 
 class SceneOrProblem(NamedTuple):
@@ -44,10 +45,10 @@ class SceneOrProblem(NamedTuple):
     problem: str
 
 
-def scene_or_problem(ask: Callable[[], Scene]) -> SceneOrProblem:
-    """Return the scene from `ask`, or the message of its error, because some values of the sliders give no possible machine."""
+def scene_or_problem(build: Callable[[], Scene]) -> SceneOrProblem:
+    """Return the scene from `build`, or the message of its error: some values of the sliders do not give a valid machine."""
     try:
-        return SceneOrProblem(ask(), "")
+        return SceneOrProblem(build(), "")
     except (InputError, ComputationError) as error:
         return SceneOrProblem(None, str(error))
 
@@ -128,14 +129,14 @@ def heading(scene: Scene) -> str:
     """Return the heading of `diagram` for this scene, with a reference to other results."""
     if has_branches(scene):
         return (
-            "Where light loads jam: their speed and the foundation force over the rotor's speed. Solid: stable by slope, for "
-            "loads that stay together; dashed: unstable. Where the line of the rotor's speed crosses, jams stand with the "
-            "numbers of their modes."
+            "Jams of light loads: load speed and foundation force over the rotor speed. Solid lines: stable by slope, for "
+            "loads that stay together; dashed lines: unstable. The numbers on the vertical line of the operating speed are "
+            "those of the jam modes at this rotor speed."
         )
     return (
-        "Whirl of the rotor over its speed (Campbell diagram), the loads' masses where they run, and its critical speeds. "
-        "There is no branch diagram and no force chart: loads of a machine that moves both ways jam at any phases, which "
-        "`jaxvib modes` finds."
+        "Whirl speeds of the rotor over the rotor speed (Campbell diagram), with the masses of the loads fixed to the rotor, "
+        "and critical speeds. There is no branch diagram and no force chart, because the loads of a machine that moves in two "
+        "directions can jam at any phases; `jaxvib modes` finds these jams."
     )
 
 
@@ -185,6 +186,6 @@ def modes_of(scene: Scene) -> list[int]:
 
 def machine(scene: Scene, mode: int | None) -> str:
     """Return the machine as an SVG picture, moving in the jam mode with that number, or at rest if `mode` is None."""
-    from jaxvib.show.moving import moving, still  # slow import
+    from jaxvib.show.moving import moving_svg, sketch_svg  # slow import
 
-    return still(scene) if mode is None else moving(scene, jax.device_get(jam_modes(scene)).select(mode))
+    return sketch_svg(scene) if mode is None else moving_svg(scene, jax.device_get(jam_modes(scene)).select(mode))

@@ -120,7 +120,7 @@ class RunPlan(Result):
         from jaxvib.draw.results import points_chart  # slow import
 
         largest = np.max(np.where(np.isfinite(self.errors), self.errors, 1.0), axis=1)
-        return points_chart(largest[:, None], across="candidate run", up="largest relative error", ax=ax)
+        return points_chart(largest[:, None], x_label="candidate run", y_label="largest relative error", ax=ax)
 
 
 @validated

@@ -28,7 +28,7 @@ class Carrier(eqx.Module):
 
     **Attributes** (nd coordinates, nb directions of the force on the foundation)
 
-    - `mass` M (nd, nd), kg (kg m^2 for tilts); typical: 50 to 5000 kg, of rotors 5 to 50 kg
+    - `mass` M (nd, nd), kg (kg m^2 for tilts); typical: 50 to 5000 kg, for rotors 5 to 50 kg
     - `damping` C (nd, nd), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(K M)
     - `stiffness` K (nd, nd), N/m; typical: 1e4 to 1e6
     - `foundation_stiffness` T_K and `foundation_damping` T_C (nb, nd): the supports on the foundation, N/m and N s/m

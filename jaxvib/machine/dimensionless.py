@@ -42,9 +42,10 @@ class Dimensionless(eqx.Module):
     **Arguments** (p platforms; numbers are dimensionless unless a unit is stated)
 
     - `form`: "antiphase" or "criterion"
-    - `natural` n_i (p,), one number for each platform; typical: 0.2 to 1
+    - `natural` n_i (p,): natural frequency of each platform on its own support; typical: 0.2 to 1
     - `damping` h_i (p,); typical: 0.01 to 0.05
-    - `link_natural` n_ij, one number for each link (12 for two masses; 12, 13, 23 for three); typical: 0.3 to 1
+    - `link_natural` n_ij: square root of the stiffness of each link (12 for two masses; 12, 13, 23 for three); typical: 0.3
+      to 1
     - `link_damping` h_ij, one number for each link; typical: 0.01 to 0.05
     - `rho` rho_i (p - 1,) of the platforms without the exciter, in order; typical: 0.5 to 2
     - `eps`: mass of one load ("antiphase") or of all loads ("criterion"), divided by kappa M2S; typical: 1e-3 to 0.1

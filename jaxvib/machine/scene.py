@@ -406,7 +406,7 @@ def _require_comparable(
         if not _MIN_RATIO <= total / whole <= 1.0 / _MIN_RATIO:
             raise InputError(
                 "loads.mass",
-                f"makes {total:.3g} kg in all on a machine of {whole:.3g} kg, and rounding errors hide one of them; "
+                f"gives {total:.3g} kg for all loads on a machine of {whole:.3g} kg, and rounding errors hide one of them; "
                 f"loads may have {_MIN_RATIO:g} to {1.0 / _MIN_RATIO:g} times the machine's mass",
             )
     if drag is not None:
@@ -416,6 +416,6 @@ def _require_comparable(
             least = _MIN_RATIO * float(np.max(each[lost])) * speed
             raise InputError(
                 "loads.drag",
-                f"takes {float(np.min(share[lost])):.1e} of a load's speed while the rotor turns by one radian, less than the "
-                f"rounding error; give 0, or at least {least:.1g} N s/m",
+                f"changes a load's speed by the fraction {float(np.min(share[lost])):.1e} while the rotor turns by one radian, "
+                f"which is less than the rounding error; give 0, or at least {least:.1g} N s/m",
             )

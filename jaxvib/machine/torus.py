@@ -129,7 +129,7 @@ class TorusBalls(Loads):
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
 
 
-def in_torus(loads: Loads, caller: str) -> TorusBalls:
+def require_torus_balls(loads: Loads, caller: str) -> TorusBalls:
     """Return the loads if they are balls in a torus. **Raises** `InputError` for others, which names the `caller`."""
     if not isinstance(loads, TorusBalls):
         advice = f"{caller} needs balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"

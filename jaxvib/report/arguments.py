@@ -24,7 +24,7 @@ class Argument(NamedTuple):
     """Argument of a part.
 
     **Attributes**: `name`; `unit`, "" for none; `needed`: True if the argument has no default; `default` as text, or None;
-    `allowed` texts of an argument that is one of several; `bounds` of a number in words; `meaning` from the docstring.
+    `allowed`: the allowed texts of an argument that is a choice; `bounds` of a number in words; `meaning` from the docstring.
     """
 
     name: str

@@ -18,7 +18,7 @@ import equinox as eqx
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, written
 from jaxvib.machine.scene import Scene
-from jaxvib.report.tables import Units, escaped, in_display_units, parameters, results, worth
+from jaxvib.report.tables import Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.result import Result
 
@@ -55,7 +55,7 @@ class Report:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
         units = self.units if self.scene is None else _of_coordinates(self.units, self.scene)
         document, units = in_display_units(self.document, units)
-        numbers = [_section("Accuracy", worth(document, units)), _section("Numbers", results(document, units))]
+        numbers = [_section("Accuracy", accuracy_table(document, units)), _section("Numbers", result_tables(document, units))]
         if self.text:
             parts.append(_section("Results", f"<pre>{escaped(self.text)}</pre>"))
         parts.append(_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures)))
@@ -63,7 +63,7 @@ class Report:
             parts += numbers
         if self.scene is not None:
             sketch = "" if self.sketch is None else _figure("sketch", self.sketch)
-            parts += [_section("Machine", sketch + parameters(self.scene))]
+            parts += [_section("Machine", sketch + parameter_tables(self.scene))]
         if self.text:
             parts.append(f"<details><summary>All numbers</summary>{''.join(numbers)}</details>")
         parts.append(_section("Made with", _versions()))

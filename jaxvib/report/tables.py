@@ -69,21 +69,23 @@ def _scaled(value: Plain | Mapping[str, Plain], name: str, scale: Callable[[str,
     return scale(name, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
-def worth(document: Mapping[str, Plain], units: Units) -> str:
+def accuracy_table(document: Mapping[str, Plain], units: Units) -> str:
     """Return a table of the fields of a document about accuracy and cost: status, error, steps, seconds."""
-    return _pairs([(name, document[name]) for name in ACCURACY_FIELDS if name in document and _plain(document[name])], units)
+    return _pairs(
+        [(name, document[name]) for name in ACCURACY_FIELDS if name in document and _fits_in_cell(document[name])], units
+    )
 
 
-def results(document: Mapping[str, Plain], units: Units, inner: bool = False) -> str:
+def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = False) -> str:
     """Return a document as tables: one for all single values, and one below its own heading for each list or mapping."""
     single, below = [], []
     for name, value in document.items():
-        if name in _HIDDEN_FIELDS or (not inner and name in ACCURACY_FIELDS and _plain(value)):
+        if name in _HIDDEN_FIELDS or (not inner and name in ACCURACY_FIELDS and _fits_in_cell(value)):
             continue
-        if _plain(value):
+        if _fits_in_cell(value):
             single.append((name, value))
         elif isinstance(value, Mapping):
-            below.append((name, results(value, units, inner=True)))
+            below.append((name, result_tables(value, units, inner=True)))
         elif _entries(value):
             below.append((name, _rows(value, units)))
         elif isinstance(value, list) and value:
@@ -92,7 +94,7 @@ def results(document: Mapping[str, Plain], units: Units, inner: bool = False) ->
     return _pairs(single, units) + heads
 
 
-def parameters(scene: Scene) -> str:
+def parameter_tables(scene: Scene) -> str:
     """Return the parameters of a scene with their units, in a table for each of its parts."""
     tables = tomllib.loads(scene_to_toml(scene))
     parts = []
@@ -127,7 +129,7 @@ def _words(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _plain(value: Plain) -> bool:
+def _fits_in_cell(value: Plain) -> bool:
     """Return True if a value fits into one cell."""
     if isinstance(value, list):
         return len(value) <= _MAX_INLINE_ENTRIES and all(not isinstance(x, (list, dict)) for x in value)
@@ -155,17 +157,17 @@ def _rows(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
         name for name in every if any(isinstance(x := row.get(name), str) and len(x) > _MAX_CELL_CHARACTERS for row in rows)
     ]
     names = [name for name in every if name not in long]
-    heads = "".join(f"<th{_side(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
+    heads = "".join(f"<th{_column_class(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
     body = ""
     for row in rows[:_MAX_ROWS]:
-        body += "<tr>" + "".join(f"<td{_side(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
+        body += "<tr>" + "".join(f"<td{_column_class(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
         for name in long:
             if row.get(name):
                 body += f"<tr><td class='below' colspan='{len(names)}'>{escaped(_words(name))}: {_cell(row[name])}</td></tr>"
     return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more(len(rows))}"
 
 
-def _side(rows: Sequence[Mapping[str, Plain]], name: str) -> str:
+def _column_class(rows: Sequence[Mapping[str, Plain]], name: str) -> str:
     """Return the HTML class of a column: numbers are aligned to the right."""
     values = [row.get(name) for row in rows]
     numeric = all(v is None or (isinstance(v, (int, float)) and not isinstance(v, bool)) for v in values)
@@ -174,7 +176,7 @@ def _side(rows: Sequence[Mapping[str, Plain]], name: str) -> str:
 
 def _grid(values: Sequence[Plain]) -> str:
     """Return a list of lists as a table, or the number of entries and the range of a long list."""
-    rows = [x for x in values if isinstance(x, list) and _plain(x)]
+    rows = [x for x in values if isinstance(x, list) and _fits_in_cell(x)]
     if len(rows) == len(values):
         body = "".join("<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>" for row in rows[:_MAX_ROWS])
         return f"<div class='wide'><table>{body}</table></div>{_more(len(values))}"

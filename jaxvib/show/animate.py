@@ -18,14 +18,14 @@ from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
-from jaxvib.show.motion import Stretch, of_orbit, of_run
+from jaxvib.show.motion import SampledMotion, motion_of_orbit, motion_of_run
 from jaxvib.show.sketch import checked_scene, fit
 from jaxvib.show.views import view_of
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.units import Number, number
 
-_TURN = 0.42
-"""Largest rotation between two pictures, turns. Near half a turn, the rotor appears to turn at another speed or backward."""
+_MAX_TURNS_PER_PICTURE = 0.42
+"""Largest rotation between two pictures, turns. Near half a turn, a rotor seems to turn at another speed or backward."""
 
 _TURNS_PER_PICTURE = 0.09
 """Default rotation between pictures, turns of the rotor."""
@@ -55,8 +55,8 @@ def animate(
 ) -> Film:
     """Return a film of a run or of an exact jam in slow motion, with a clock.
 
-    Platforms, springs, rotor and loads move. Arrows are the forces of the supports on the foundation (black: their sum). The
-    displacements and the force over time are plotted below.
+    Platforms, springs, rotor and loads move. Arrows show the forces of the supports on the foundation (black: their sum). The
+    displacements and the force are plotted over time below the machine.
 
     **Arguments**
 
@@ -67,8 +67,8 @@ def animate(
     - `fps`: pictures per second; typical: 20 (the default)
     - `magnify`: magnification of displacements relative to the loads' circle, stated in the picture; typical: 1 to 50; default:
       a factor at which the largest displacement is clearly visible
-    - `width` of the picture, inches of 100 dots; typical: 6.4 (the default). Drawing takes most of the time, in proportion to
-      `seconds` times `fps`
+    - `width` of the picture, inches (100 pixels each); typical: 6.4 (the default). Drawing takes most of the computing time,
+      in proportion to `seconds` times `fps`
 
     **Returns** a matplotlib animation, whose `save` writes further files. The same call gives the same file.
 
@@ -92,23 +92,24 @@ def animate(
         raise InputError("path", f"is {quoted(str(path))}; a film must be a .gif or .html file")
     if isinstance(fps, bool) or not isinstance(fps, int) or not 1 <= fps <= 50:
         raise InputError("fps", f"is {quoted(fps)}; it must be a whole number of pictures a second, 1 to 50")
-    first, last = _stretch(motion, begin, end)
+    first, last = _time_range(motion, begin, end)
     speed = _fastest(motion, owner)
     turns = speed * (last - first) / (2.0 * np.pi)
     lasts = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
     pictures = int(np.ceil(turns / _TURNS_PER_PICTURE)) if lasts is None else lasts * fps
     count = round(float(np.clip(pictures, 2, _MAX_PICTURES)))
-    if turns / count > _TURN:
-        most = first + _TURN * 2.0 * np.pi * count / speed
-        problem = f"advances the rotor by {turns / count:.3g} turns from one frame to the next, which looks like another speed"
+    if turns / count > _MAX_TURNS_PER_PICTURE:
+        most = first + _MAX_TURNS_PER_PICTURE * 2.0 * np.pi * count / speed
+        problem = f"turns the rotor by {turns / count:.3g} turns from one picture to the next, which looks like another speed"
         raise InputError("end", f"{problem}; end at {most:.4g} s or before, or make the film longer")
     # An orbit is periodic: the picture after the last one would be the first one.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
     dense = np.linspace(time[0], time[-1], max(400, count))
-    shown, strips = (
-        of_run(motion, times) if isinstance(motion, Run) else of_orbit(motion, owner, times) for times in (time, dense)
+    shown, history = (
+        motion_of_run(motion, times) if isinstance(motion, Run) else motion_of_orbit(motion, owner, times)
+        for times in (time, dense)
     )
-    film = _film(owner, shown, strips, float(fps), magnify, width)
+    film = _film(owner, shown, history, float(fps), magnify, width)
     if path is not None:
         film.save(path)
     return film
@@ -126,7 +127,7 @@ def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
     return scene
 
 
-def _stretch(motion: Run | Orbit, begin: Number | None, end: Number | None) -> tuple[float, float]:
+def _time_range(motion: Run | Orbit, begin: Number | None, end: Number | None) -> tuple[float, float]:
     """Return the beginning and the end of the film, s."""
     if isinstance(motion, Run):
         window = motion.window
@@ -151,7 +152,7 @@ def _fastest(motion: Run | Orbit, scene: Scene) -> float:
     return float(max(motion.rotor_speed, motion.omega)) if np.isfinite(motion.rotor_speed) else float(scene.drive.speed)
 
 
-def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: float | None, width: float) -> Film:
+def _film(scene: Scene, shown: SampledMotion, history: SampledMotion, fps: float, magnify: float | None, width: float) -> Film:
     if not _NARROWEST <= width <= _WIDEST:
         raise InputError("width", f"is {width:g} inches; it must be from {_NARROWEST:g} to {_WIDEST:g}")
     view = view_of(scene)
@@ -187,7 +188,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     # Texts that are wider than the picture must not reduce the size of the drawing.
     for text in stage.texts:
         text.set_in_layout(False)
-    cursors = _strips((lower, below), scene, strips)
+    cursors = _plot_histories((lower, below), scene, history)
 
     def update(k: int) -> None:
         for artist, part in zip(artists, parts(k), strict=True):
@@ -209,7 +210,7 @@ def _move(artist: Line2D | Polygon, points: np.ndarray) -> None:
         artist.set_xy(points)
 
 
-def _strips(axes: tuple[Axes, Axes], scene: Scene, shown: Stretch) -> list[Line2D]:
+def _plot_histories(axes: tuple[Axes, Axes], scene: Scene, shown: SampledMotion) -> list[Line2D]:
     """Plot displacements and force over time, and return a moving time cursor for each."""
     upper, lower = axes
     structure = scene.machine.structure()

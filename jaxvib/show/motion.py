@@ -16,11 +16,11 @@ from jaxvib.show.wheel import Pose, RotorPose
 from jaxvib.steady.orbits.describe import Orbit
 
 _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
-"""Largest rotation of a load between two samples of a run, rad, for which interpolation is accurate enough."""
+"""Rotation of a load between two samples of a run, rad, up to which interpolation is accurate enough."""
 
 
-class Stretch(NamedTuple):
-    """Motion at some times.
+class SampledMotion(NamedTuple):
+    """Motion of a machine at the times of a film.
 
     **Attributes**: `time` (nt,) s; `displacement`, `velocity` (nt, nd); `rotors`, a `RotorPose` for each exciter, whose arrays
     have a leading axis over the times; `force` on the foundation, (nt, directions) N.
@@ -37,7 +37,7 @@ class Stretch(NamedTuple):
         return Pose(self.displacement[k], self.velocity[k], jax.tree.map(lambda x: x[k], self.rotors))
 
 
-def of_run(run: Run, time: np.ndarray) -> Stretch:
+def motion_of_run(run: Run, time: np.ndarray) -> SampledMotion:
     """Return a run at these times, by cubic Hermite interpolation between the stored states.
 
     Velocities and forces are interpolated linearly. **Raises** `InputError` for times outside the stored states, and for states
@@ -69,13 +69,13 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
     q, v = np.asarray(state.displacement, float), np.asarray(state.velocity, float)
     rotors = []
     for own, *rotor in zip(state.exciters, kept.rotor_angles, kept.rotor_speeds, strict=True):
-        angle = [cubic(_whole(u, w, t), w) for u, w in zip(arrays(own.angle), arrays(own.rate), strict=True)]
+        angle = [cubic(_continuous_angle(u, w, t), w) for u, w in zip(arrays(own.angle), arrays(own.rate), strict=True)]
         turn, speed = arrays(rotor)
-        rotors.append(RotorPose(tuple(angle), cubic(_whole(turn, speed, t), speed)))
+        rotors.append(RotorPose(tuple(angle), cubic(_continuous_angle(turn, speed, t), speed)))
     force = np.asarray(kept.foundation_force, float)
     between = (1.0 - share)[:, None] * force[k] + share[:, None] * force[k + 1]
     velocity = (1.0 - share)[:, None] * v[k] + share[:, None] * v[k + 1]
-    return Stretch(time, cubic(q, v), velocity, tuple(rotors), between)
+    return SampledMotion(time, cubic(q, v), velocity, tuple(rotors), between)
 
 
 def _stored_states(run: Run, time: np.ndarray) -> Trajectory:
@@ -90,7 +90,7 @@ def _stored_states(run: Run, time: np.ndarray) -> Trajectory:
     raise InputError("begin", problem + ("" if run.trajectory is not None else " (simulate with save='all' for the rest)"))
 
 
-def _whole(angle: np.ndarray, rate: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _continuous_angle(angle: np.ndarray, rate: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return continuous angles (nt, ...) from angles modulo a turn; their rates determine the number of whole turns."""
     step = np.diff(time).reshape(-1, *[1] * (angle.ndim - 1))
     foreseen = 0.5 * step * (rate[1:] + rate[:-1])
@@ -99,14 +99,14 @@ def _whole(angle: np.ndarray, rate: np.ndarray, time: np.ndarray) -> np.ndarray:
     return np.concatenate([angle[:1], angle[:1] + np.cumsum(change, axis=0)])
 
 
-def of_orbit(orbit: Orbit, scene: Scene, time: np.ndarray) -> Stretch:
+def motion_of_orbit(orbit: Orbit, scene: Scene, time: np.ndarray) -> SampledMotion:
     """Return an exact jam of a `scene` at these times, from its Fourier series.
 
     **Raises** `InputError` for a jam that does not exist, or a scene with other coordinates or loads.
     """
     omega = float(orbit.omega)
     if not np.isfinite(omega) or not np.isfinite(np.asarray(orbit.amplitude)).all():
-        raise InputError("orbit", f"is no motion to be shown: {orbit.message}")
+        raise InputError("orbit", f"is not a motion that can be shown: {orbit.message}")
     if len(orbit.units) != len(scene.machine.structure().coordinates) or orbit.offsets.shape != (scene.loads.count,):
         raise InputError("scene", "is not the scene of the orbit: it has other coordinates or loads")
     theta = omega * time
@@ -114,4 +114,4 @@ def of_orbit(orbit: Orbit, scene: Scene, time: np.ndarray) -> Stretch:
     wave = np.exp(1j * np.asarray(orbit.orders)[:, None] * theta)
     force = np.real(np.asarray(orbit.force_harmonics) @ wave).T
     rotor = RotorPose((np.asarray(phi),), float(orbit.rotor_speed) * time)
-    return Stretch(time, np.asarray(q), np.asarray(v), (rotor,), force)
+    return SampledMotion(time, np.asarray(q), np.asarray(v), (rotor,), force)

@@ -12,14 +12,14 @@ from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest, caption, places_of
 from jaxvib.steady.jams.jam import Jam
 
-_FRAMES = 20
-"""Poses in a period. Browsers interpolate linearly between them; circular paths are accurate to about 1 %."""
+_FRAMES_PER_PERIOD = 20
+"""Number of frames in a period. Browsers interpolate linearly between them; circular paths are accurate to about 1 %."""
 
-_SECONDS = 1.6
-"""Duration of a period in the picture, s."""
+_PERIOD_SECONDS = 1.6
+"""Duration of a period of the vibration in the picture, s."""
 
 
-def moving(scene: Scene, jam: Jam) -> str:
+def moving_svg(scene: Scene, jam: Jam) -> str:
     """Return the sketch of a scene that moves in a jam mode, with the forces on the foundation as arrows.
 
     The rotor turns at its own speed, faster than the loads. Coincident loads are drawn at the same place.
@@ -33,14 +33,14 @@ def moving(scene: Scene, jam: Jam) -> str:
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
-    >>> moving(scene, jv.jam_modes(scene).select(1)).count("<animate") > 10
+    >>> moving_svg(scene, jv.jam_modes(scene).select(1)).count("<animate") > 10
     True
     """
     view = view_of(checked_scene(scene))
     omega, amplitude = float(jam.omega), np.asarray(jam.displacement)
     if not np.isfinite(omega) or not np.isfinite(amplitude).all():
         raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown:  {jam.message}")
-    theta = 2.0 * np.pi * np.arange(_FRAMES) / _FRAMES
+    theta = 2.0 * np.pi * np.arange(_FRAMES_PER_PERIOD) / _FRAMES_PER_PERIOD
     first, *others = (np.asarray(u, float) for u in scene.loads.rest())
     wave = np.exp(1j * theta)[:, None] * amplitude
     displacement, velocity = np.real(wave), np.real(1j * omega * wave)
@@ -56,21 +56,23 @@ def moving(scene: Scene, jam: Jam) -> str:
     magnified = view.magnified(displacement)
     reach = magnified * view.scale
     frames = [[*view.parts(p, reach), *view.arrows(p, total, 0.7 / most)] for p, total in zip(poses, totals, strict=True)]
-    slower = _SECONDS * omega / (2.0 * np.pi)
+    slower = _PERIOD_SECONDS * omega / (2.0 * np.pi)
     head = (
         f"{caption(scene)}\njam mode {int(jam.mode)}, {jam.judgement}: slowed down {slower:.3g} x, displacements drawn "
         f"{magnified:.3g} x as large, longest arrow {most:.3g} N"
     )
-    return svg(view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _SECONDS, float(jam.rotor_speed) / omega)
+    return svg(
+        view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _PERIOD_SECONDS, float(jam.rotor_speed) / omega
+    )
 
 
-def still(scene: Scene) -> str:
+def sketch_svg(scene: Scene) -> str:
     """Return the sketch of a scene at rest as the text of an SVG file; this is much faster than `jaxvib.sketch`.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
-    >>> "M = " in still(jv.scene_from_toml(TEMPLATES["planar_rotor"]))
+    >>> "M = " in sketch_svg(jv.scene_from_toml(TEMPLATES["planar_rotor"]))
     True
     """
     view, pose = view_of(checked_scene(scene)), at_rest(scene)
-    return svg(view.limits, [view.parts(pose, 0.0)], [view.texts(pose, 0.0)], caption(scene), _SECONDS, 0.0)
+    return svg(view.limits, [view.parts(pose, 0.0)], [view.texts(pose, 0.0)], caption(scene), _PERIOD_SECONDS, 0.0)

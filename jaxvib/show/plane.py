@@ -11,17 +11,17 @@ from jaxvib.draw.machine.parts import Part, Text, circle, ground, turning_arrow
 from jaxvib.draw.style import COLORS, Look
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.plane_body import PlaneBody
-from jaxvib.show.view import BED, BODY, View, tie_parts
+from jaxvib.show.view import BODY, FOUNDATION, View, tie_parts
 from jaxvib.show.wheel import Pose, Wheel, shown
 
 _WIDTH = 6.0
-"""Width of the attachments of a body in the drawing."""
+"""Width of the area of a body, in units of the drawing, that contains the points to which something is attached."""
 
 _MARGIN = 0.32
 """Distance of the outline of a body from the points of its supports, and from the rims of its exciters."""
 
 _SPRING = 1.6
-"""Length of a spring from the point of the body to the foundation."""
+"""Length of a spring from the body to the foundation, in units of the drawing."""
 
 _TURN: Look = {"color": COLORS[1], "zorder": 3.7}
 
@@ -30,7 +30,11 @@ _STEEP_SPRING_SINE = np.sin(np.radians(40.0))
 
 
 class _Strut(NamedTuple):
-    """Spring with its damper: `start` and `way` to its end on the foundation, index of its `support`, direction `along`."""
+    """Spring with its damper, from the body to the foundation.
+
+    **Attributes**: `support`: index of its support; `start`: its end on the body; `way`: the vector from there to its end on
+    the foundation; `along`: unit vector of its direction (angle of the support, plus a right angle for the second spring).
+    """
 
     support: int
     start: np.ndarray
@@ -94,7 +98,7 @@ class PlaneView(View):
         for strut in self.struts:
             end = strut.start + strut.way
             side = 0.4 * np.array([strut.way[1], -strut.way[0]]) / _SPRING
-            found.append(Part(ground(tuple(end - side), tuple(end + side)), BED))
+            found.append(Part(ground(tuple(end - side), tuple(end + side)), FOUNDATION))
             found += tie_parts(tuple(ends[strut.support]), tuple(end), strut.stiffness, strut.damping, _SPRING)
         found.append(Part(corners, BODY, True))
         found += [Part(circle(tuple(at), 0.06, 15), {"fc": "black", "ec": "none", "zorder": 2.8}, True) for at in ends]

@@ -32,7 +32,7 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
 
     **Arguments**
 
-    - `scene`, of any machine
+    - `scene` with any kind of machine
     - `deck`: the motion of points of a body in a plane, from `Run.deck`; their ellipses are drawn, magnified
     - `ax`: axes to draw onto
 

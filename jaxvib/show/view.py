@@ -12,7 +12,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.show.wheel import Pose, Wheel, shown
 
 INK: Look = {"color": "#333333", "lw": 1.2, "zorder": 2.0}
-BED: Look = {"color": "black", "lw": 1.4, "zorder": 1.0}
+FOUNDATION: Look = {"color": "black", "lw": 1.4, "zorder": 1.0}
 BODY: Look = {"fc": "#c9d7e8", "ec": "black", "lw": 1.3, "zorder": 2.5}
 FORCE: Look = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
 
@@ -81,7 +81,7 @@ class View(abc.ABC):
 
     @abc.abstractmethod
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return the force of each support on the foundation, (supports, 2) N, across and up.
+        """Return the force of each support on the foundation, (supports, 2) N: the horizontal and the upward component.
 
         Supports that are effects are not included.
         """

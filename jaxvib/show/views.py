@@ -12,7 +12,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.layout import Tie, order_of_ties
 from jaxvib.show.plane import PlaneView
-from jaxvib.show.view import BED, BODY, RotorView, View, spring_text, tie_parts
+from jaxvib.show.view import BODY, FOUNDATION, RotorView, View, spring_text, tie_parts
 from jaxvib.show.wheel import Pose, places_of, shown
 
 
@@ -49,7 +49,7 @@ class PlatformView(RotorView):
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation, the springs and dampers, the platforms, the exciter."""
-        found = [Part(ground((-0.2, 0.0), (self.width, 0.0)), BED)]
+        found = [Part(ground((-0.2, 0.0), (self.width, 0.0)), FOUNDATION)]
         for k, tie in enumerate(self.ties):
             if not tie.exciter:
                 low, high = (self._height(level, pose, reach) for level in (tie.low, tie.high))
@@ -111,7 +111,7 @@ class FrontView(RotorView):
         x, y = self._centre(pose, reach)
         k, c = self.foundation_stiffness[1], self.foundation_damping[1]
         stiffness, damping = float(np.max(k)), float(np.max(c))
-        found = [Part(ground((-1.2, -2.4), (1.6, -2.4)), BED), Part(ground((-2.7, 1.2), (-2.7, -1.6)), BED)]
+        found = [Part(ground((-1.2, -2.4), (1.6, -2.4)), FOUNDATION), Part(ground((-2.7, 1.2), (-2.7, -1.6)), FOUNDATION)]
         found += tie_parts((x, -2.4), (x, y - self.wheel.rim), stiffness, damping)
         found += tie_parts((-2.7, y), (x - self.wheel.rim, y), stiffness, damping)
         found += self.wheel.parts((x, y), pose.rotors[0])
@@ -159,7 +159,7 @@ class FrontView(RotorView):
         return [(0.0, -2.4), (-2.7, 0.0)]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return the components of T_K q + T_C q', up on the foundation and across on the wall.
+        """Return the vertical component of T_K q + T_C q' on the foundation and the horizontal one on the wall.
 
         T_K is `foundation_stiffness`, T_C is `foundation_damping`.
         """
@@ -195,7 +195,7 @@ class ShaftView(RotorView):
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return foundation, supports, shaft and body, a disc with loads at each station, and the rotor along its axis."""
-        found = [Part(ground((-3.2, -2.2), (3.2, -2.2)), BED)]
+        found = [Part(ground((-3.2, -2.2), (3.2, -2.2)), FOUNDATION)]
         for s, k, c in self.stands:
             found += tie_parts((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
         ends = [self.middle - 3.1 / self.along, self.middle + 3.1 / self.along]
@@ -258,8 +258,8 @@ def view_of(scene: Scene) -> View:
     not_drawn = machine.places == "point" and machine.mounting().axes != (0, 1)
     if not_drawn or machine.places not in views or machine.body_count > 1:
         problem = (
-            f"is {machine.kind!r}; sketches are available for machines with platforms, a shaft or one body in a plane, or that "
-            "move across and up"
+            f"is {machine.kind!r}; sketches are available for machines with platforms, a shaft or one body in a plane, and for "
+            "machines that move across and up"
         )
         raise InputError("machine.kind", problem)
     return views[machine.places](scene)

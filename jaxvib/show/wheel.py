@@ -18,13 +18,14 @@ from jaxvib.machine.scene import Exciter, Scene
 class RotorPose(NamedTuple):
     """Positions of a rotor and its loads at an instant.
 
-    **Attributes**: `angle`, the loads' coordinates, (count,) each; `turn`, the angle of the rotor, rad; `own`, the loads'
-    positions relative to its centre, (count,) each, or None if they have not been computed yet.
+    **Attributes**: `angle`, the angles of the loads and their further coordinates if there are any, (count,) each; `turn`, the
+    angle of the rotor, rad; `positions` of the loads relative to the centre of the rotor, (count,) for each direction, or None
+    if they have not been computed yet.
     """
 
     angle: tuple[np.ndarray, ...]
     turn: np.ndarray | float
-    own: Sequence[np.ndarray] | None = None
+    positions: Sequence[np.ndarray] | None = None
 
 
 class Pose(NamedTuple):
@@ -67,7 +68,8 @@ def _span(values: np.ndarray, unit: str) -> str:
 
 
 def places_of(loads: Loads, angle: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the loads' positions relative to the rotor's centre, m: across, up, and along the axis if they move along it."""
+    """Return the loads' positions relative to the rotor's centre, m: across, up, and along the axis for loads that move along
+    it."""
     return [np.asarray(x, float) for x in loads.position(*map(jnp.asarray, angle))]
 
 
@@ -135,9 +137,9 @@ class Wheel:
         self.rim = radius + max(1.15 * self.size, 0.1)
 
     def places(self, pose: RotorPose) -> list[np.ndarray]:
-        """Return the loads' positions relative to the axis in the drawing: across, up, and along if they move along it."""
+        """Return the loads' positions relative to the axis, in units of the drawing, see `places_of`."""
         assert self.loads is not None
-        own = places_of(self.loads, pose.angle) if pose.own is None else pose.own
+        own = places_of(self.loads, pose.angle) if pose.positions is None else pose.positions
         return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in own]
 
     def parts(self, centre: tuple[float, float], pose: RotorPose) -> list[Part]:

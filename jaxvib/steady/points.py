@@ -154,9 +154,8 @@ class Deck(Result):
     - `points` (n, 2), m, of the body
     - `amplitude` U (n, 2), m: complex amplitudes across and up
     - `ellipses`: an `Ellipse` whose arrays are (n,)
-    - `straightness`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points have the same motion;
-      typical:
-      0.01 to 0.3
+    - `motion_spread`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points have the same
+      motion; typical: 0.01 to 0.3
     """
 
     status = Computed.done
@@ -164,7 +163,7 @@ class Deck(Result):
     points: Array = eqx.field(metadata=in_unit("m", "point", "direction"))
     amplitude: Array = eqx.field(metadata=in_unit("m", "point", "direction"))
     ellipses: Ellipse = eqx.field(metadata=part("point"))
-    straightness: Array = eqx.field(metadata=in_unit(""))
+    motion_spread: Array = eqx.field(metadata=in_unit(""))
 
     @property
     def amplitude_spread(self) -> Array:
@@ -187,7 +186,7 @@ class Deck(Result):
         ]
         spread = (
             f"spread over the deck: amplitude {100.0 * float(self.amplitude_spread):.3g} %, "
-            f"direction {np.rad2deg(float(self.direction_spread)):.3g} deg, straightness {float(self.straightness):.3g}"
+            f"direction {np.rad2deg(float(self.direction_spread)):.3g} deg, motion {float(self.motion_spread):.3g}"
         )
         return "\n".join([*each, spread])
 

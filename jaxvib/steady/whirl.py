@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jaxvib.display import SpeedUnit
     from jaxvib.draw.style import Drawn
 
-Weights = Literal["fixed", "none"]
+LoadMasses = Literal["fixed", "none"]
 
 _COUPLING, _MIN_COUPLING_ROUNDINGS = 1e-9, 100.0
 """Size of the added coupling that separates two whirls of one speed, relative to the matrices of the machine, and its minimum
@@ -94,7 +94,7 @@ class Whirl(Result):
     - `decay`: (ns, nd) 1/s, negative if the motion grows. An overdamped motion has two decay rates; `decay` is the smaller
       one, with which the displacement creeps back. Several overdamped motions are in the order of increasing decay
     - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
-    - `critical`: the synchronous speeds
+    - `critical`: the critical speeds
     - `status`: a `WhirlStatus`; motions that rounding hides are NaN
     """
 
@@ -116,9 +116,10 @@ class Whirl(Result):
 
     @validated
     def plot(self, *, at: float | None = None, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the Campbell diagram: whirl speeds over the rotor's speed, forward and backward, with the synchronous line.
+        """Plot the Campbell diagram: speeds of forward and backward whirls over the rotor speed.
 
-        Critical speeds are marked on the synchronous line, and the rotor's working speed if `at` is given.
+        Critical speeds are marked on the line on which the whirl speed is equal to the rotor speed. A vertical line marks the
+        operating speed `at` if it is given.
 
         **Arguments**: `at`, rad/s; `unit` of the speeds; `ax`: axes to draw onto.
 
@@ -134,7 +135,7 @@ class Whirl(Result):
 
 
 @validated
-def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = "fixed") -> Whirl:
+def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: LoadMasses = "fixed") -> Whirl:
     """Return the whirl speeds of the scene's rotor, with its damping, at one or several rotor speeds.
 
         (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex
@@ -145,7 +146,7 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = 
 
     - `scene` with a machine that moves in two directions
     - `rotor_speed`, rad/s, one or a list (default: the drive's); typical: 50 values from 0 to 500 for a Campbell diagram
-    - `loads`: "fixed" counts the loads' masses at their track (the default), "none" leaves them out
+    - `loads`: "fixed": the masses of the loads are fixed to the rotor at their track (the default); "none": without the loads
 
     **Returns** `Whirl`. Speeds and decays have derivatives if no two of them are equal.
 
@@ -172,7 +173,7 @@ def _sense_word(speed: float, forward: bool) -> str:
 
 
 @cached
-def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
+def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
     carrier, mass = model.carrier, _mass(model, loads)
     nd = mass.shape[0]
     gyroscopic = jnp.zeros_like(mass) if model.mount.gyroscopic is None else model.mount.gyroscopic
@@ -246,8 +247,8 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
 
 @validated
-def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
-    """Return the synchronous critical speeds: (K - w^2 (M - i G)) X = 0, where the whirl turns at the speed w of the rotor.
+def critical_speeds(scene: Scene, *, loads: LoadMasses = "fixed") -> CriticalSpeeds:
+    """Return the critical speeds, at which a whirl turns at the speed w of the rotor: (K - w^2 (M - i G)) X = 0.
 
     The eigenproblem is Hermitian. On supports that are equal in both directions, a forward tilt has the inertia A - C, a
     backward one A + C.
@@ -268,7 +269,7 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
 
 
 @cached
-def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
+def _critical_speeds(model: LinearModel, loads: LoadMasses) -> CriticalSpeeds:
     carrier, mount, mass = model.carrier, model.mount, _mass(model, loads)
     inertia = mass if mount.gyroscopic is None else mass - 1j * mount.gyroscopic
     part = 1j * _coupling(mass.dtype) * jnp.trace(mass) * _sense_matrix(model.mount)
@@ -318,7 +319,7 @@ def _has_all_springs(stiffness: np.ndarray) -> bool:
     return bool(np.all(np.linalg.eigvalsh(stiffness / np.outer(size, size)) > rounding))
 
 
-def _mass(model: LinearModel, loads: Weights) -> Array:
+def _mass(model: LinearModel, loads: LoadMasses) -> Array:
     require_one_of(loads, ("fixed", "none"), "loads")
     return model.mass if loads == "fixed" else model.carrier.mass
 

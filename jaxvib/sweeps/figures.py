@@ -83,7 +83,7 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
     label = _axis_label(opened, dims[0])
     (_, scale), (_, factor) = _display_unit(opened, dims[0]), _display_unit(opened, name)
     return points_over(
-        scale * x, factor * values.reshape(x.size, -1), across=label, up=_measure_label(opened, name), log=log, ax=ax
+        scale * x, factor * values.reshape(x.size, -1), x_label=label, y_label=_measure_label(opened, name), log=log, ax=ax
     )
 
 
@@ -140,22 +140,22 @@ def plot_map(
         if given is not None and given not in grid:
             raise InputError(name, f"is {quoted(given)}; {suggest_name(given, grid)}")
     rest = [d for d in grid if d not in (x, y)]
-    across = x or (_SPEED if _SPEED in rest else rest[0] if rest else None)
-    rest = [d for d in rest if d != across]
-    up = y or (rest[0] if rest else None)
-    if across is None or up is None or across == up:
+    x_name = x or (_SPEED if _SPEED in rest else rest[0] if rest else None)
+    rest = [d for d in rest if d != x_name]
+    y_name = y or (rest[0] if rest else None)
+    if x_name is None or y_name is None or x_name == y_name:
         raise InputError("x", f"and y must be two different axes; this study has: {', '.join(grid) or 'none'}")
-    (xs, step_x), (ys, step_y) = _thinned(opened, across), _thinned(opened, up)
-    steps = {across: slice(None, None, step_x), up: slice(None, None, step_y)}
+    (xs, step_x), (ys, step_y) = _thinned(opened, x_name), _thinned(opened, y_name)
+    steps = {x_name: slice(None, None, step_x), y_name: slice(None, None, step_y)}
     region = tuple(steps.get(d, slice(n // 2, n // 2 + 1)) for d, n in zip(dims, opened.shape, strict=True))
-    order = sorted(range(len(dims)), key=lambda k: (dims[k] in (up, across), dims[k] == across))
+    order = sorted(range(len(dims)), key=lambda k: (dims[k] in (y_name, x_name), dims[k] == x_name))
     shape = (ys.size, xs.size)
-    labels: Look = {"across": _axis_label(opened, across), "up": _axis_label(opened, up)}
-    labels["log"] = (_is_log(opened, across), _is_log(opened, up))
-    (_, scale_x), (_, scale_y) = _display_unit(opened, across), _display_unit(opened, up)
+    labels: Look = {"x_label": _axis_label(opened, x_name), "y_label": _axis_label(opened, y_name)}
+    labels["log"] = (_is_log(opened, x_name), _is_log(opened, y_name))
+    (_, scale_x), (_, scale_y) = _display_unit(opened, x_name), _display_unit(opened, y_name)
     if measure in (None, "regime", "mode") and _has_labels(opened):
         table = _labels(opened, region)
-        lines = _theory(opened, across, up, xs, ys) if theory else {}
+        lines = _theory(opened, x_name, y_name, xs, ys) if theory else {}
         codes = np.transpose(table.codes, order).reshape(shape)
         lines = {kind: [(scale_x * a, scale_y * b) for a, b in parts] for kind, parts in lines.items()}
         return label_map(scale_x * xs, scale_y * ys, codes, table.names, lines=lines, **labels, ax=ax)
@@ -194,7 +194,7 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     shares = {name: (n / total, *wilson(n, total)) for name, n in hits.items() if np.any(n > 0)}
     log = _is_log(opened, over)
     _, scale = _display_unit(opened, over)
-    return shares_chart(scale * opened.read(over), shares, across=_axis_label(opened, over), log=log, ax=ax)
+    return shares_chart(scale * opened.read(over), shares, x_label=_axis_label(opened, over), log=log, ax=ax)
 
 
 def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -216,7 +216,7 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
     _, factor = _display_unit(opened, name)
-    return distribution_chart(factor * edges, np.asarray(counts), across=_measure_label(opened, name), ax=ax)
+    return distribution_chart(factor * edges, np.asarray(counts), x_label=_measure_label(opened, name), ax=ax)
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -252,7 +252,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
     label = f"mean {_measure_label(opened, name)}"
     _, factor = _display_unit(opened, name)
-    return tornado_chart(axes, *(factor * m for m in (*means.T, found[0] / found[1])), across=label, ax=ax)
+    return tornado_chart(axes, *(factor * m for m in (*means.T, found[0] / found[1])), x_label=label, ax=ax)
 
 
 def _fifths(store: Store, axis: str) -> tuple[float, float]:
@@ -335,7 +335,7 @@ def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
 
 
 def _theory(
-    store: Store, across: str, up: str, xs: np.ndarray, ys: np.ndarray
+    store: Store, x_name: str, y_name: str, xs: np.ndarray, ys: np.ndarray
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """Return the lines in a map on which exact jams of the stored scene have a fold or lose their stability, by kind.
 
@@ -343,12 +343,12 @@ def _theory(
     influence steady motions, the lines are straight. If it is a parameter of the scene, the lines connect points that are
     computed for `_ROWS` of its values.
     """
-    if _SPEED not in (across, up):
+    if _SPEED not in (x_name, y_name):
         return {}
     scene = scene_from_toml(store.record["scene"])
     if not isinstance(scene.drive, ConstantSpeed):
         return {}
-    other, values, speeds = (up, ys, xs) if across == _SPEED else (across, xs, ys)
+    other, values, speeds = (y_name, ys, xs) if x_name == _SPEED else (x_name, xs, ys)
     fixed = other.startswith("start.")
     rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _ROWS))
     target = axis_of(scene, other, [float(rows[0])]).target
@@ -375,5 +375,5 @@ def _theory(
                 for kinds, row in zip(found, rows, strict=True)
                 for n in kinds.get(kind, [])
             ]
-        lines[kind] = parts if across == _SPEED else [(b, a) for a, b in parts]
+        lines[kind] = parts if x_name == _SPEED else [(b, a) for a, b in parts]
     return lines

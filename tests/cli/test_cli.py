@@ -187,7 +187,7 @@ def test_optimize_json_has_the_promised_keys(typed, tmp_path):
 def test_criterion_json_has_the_promised_keys(typed, tmp_path, monkeypatch):
     """The figure is fine at resonances, beside which the functional spans decades."""
     drawn = []
-    monkeypatch.setattr("jaxvib.draw.criterion.pull_chart", lambda axis, speed, *more: drawn.append(speed))
+    monkeypatch.setattr("jaxvib.draw.criterion.criterion_chart", lambda axis, speed, *more: drawn.append(speed))
     code, out, err = typed("criterion", "machine.toml", "--json", "--check", "--out", "o")
     document = json.loads(out)
     assert code == 0 and err == ""

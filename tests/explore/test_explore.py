@@ -18,7 +18,7 @@ from jaxvib.explore.panel import TALL, WIDE, Panel
 from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.show.moving import moving
+from jaxvib.show.moving import moving_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 RPM = 30.0 / np.pi
@@ -244,7 +244,7 @@ def test_the_campbell_diagram_is_the_rotors_whirl(kind):
 def test_the_machine_moves_as_its_jam_says(two_platforms):
     """The picture's motion, read from its file, is the jam's: stroke and phase of platforms, loads and force arrows."""
     jam = jax.device_get(jv.jam_modes(two_platforms)).select(3)
-    drawn = ElementTree.fromstring(moving(two_platforms, jam))
+    drawn = ElementTree.fromstring(moving_svg(two_platforms, jam))
 
     def shifts(texts: str) -> np.ndarray:
         (group,) = [g for g in drawn.iter(f"{SVG}g") if texts in "".join(g.itertext())]
@@ -262,7 +262,7 @@ def test_the_machine_moves_as_its_jam_says(two_platforms):
     (once,) = turns
     assert float(seconds[:-1]) / float(once[:-1]) == pytest.approx(float(jam.rotor_speed / jam.omega), rel=1e-3)
     with pytest.raises(jv.ComputationError, match="jam mode 1 cannot be shown"):
-        moving(two_platforms, jv.jam_modes(two_platforms).select(1, throw=False))
+        moving_svg(two_platforms, jv.jam_modes(two_platforms).select(1, throw=False))
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)

@@ -33,7 +33,10 @@ WRONG = {
     "no speed": (lambda: changed(lambda s: s.drive.speed, 0.0), "drive.speed is 0 rad/s; it must be greater than 0"),
     "a text": (lambda: changed(lambda s: s.drive.speed, "50 rpm"), "scene.drive.speed is '50 rpm', which is not a number"),
     "another shape": (lambda: changed(lambda s: s.machine.mass, jnp.ones(3)), "machine.mass has 3 values; 2 are needed"),
-    "heavy loads": (lambda: changed(lambda s: s.loads.mass, 1e18), "loads.mass makes 3e+18 kg in all on a machine of 215 kg"),
+    "heavy loads": (
+        lambda: changed(lambda s: s.loads.mass, 1e18),
+        "loads.mass gives 3e+18 kg for all loads on a machine of 215 kg",
+    ),
     "weak drag": (lambda: changed(lambda s: s.loads.drag, 1e-300), "loads.drag takes 1.0e-302 of a load's speed"),
     "an effect": (
         lambda: changed(lambda s: s.all_effects[0].g, -9.81, scene(effects=(jv.Gravity(),))),
@@ -90,7 +93,7 @@ def test_numbers_lost_by_rounding_are_refused():
 
     for changes, says in (
         (dict(mass=1e18), r"loads may have 1e-15 to 1e\+15 times the machine's mass"),
-        (dict(mass=1e-18), r"loads\.mass makes 3e-18 kg in all on a machine of 215 kg"),
+        (dict(mass=1e-18), r"loads\.mass gives 3e-18 kg for all loads on a machine of 215 kg"),
         (dict(drag=1e-300), r"give 0, or at least 1e-13 N s/m"),
     ):
         with pytest.raises(jv.InputError, match=says):

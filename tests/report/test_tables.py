@@ -3,7 +3,7 @@
 import re
 
 import jaxvib as jv
-from jaxvib.report.tables import results, worth
+from jaxvib.report.tables import accuracy_table, result_tables
 
 UNITS = {"force": "N", "rows": "m"}
 
@@ -14,33 +14,33 @@ def cells(text, tag="td"):
 
 def test_only_columns_of_numbers_stand_at_the_right():
     rows = [{"force": 1.0, "kind": "x", "fits": True}, {"force": None, "kind": 2.0, "fits": False}]
-    text = results({"rows": rows}, UNITS)
+    text = result_tables({"rows": rows}, UNITS)
     assert cells(text, "th") == ["force, N", "kind", "fits"] and cells(text) == ["1", "x", "yes", "none", "2", "no"]
     assert re.findall(r"<t[hd]( class='n')?>", text) == [" class='n'", "", ""] * 3
 
 
 def test_long_texts_stand_below_their_row():
     long = "a sentence of more than forty characters, which no column has room for"
-    text = results({"rows": [{"name": "first", "message": long}, {"name": "second", "message": ""}]}, {})
+    text = result_tables({"rows": [{"name": "first", "message": long}, {"name": "second", "message": ""}]}, {})
     assert cells(text, "th") == ["name"] and cells(text) == ["first", f"message: {long}", "second"]
 
 
 def test_worth_is_said_apart_from_results():
     document = {"status": "done", "force": 2.5, "scene": "hidden", "toml": "hidden", "inner": {"status": "inside"}}
-    assert cells(worth(document, UNITS)) == ["done", ""]
-    text = results(document, UNITS)
+    assert cells(accuracy_table(document, UNITS)) == ["done", ""]
+    text = result_tables(document, UNITS)
     assert cells(text) == ["2.5", "N", "inside", ""] and cells(text, "h3") == ["inner"] and "hidden" not in text
 
 
 def test_long_lists_are_told_by_their_range():
     document = {"times": [0.5 * k for k in range(40)], "names": ["x"] * 40, "grid": [[1.0, 2.0], [3.0, None]]}
-    text = results(document, {})
+    text = result_tables(document, {})
     assert cells(text, "p") == [
         "40 numbers from 0 to 19.5; see the output of --json or --out",
         "40 values; see the output of --json or --out",
     ]
     assert cells(text) == ["1", "2", "3", "none"]
-    short = results({"times": [1.0, 2.0], "none": []}, {})
+    short = result_tables({"times": [1.0, 2.0], "none": []}, {})
     assert cells(short) == ["1, 2", "", "none", ""]
 
 

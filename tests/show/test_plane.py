@@ -6,7 +6,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.draw.machine.deck import ellipses
 from jaxvib.draw.machine.parts import turning_arrow
-from jaxvib.show.motion import of_run
+from jaxvib.show.motion import motion_of_run
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import at_rest
 
@@ -114,7 +114,7 @@ def test_path_of_a_point_is_its_motion():
 
 def test_film_has_each_rotor_at_its_own_angle(run, tmp_path):
     kept = run.trajectory
-    found = of_run(run, np.asarray(kept.time)[3000:3010])
+    found = motion_of_run(run, np.asarray(kept.time)[3000:3010])
     for rotor, angle in zip(found.rotors, kept.rotor_angles, strict=True):
         np.testing.assert_allclose(np.exp(1j * rotor.turn), np.exp(1j * np.asarray(angle[3000:3010])), atol=1e-9)
     assert [len(rotor.angle) for rotor in found.rotors] == [1, 0]

@@ -12,7 +12,7 @@ from PIL import Image
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.show.layout import Tie, order_of_ties
-from jaxvib.show.motion import of_orbit, of_run
+from jaxvib.show.motion import motion_of_orbit, motion_of_run
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest
 
@@ -96,21 +96,21 @@ def test_a_run_between_its_samples(run):
     kept = run.trajectory
     t = np.asarray(kept.time)
     some = slice(1000, 1200)
-    found = of_run(run, t[some])
+    found = motion_of_run(run, t[some])
     np.testing.assert_allclose(found.displacement, kept.state.displacement[some], rtol=1e-9)
     np.testing.assert_allclose(
         np.exp(1j * found.rotors[0].angle[0]), np.exp(1j * np.asarray(kept.state.angle[0][some])), rtol=1e-9
     )
     # Every other sample, from its neighbours, is what it was.
     coarse = thinned(run, 2)
-    found = of_run(coarse, t[some])
+    found = motion_of_run(coarse, t[some])
     np.testing.assert_allclose(found.displacement, kept.state.displacement[some], atol=1e-5 * float(run.amplitude[0]))
     np.testing.assert_allclose(np.exp(1j * found.rotors[0].turn), np.exp(60j * t[some]), atol=1e-6)
 
 
 def test_an_orbit_is_the_run_that_settled_on_it(orbit):
     time = np.linspace(0.0, 0.2, 50)
-    found = of_orbit(orbit, SCENE, time)
+    found = motion_of_orbit(orbit, SCENE, time)
     force = SCENE.machine.stiffness[0] * found.displacement + SCENE.machine.damping[0] * found.velocity
     np.testing.assert_allclose(found.force, force, rtol=1e-6, atol=1e-6 * float(orbit.foundation_force))
     np.testing.assert_allclose(found.rotors[0].turn, float(orbit.rotor_speed) * time)

@@ -89,9 +89,9 @@ class Known(PathsOfPoints):
         return Harmonic(SCREEN, jnp.asarray(SPEED), self.amplitude)
 
 
-def test_deck_of_a_translation_is_straight():
+def test_deck_of_a_translation_has_no_spread():
     deck = Known(jnp.array([3e-3 + 0j, 3e-3, 0.0])).deck([(-1.0, 0.2), (0.0, 0.2), (1.0, 0.2)])
-    np.testing.assert_allclose(deck.straightness, 0.0, atol=1e-15)
+    np.testing.assert_allclose(deck.motion_spread, 0.0, atol=1e-15)
     np.testing.assert_allclose([deck.amplitude_spread, deck.direction_spread], 0.0, atol=1e-12)
     np.testing.assert_allclose(np.rad2deg(deck.ellipses.direction), 45.0, rtol=1e-12)
 
@@ -100,7 +100,7 @@ def test_deck_of_a_body_that_turns_has_its_spread():
     """U_p = (0, y + psi x_p): the mean is y, the root mean square of the rest psi x_p."""
     y, psi, x = 2e-3, 1e-3j, np.array([-1.0, 0.0, 1.0])
     deck = Known(jnp.array([0.0, y, psi])).deck([(each, 0.0) for each in x])
-    np.testing.assert_allclose(deck.straightness, abs(psi) * np.sqrt(2.0 / 3.0) / y, rtol=1e-12)
+    np.testing.assert_allclose(deck.motion_spread, abs(psi) * np.sqrt(2.0 / 3.0) / y, rtol=1e-12)
     np.testing.assert_allclose(deck.ellipses.semi_major, np.abs(y + psi * x), rtol=1e-12)
     assert len(deck.summary().splitlines()) == 4
 
@@ -146,7 +146,7 @@ def test_run_has_the_ellipses_of_the_steady_motion():
     found, wanted = run.deck(points, slope="-10 deg"), expected.deck(points, slope="-10 deg")
     for name in ("semi_major", "semi_minor", "direction", "acceleration", "throw_number"):
         np.testing.assert_allclose(getattr(found.ellipses, name), getattr(wanted.ellipses, name), rtol=1e-6)
-    np.testing.assert_allclose(found.straightness, wanted.straightness, rtol=1e-6)
+    np.testing.assert_allclose(found.motion_spread, wanted.motion_spread, rtol=1e-6)
     assert np.max(found.ellipses.remainder) < 1e-4  # what is left of the start
     one = run.ellipse(points[0], slope="-10 deg")
     np.testing.assert_allclose(one.semi_major, found.ellipses.semi_major[0], rtol=1e-12)

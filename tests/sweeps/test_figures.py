@@ -70,8 +70,8 @@ def test_labels_have_a_colour_each_and_none_has_its_own():
         np.arange(2.0),
         codes,
         ["a", "b", "c"],
-        across="x",
-        up="y",
+        x_label="x",
+        y_label="y",
         lines={"fold": [(np.ones(2), np.arange(2.0))]},
     )
     axis = figure.axes[0]

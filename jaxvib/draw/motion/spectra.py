@@ -1,4 +1,4 @@
-"""Charts of spectra, as lines and as waterfalls, and of paths of points in the plane across a rotor's axis."""
+"""Charts of spectra, as lines and as waterfalls, and of paths of points in the plane perpendicular to a rotor's axis."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def _require_fall(torques: np.ndarray) -> None:
 
 
 class SpeedProfile(IdealDrive):
-    """Rotor whose speed is prescribed at several times, with constant accelerations between them.
+    """Drive that prescribes the rotor speed at several times, with constant accelerations between them.
 
     The speed before the first time is the first speed, and the speed after the last time is the last one. The acceleration
     jumps at the times; `simulate` ends a step at each of them.
@@ -285,7 +285,7 @@ class SpeedControl(Motor):
         return self._torques(t, speed, states[0])[2] if states else self.torque(speed)
 
     def state_units(self) -> tuple[Array, ...]:
-        """Return the torque limit."""
+        """Return the torque limit, the typical magnitude of the integral."""
         return (self.torque_limit,)
 
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -83,8 +83,8 @@ class Drive(Part):
         return ()
 
     def settled(self) -> Drive:
-        """Return the drive in its final state: an ideal drive at its working speed, a motor after the time at which it is
-        switched off."""
+        """Return the drive in its final state: an ideal drive at its working speed, or a motor switched off if it is switched
+        off at some time."""
         return self
 
 
@@ -249,7 +249,7 @@ class Motor(Drive):
 
 
 class ConstantSpeed(IdealDrive):
-    """Rotor at a constant speed that the loads do not change.
+    """Drive at a constant rotor speed, which the loads do not change.
 
         theta' = n
 

@@ -73,7 +73,8 @@ class NamePlateMotor(Motor):
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Synchronous speed, rad/s."""
-        # The factor makes a rated speed of 1000 rpm at 50 Hz one below 1500 rpm.
+        # Without the factor, rounding would decide if a rated speed of 1000 rpm at 50 Hz belongs to 1000 rpm or to 1500 rpm; it
+        # belongs to 1500 rpm, because a rated speed is below the synchronous speed.
         return self.frequency / (jnp.ceil(self.frequency / self.rated_speed * (1.0 - 1e-6)) - 1.0)
 
     @property
@@ -159,7 +160,7 @@ class DCMotorElectrical(Motor):
         return self.torque_constant * states[0] if states else self.torque(speed)
 
     def state_units(self) -> tuple[Array, ...]:
-        """Return the current at rest; () without an inductance."""
+        """Return the current at standstill, the typical magnitude of the current; () without an inductance."""
         return () if self.inductance is None else (self.voltage / self.resistance,)
 
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -299,7 +300,7 @@ class InductionMotorElectrical(InductionMotorCircuit):
         return 1.5 * self.pole_pairs * (states[0] * iy - states[1] * ix)
 
     def state_units(self) -> tuple[Array, ...]:
-        """Return the flux linkage that the voltage induces, for each state."""
+        """Return the flux linkage at the voltage of the supply, the typical magnitude of each state."""
         return (self._voltage_amplitude / self.frequency,) * 4
 
     def state_rates(self, t: Array, speed: Array, states: tuple[Array, ...]) -> tuple[Array, ...]:

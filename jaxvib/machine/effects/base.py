@@ -59,7 +59,7 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
     return total
 
 
-def has_half_turn(effects: Iterable[Effect]) -> bool:
+def has_half_turn_symmetry(effects: Iterable[Effect]) -> bool:
     """True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged; the deviation of the load angle in
     a jam then has even harmonics only. Some friction laws keep this symmetry. Gravity on the loads, an imbalance and forces
     between loads break it.
@@ -133,7 +133,8 @@ class Effect(Part):
 class Gravity(Effect):
     """Gravity on the loads: V = m g p_up(u), the torque - m g R cos phi on a load on a circle.
 
-    Coordinates of platforms start at static equilibrium with the weight of the loads, so that gravity adds no force on them.
+    Displacements of platforms are measured from static equilibrium under the weight of platforms and loads. Gravity therefore
+    adds no force on the platforms.
 
     **Arguments**
 

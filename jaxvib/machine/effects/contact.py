@@ -29,7 +29,7 @@ class LoadContact(Effect):
 
     - On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1 follows load j, and load 1
       follows the last one a turn later, so there are N pairs. The angles of a start must be in this order, within one turn;
-      named starts place coincident loads side by side
+      starts by name, such as "rest", place coincident loads side by side
     - With several coordinates each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 times 2 r
 
     Two loads that collide on a track at rest separate at e times the speed at which they approached. The restitution e is

@@ -50,7 +50,7 @@ def _read_place(
 
 
 class CubicSupport(_Support):
-    """Hardening (or softening) support: force k3 r^2 x on the foundation, r the distance from the rest position.
+    """Hardening (or softening) support: force k3 r^2 x on the foundation; r = |x| is the distance from the rest position.
 
     **Arguments** (SI, or strings with a unit)
 

@@ -1,6 +1,7 @@
 """Units, bounds and labels of the parameters of a scene, stored as metadata of dataclass fields.
 
-Constructors use this metadata to read their arguments. The module `named` uses it to name the parameters of a whole scene.
+Constructors use this metadata to read their arguments. The module `named` uses it to name the parameters of a whole scene. In
+names of functions and classes, "number" stands for a parameter.
 """
 
 from __future__ import annotations

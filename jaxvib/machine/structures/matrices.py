@@ -91,7 +91,7 @@ def from_matrices(
       of its coordinates, [up], [across, up] or [across, up, rotation], or a matrix (1 to 3, nd) that gives its
       displacement from q; all places have the same number of directions. "Across" is horizontal
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or across
-      and up (nb = 2); default: the force is not known and given as 0
+      and up (nb = 2); default: the force is unknown, and results state 0
     - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
 
     **Returns** `MatrixMachine`.

@@ -142,7 +142,7 @@ def rotor(
     **Arguments** (SI, or strings with a unit)
 
     - `mass` M, kg, loads not included; typical: 5 to 50
-    - `transverse_inertia` A about an axis across, kg m^2, loads not included; typical: 0.05 to 1
+    - `transverse_inertia` A about a transverse axis, kg m^2, loads not included; typical: 0.05 to 1
     - `polar_inertia` C about the axis of rotation, kg m^2, loads not included, at most 2 A; typical: 0.01 to 0.5
     - `stiffness` k (2,) of the supports, N/m; typical: 1e5 to 1e6
     - `damping` (2,) of the supports, N s/m; typical: 100 to 1000

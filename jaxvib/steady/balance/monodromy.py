@@ -25,7 +25,7 @@ BATCH = 16
 """Number of rotor speeds in a batch of monodromy matrices."""
 
 _MIN_DECAY_EXPONENT = 40.0
-"""Exponent of the decay in a turn, exp(-40), above which a vibration is below the rounding of multipliers."""
+"""Exponent of the decay over a turn, exp(-40), above which a vibration is smaller than the rounding errors of multipliers."""
 
 _MIN_STEPS, _MAX_STEPS = 16, 2**17
 """Limits of the number of steps in a turn. A rotor that needs more steps is allowed only if the carrier comes to rest within a

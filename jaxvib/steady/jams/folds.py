@@ -29,13 +29,13 @@ _GRID_POINTS = 64
 """Number of grid points on each side of each pole in the search for folds."""
 
 _BLOCK_SIZE = 2**16
-"""Number of terms of the modal form, of several load speeds, whose intermediate results fit the processor's cache."""
+"""Number of terms of the modal form (modes times load speeds) whose intermediate results fit into the processor's cache."""
 
 
 class Folds(eqx.Module):
     """Points with dn/dOmega = 0, where two jam modes appear or merge.
 
-    **Attributes**, all (2 nd,), ascending in `omega`; entries whose `exists` is False fill up the end
+    **Attributes**, all (2 nd,), ascending in `omega`; `exists` is False for unused entries, which are at the end
 
     - `omega`: load speed, rad/s
     - `rotor_speed`, rad/s

@@ -207,7 +207,7 @@ def plot_period(
         (title, turned, several if len(several) > 1 else [alone]),
         ("foundation force, N", forces, ["across", "up"][-forces.shape[1] :]),
     ]
-    return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)
+    return signals_chart(np.rad2deg(theta), panels, x_label="load angle Ωt, degrees", ax=ax)
 
 
 @cached
@@ -226,7 +226,7 @@ def _at(orbit: Orbit, theta: Array | np.ndarray) -> tuple[Array, Array, tuple[Ar
 
 @cached
 def _relative_amplitude(orders: tuple[int, ...], displacement: Array, i: int, j: int) -> Array:
-    return swing(np.asarray(orders), displacement[i - 1 : i] - displacement[j - 1 : j])[0]
+    return half_range(np.asarray(orders), displacement[i - 1 : i] - displacement[j - 1 : j])[0]
 
 
 @cached
@@ -369,11 +369,11 @@ def _motion_quantities(
     velocity = motion.omega * (harmonics.displacement * grid.orders[None])
     power = power + model.linear.dissipated(velocity)
     nd = harmonics.displacement.shape[0]
-    swings = swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
+    ranges = half_range(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
     # Components of the foundation force are combined as those of a vector.
-    force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
+    force = jnp.sqrt(jnp.sum(ranges[nd:] ** 2))
     contact_torque = _least_contact_torque(model, grid, motion, harmonics)
-    return (swings[:nd], force, power, contact_torque)
+    return (ranges[:nd], force, power, contact_torque)
 
 
 def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
@@ -432,8 +432,8 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     return side * (jax.lax.fori_loop(0, 3, halley, (starts + width / each * best, begin))[1] @ both)
 
 
-def swing(orders: np.ndarray, harmonics: Array) -> Array:
-    """Return (max - min)/2 over the period of the signals with these harmonics (n, K), also between the samples."""
+def half_range(orders: np.ndarray, harmonics: Array) -> Array:
+    """Return (max - min)/2 over the period, between samples too, of the signals with these harmonics (n, K)."""
     symmetric = bool(np.all(orders % 2 == 1))  # the signal changes its sign in half a period
 
     def highest(c: Array) -> Array:

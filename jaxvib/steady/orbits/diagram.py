@@ -16,7 +16,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
-from jaxvib.machine.effects.base import has_half_turn
+from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.roots import next_share
@@ -213,7 +213,7 @@ def _points(scene: Scene) -> list[int]:
 
     The points lie on half a period if the motion has the half-turn symmetry, otherwise on a period.
     """
-    return [p if has_half_turn(scene.all_effects) else 2 * p + 1 for p in _COLLOCATION_POINTS]
+    return [p if has_half_turn_symmetry(scene.all_effects) else 2 * p + 1 for p in _COLLOCATION_POINTS]
 
 
 def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -266,7 +266,7 @@ def _tests(growth: Floquet) -> Array:
 def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
     """Return the roots of the test functions, from all sign changes between neighbouring points."""
     kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
-    if not has_half_turn(solve.scene.all_effects):
+    if not has_half_turn_symmetry(solve.scene.all_effects):
         kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
 
     def read(values: _Values) -> np.ndarray:

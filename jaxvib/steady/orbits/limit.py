@@ -89,7 +89,7 @@ class SynchronizationLimit(Result):
         from jaxvib.draw.results import signals_chart  # slow import
 
         values = [(self.over, np.asarray(self.branch_values)[:, None], [self.over])]
-        return signals_chart(np.rad2deg(np.asarray(self.branch_phases)), values, across="phase, degrees", ax=ax)
+        return signals_chart(np.rad2deg(np.asarray(self.branch_phases)), values, x_label="phase, degrees", ax=ax)
 
 
 @validated

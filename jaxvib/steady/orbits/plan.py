@@ -19,7 +19,7 @@ from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag, require_terms
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import SwitchedOff
-from jaxvib.machine.effects.base import has_half_turn, has_term
+from jaxvib.machine.effects.base import has_half_turn_symmetry, has_term
 from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadPotential, RotorImbalance, SupportForce
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
@@ -131,7 +131,7 @@ def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known
         bodies = 1 if loads.alike else loads.count
         size = _BYTES_PER_POINT * bodies**2 * float(points if isinstance(points, int) else 1)
         return (count(points, "points", low=2, each=size),)
-    tried = _COLLOCATION_POINTS if has_half_turn(scene.all_effects) else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
+    tried = _COLLOCATION_POINTS if has_half_turn_symmetry(scene.all_effects) else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
     return tried if all_known else tried[:1]
 
 

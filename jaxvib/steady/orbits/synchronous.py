@@ -21,7 +21,7 @@ from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.orbits.describe import judgement_of, plot_period, swing
+from jaxvib.steady.orbits.describe import half_range, judgement_of, plot_period
 from jaxvib.steady.orbits.plan import SynchronousPlan, plan_synchronous
 from jaxvib.steady.orbits.whole import (
     PeriodicScene,
@@ -291,7 +291,7 @@ def _quantities(scene: PeriodicScene, grid: Grid, motion: WholeMotion) -> dict[s
     harmonics = analyzed(jnp.concatenate([x[:nd] * scene.length, x[nd:], force.T]), deviation_analysis(grid))
     bodies = x.shape[0]
     displacement, deviation, forces = harmonics[:nd], harmonics[nd:bodies].at[:, 0].add(scene.phases), harmonics[bodies:]
-    swings = swing(grid.deviation_orders, jnp.concatenate([displacement, forces]))
+    ranges = half_range(grid.deviation_orders, jnp.concatenate([displacement, forces]))
     counts = body_counts(scene.model.scene)
     ends = np.cumsum([0, *counts])
     means = [jnp.mean(deviation[a:b, 0].real) if b > a else jnp.zeros_like(omega) for a, b in itertools.pairwise(ends)]
@@ -300,8 +300,8 @@ def _quantities(scene: PeriodicScene, grid: Grid, motion: WholeMotion) -> dict[s
         "phases": jnp.stack(means),
         "torque": jnp.mean(torque, axis=0),
         "power": jnp.mean(power, axis=0),
-        "amplitude": swings[:nd],
-        "foundation_force": jnp.sqrt(jnp.sum(swings[nd:] ** 2)),
+        "amplitude": ranges[:nd],
+        "foundation_force": jnp.sqrt(jnp.sum(ranges[nd:] ** 2)),
         "deviation_harmonics": deviation,
         "displacement_harmonics": displacement,
         "force_harmonics": forces,

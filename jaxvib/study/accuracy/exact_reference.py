@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.effects.base import has_half_turn
+from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import Orbit
@@ -60,7 +60,7 @@ def usual_mode(scene: Scene) -> int:
 def collocation_points(scene: Scene, points: int) -> int:
     """Return the number of collocation points: `points` on half a period, or the same spacing on a whole period without
     half-turn symmetry."""
-    return points if has_half_turn(scene.all_effects) else 2 * points + 1
+    return points if has_half_turn_symmetry(scene.all_effects) else 2 * points + 1
 
 
 def slow_period(scene: Scene) -> float:

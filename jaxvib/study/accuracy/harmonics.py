@@ -17,7 +17,7 @@ from jaxvib.display import speed_text
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.effects.base import has_half_turn
+from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.fields import in_unit
@@ -94,7 +94,7 @@ def harmonic_convergence(
     if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
         raise InputError("points", f"are {quoted(points)}; give numbers of points in ascending order")
     speeds = jnp.atleast_1d(numbers(omega, "rad/s", "omega", None, low=0.0, open_low=True))
-    half = has_half_turn(scene.all_effects)
+    half = has_half_turn_symmetry(scene.all_effects)
     rows = [_errors(scene, speeds, grid_of(m, half).theta.size) for m in (*points, 2 * points[-1])]
     n, known = (np.stack([np.asarray(row[k]) for row in rows]) for k in range(2))
     highest = np.array([grid_of(m, half).orders[-1] for m in points])

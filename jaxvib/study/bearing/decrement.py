@@ -93,7 +93,7 @@ class Decrement(Result):
         """
         from jaxvib.draw.results import points_chart  # slow import
 
-        return points_chart(self.estimates[:, None], across="pair of swings", up="mu1, N m s", ax=ax)
+        return points_chart(self.estimates[:, None], x_label="pair of swings", y_label="mu1, N m s", ax=ax)
 
 
 def turning_points(record: Record) -> TurningPoints:

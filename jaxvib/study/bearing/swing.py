@@ -137,7 +137,7 @@ class Swing(Result):
 
         angle, rate = (np.asarray(x)[:, None] for x in (self.angle, self.rate))
         signals = [("angle, deg", np.rad2deg(angle), ["angle"]), ("rate, rad/s", rate, ["rate"])]
-        return signals_chart(np.asarray(self.time), signals, across="time, s", ax=ax)
+        return signals_chart(np.asarray(self.time), signals, x_label="time, s", ax=ax)
 
 
 @validated

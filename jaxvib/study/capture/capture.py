@@ -19,7 +19,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import SlipRelease
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.torus import in_torus
+from jaxvib.machine.torus import require_torus_balls
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.run import Run
@@ -147,7 +147,7 @@ def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     >>> [round(float(x), 4) for x in (state.angle[0][1], state.rate[0][0])]
     [0.1248, 70.0]
     """
-    loads = in_torus(scene.loads, "moving_state")
+    loads = require_torus_balls(scene.loads, "moving_state")
     beside = 2.0 * jnp.arctan2(loads.ball_radius, loads.radius)
     zero = jnp.zeros((loads.count,))
     still = jnp.zeros(scene.machine.structure().mass.shape[:1])
@@ -213,7 +213,7 @@ def capture(
     Source: Strautmanis et al. 2018, section 3, with one start for each speed.
     """
     scene = validate_scene(scene)
-    in_torus(scene.loads, "capture")
+    require_torus_balls(scene.loads, "capture")
     if not scene.drive.constant:
         raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a prescribed speed, use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:

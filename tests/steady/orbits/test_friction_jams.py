@@ -10,7 +10,7 @@ from periodic import integrate, monodromy, ordered
 from scenes import assembled, machines
 
 import jaxvib as jv
-from jaxvib.machine.effects.base import has_half_turn
+from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.balance.criterion import criterion_functional
 from jaxvib.steady.jams.folds import jam_rotor_speed
@@ -87,7 +87,9 @@ def test_orbits_with_friction_satisfy_the_full_equations(name):
 
 
 def test_dry_friction_keeps_the_half_turn_and_gravity_does_not():
-    assert has_half_turn(alike(dry()).all_effects) and not has_half_turn(alike(dry(), jv.Gravity()).all_effects)
+    assert has_half_turn_symmetry(alike(dry()).all_effects) and not has_half_turn_symmetry(
+        alike(dry(), jv.Gravity()).all_effects
+    )
     # On a whole period, where the symmetry is not put in, it comes out.
     model, grid = assembled(alike(dry())), grid_of(33, False)
 

@@ -13,7 +13,7 @@ from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.rotor import PlanarRotor
-from jaxvib.machine.torus import TorusBalls, in_torus
+from jaxvib.machine.torus import TorusBalls, require_torus_balls
 from papers.machines import ECCENTRICITY
 
 __all__ = ["TABLES", "PrintedTorus", "PublishedRow", "cosine_torus", "gap_torus", "printed_torus"]
@@ -145,7 +145,7 @@ def printed_torus(scene: Scene) -> PrintedTorus:
     """
     gravity, imbalance, rolling = scene.all_effects
     assert isinstance(gravity, Gravity) and isinstance(imbalance, StaticImbalance) and isinstance(rolling, RollingFriction)
-    machine, loads = cast(PlanarRotor, scene.machine), in_torus(scene.loads, "the paper")
+    machine, loads = cast(PlanarRotor, scene.machine), require_torus_balls(scene.loads, "the paper")
     one = jnp.ones_like(loads.gap)
     return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient, loads.tube, one)
 

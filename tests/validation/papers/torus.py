@@ -19,7 +19,7 @@ from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.loads import ball_radius, balls
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.torus import in_torus
+from jaxvib.machine.torus import require_torus_balls
 from papers.machines import RADIUS, published_torus
 from papers.printed import Misprint, PrintedNumber
 from papers.printed_torus import TABLES, PrintedTorus, PublishedRow, cosine_torus, gap_torus, printed_torus
@@ -49,13 +49,13 @@ def _up(field: Dynamics | PrintedTorus) -> float:
 
 
 def _angle_of_touching_balls() -> float:
-    own = float(in_torus(_SCENE.loads, "the paper").ball_radius)
+    own = float(require_torus_balls(_SCENE.loads, "the paper").ball_radius)
     first, second = balls(count=2, mass=0.05, radius=RADIUS, drag=0.0, ball_radius=own).offsets()
     return float(second - first)
 
 
 def _half_angle(inverse: Callable[[float], float]) -> float:
-    return inverse(float(in_torus(_SCENE.loads, "the paper").ball_radius) / RADIUS)
+    return inverse(float(require_torus_balls(_SCENE.loads, "the paper").ball_radius) / RADIUS)
 
 
 def _pull(model: Callable[[Scene], PrintedTorus]) -> float:
@@ -107,7 +107,7 @@ def _force() -> float:
 
 def _force_corrected() -> float:
     """N = g cos a + (B u^2 - x'' cos f - y'' sin f) sin a + eb a'^2 per mass."""
-    state, loads = _state(_DISPLACED), in_torus(_SCENE.loads, "the paper")
+    state, loads = _state(_DISPLACED), require_torus_balls(_SCENE.loads, "the paper")
     ax, ay = np.asarray(vector_field(_SCENE)(jnp.asarray(0.0), state).velocity)
     (f, a), g = (float(angle[0]) for angle in state.angle), float(printed_torus(_SCENE).gravity)
     arm, speed = RADIUS + float(loads.gap) * math.sin(a), float(_SCENE.drive.speed)

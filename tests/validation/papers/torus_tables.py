@@ -17,7 +17,7 @@ from jaxvib.equations.state import State
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.spin import FreeSpin
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.torus import in_torus
+from jaxvib.machine.torus import require_torus_balls
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.study.capture.capture import MAX_CAPTURED_SLIP, moving_state
@@ -57,7 +57,7 @@ def _alone(run: _Runs) -> tuple[Scene, State]:
 def _touching(run: _Runs) -> tuple[Scene, State]:
     scene, state = _alone(run)
     # At the paper's angle the balls would overlap by 0.2 % of their size.
-    loads = in_torus(scene.loads, "the table")
+    loads = require_torus_balls(scene.loads, "the table")
     ratio = loads.ball_radius / loads.radius
     apart = 2.0 * (jnp.arcsin(ratio) - jnp.arctan(ratio))
     state = eqx.tree_at(lambda s: s.angle[0], state, state.angle[0] + jnp.asarray([0.0, 1.0]) * apart)
