@@ -80,7 +80,7 @@ class Front(Result):
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the front; each point is labelled with its number `k`, for which `scene(k)` returns the machine.
 
-        **Returns** a matplotlib figure, or the demands `ax`.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.charts import front_chart  # slow import
 

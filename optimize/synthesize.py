@@ -111,7 +111,7 @@ def synthesize(
     >>> space = DesignSpace(form.scene(), free={"machine.stiffness": (0.02, 0.3), "machine.link_stiffness": (0.2, 0.8)},
     ...                     hold=[hold(jam_frequency(mode=3), 1.0), hold(support_frequency_squared(), 2/9)])
     >>> best = synthesize(space, force_per_amplitude(mode=3), starts=8, verify=False)
-    >>> best.same, [round(k, 2) for k in best.after.parameters["machine.stiffness"]]     # n2 = n1 came out
+    >>> best.same, [round(k, 2) for k in best.after.parameters["machine.stiffness"]]     # the optimum has n2 = n1
     (8, [0.11, 0.11])
 
     Source: the antiphase paper, section 5.1, found there by algebra.

@@ -60,7 +60,7 @@ def animate(
     film = jv.animate(motion, scene=scene, **options)
     for suffix in ("gif", "html"):
         if kind in (suffix, "both"):
-            film.save(output.made(f"animation.{suffix}"))
+            film.save(output.main_file(f"animation.{suffix}"))
     first, last = film.figure.axes[1].get_xlim()
     document = {"pictures": film.count, "fps": film.fps, "begin": first, "end": last}
     output.done(document, lambda: f"{film.count} frames from {first:.6g} to {last:.6g} s", "animate")
@@ -71,5 +71,5 @@ def animate(
 @shared
 def sketch(scene: Path, output: Output) -> None:
     """Draw SCENE with the values of its parameters: sketch.png, in --out or the current folder."""
-    jv.sketch(loaded_scene(scene)).savefig(output.made("sketch.png"))
+    jv.sketch(loaded_scene(scene)).savefig(output.main_file("sketch.png"))
     output.done({"status": "done"}, lambda: "a sketch of the machine", "sketch")

@@ -269,7 +269,7 @@ def run(arguments: list[str]) -> int:
         return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False, obj=tuple(arguments)) or 0
     except InputError as error:
         error = _of_command_line(arguments, error)
-        message = f"{error}{_way_out(arguments, error)}"
+        message = f"{error}{_remedy_hint(arguments, error)}"
         return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
     except ComputationError as error:
         return _failed(wants_json, 1, {"kind": "computation", "status": error.status, "message": str(error)})
@@ -314,7 +314,7 @@ def _of_command_line(arguments: list[str], error: InputError) -> InputError:
     return InputError(field, problem)
 
 
-def _way_out(arguments: list[str], error: InputError) -> str:
+def _remedy_hint(arguments: list[str], error: InputError) -> str:
     """Return a hint to the option that removes an excluded effect or replaces an excluded drive; empty for other errors."""
     table, _, name = error.field.partition(".")
     command = app.commands.get(arguments[0]) if arguments else None

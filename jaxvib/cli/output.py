@@ -108,7 +108,7 @@ class Output:
         if path is not None:
             result.save(path)
 
-    def made(self, name: str) -> Path:
+    def main_file(self, name: str) -> Path:
         """Return the path of the main file of a command, in the folder of --out or in the current folder."""
         path = (self.folder or Path()) / name
         self.files.append(str(path))

@@ -167,7 +167,7 @@ def vector_field(scene: Scene) -> Dynamics:
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
     >>> rest = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
-    >>> round(float(jv.vector_field(scene)(0.0, rest).rate[0][0]), 4)     # b_W n / (kappa m), the platform giving way
+    >>> round(float(jv.vector_field(scene)(0.0, rest).rate[0][0]), 4)     # b_W n / (kappa m R), more as the platform moves
     143.8746
 
     Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,

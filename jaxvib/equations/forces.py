@@ -149,8 +149,8 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
         M_j = b_W R^2 (speed - phi_j') + friction
 
     T is the torque with which an ideal drive turns its rotor against loads, their spin and the imbalance d. Loads that slide
-    also dissipate
-    - F_t.c. The rate of the energy is the difference, dE/dt = P_in - P_diss.
+    dissipate in addition the power -F_t.c of the contact force F_t at the slip c. The rate of the energy is the difference,
+    dE/dt = P_in - P_diss.
 
     **Arguments**
 
@@ -294,10 +294,10 @@ def _spin_power(
 def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
     """Return the force N with which each load presses on its track, (count,) N; negative if the track would have to pull.
 
-        N = m (centrifugal force of u' - n . (acceleration of the load's carrier + gravity upward)),    see `Loads.normal_force`
+        N = m (centrifugal force of u' - n . (acceleration a + gravity upward)),    see `Loads.normal_force`
 
-    n is the direction in which the load presses. If N is negative, the equations keep the load on its track, and friction
-    that is proportional to N is 0.
+    n is the direction in which the load presses, a the acceleration of the point that carries the load. If N is negative, the
+    equations keep the load on its track, and friction that is proportional to N is 0.
 
     **Arguments**
 

@@ -1,7 +1,7 @@
 """Universal files (UFF, UNV) of modal analysis, written and read by the package pyuff.
 
 A machine is represented by nodes: its platforms, points on a rotor's axis, or points of bodies in a plane. The direction +X is
-along the axis, +Y across, +Z up.
+along the axis, +Y horizontal, +Z up.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def export_uff(
     - Frequency responses of a `Scene`: one function for each node and direction, to a force at each exciter in each of its
       directions, at evenly spaced frequencies
     - Natural modes of a `Scene`: undamped (normal modes) for machines that move up and down; damped, at the rotor speed
-      (complex modes, the whirl), for machines that move across and up
+      (complex modes, the whirl), for machines that move horizontally and vertically
     - Histories of a `Run`: those of every node and of the force on the foundation (node 0), and the amplitude spectra of its
       end
 
@@ -185,7 +185,7 @@ def _places(scene: Scene) -> list[tuple[Place, tuple[float, float, float]]]:
 
 
 def _directions(scene: Scene) -> list[int]:
-    """Return the numbers of the directions of a node's rows: 2 (+Y) across, 3 (+Z) up."""
+    """Return the numbers of the directions of a node's rows: 2 (+Y) horizontal, 3 (+Z) up."""
     return [2 + axis for axis in scene.machine.mounting(scene.exciters[0].place).axes]
 
 

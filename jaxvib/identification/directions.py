@@ -20,8 +20,9 @@ UNDETERMINED = 1.0
 _MIN_SHARE = 0.05
 """Share of a number in an undetermined direction above which the number itself counts as undetermined."""
 
-_COMMON = 0.95
-"""Part of the common factor within the undetermined directions above which it counts as undetermined itself."""
+_MIN_COMMON_PART = 0.95
+"""Part of the direction of the common factor (of all masses, stiffnesses, dampings and unbalances) that lies within the
+undetermined directions; above this value the factor itself counts as undetermined."""
 
 _ADVICE = "give one of them in kg or N as known, or record a run with a known mass added"
 
@@ -183,7 +184,7 @@ def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect:
     if axes.size and np.any(common):
         common /= np.linalg.norm(common)
         inside = axes @ (axes.T @ common)
-        if np.linalg.norm(inside) > _COMMON:
+        if np.linalg.norm(inside) > _MIN_COMMON_PART:
             kinds = _kinds(found.names)
             words = f"multiplying all {kinds} by one number{effect}: {advice}"
             weights = (axes.T @ common) * errors

@@ -31,7 +31,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 
 GAUSS_POINTS = 0.5 + np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15)
-"""Places of the force within a step, relative to the step."""
+"""Times at which the force is evaluated within a step, relative to the length of the step."""
 
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
@@ -83,7 +83,7 @@ class Samples(eqx.Module):
 
     **Attributes** (N stretches of n samples, C channels, E exciters)
 
-    - `force` (N, n, 4, 2 E): F of each exciter, (across, up), at the sample and at the three Gauss points after it
+    - `force` (N, n, 4, 2 E): F of each exciter, (horizontal, up), at the sample and at the three Gauss points after it
     - `readings` (N, n, C): readings after the filter `data_filter` of `whitened`
     - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
     - `taps` (m + 1, C): filter of the model's readings

@@ -23,8 +23,8 @@ from jaxvib.runtime.programs import cached
 _WINDOWS = 128
 """Number of stretches of a run, of whole turns, that have one amplitude each."""
 
-_TIE = 0.05
-"""Weight of the logarithm of a change of an unknown, per amplitude."""
+_PRIOR_WEIGHT = 0.05
+"""Weight of the logarithm of the change of an unknown, relative to that of the logarithm of an amplitude."""
 
 
 def amplitudes(
@@ -92,7 +92,7 @@ def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tu
     """Return the unknowns whose steady amplitudes resemble those of the runs, up to one factor for each run."""
 
     def residual(x: Array, _: None) -> Array:
-        parts = [_TIE * x]
+        parts = [_PRIOR_WEIGHT * x]
         for samples, (speeds, sizes, weights) in zip(runs, data, strict=True):
             away = jnp.log(jnp.maximum(sizes, 1e-300)) - jnp.log(_steady(unknowns, samples, scene, x, speeds))
             mean = jnp.sum(weights * away) / jnp.sum(weights)

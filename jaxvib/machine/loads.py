@@ -25,8 +25,8 @@ BALL_RADIUS = unit("m", low=0.0, open_low=True, words="radius of each {load}")
 class NormalForce(NamedTuple):
     """Normal force N = `reaction` + `normal` . a of each load on its track.
 
-    a is the acceleration of the point that carries the load. `reaction` (count,) is in N, `normal` (across, up) in kg, (count,)
-    each.
+    a is the acceleration of the point that carries the load. `reaction` (count,) is in N. `normal` (horizontal, up) is in kg,
+    (count,) each.
     """
 
     reaction: Array
@@ -108,8 +108,7 @@ class Loads(Part):
 
     @abc.abstractmethod
     def position(self, *u: Array) -> tuple[Array, ...]:
-        """Return the load's position p(u), m: (across, up) in the rotor's plane, and along the axis if the load moves in this
-        direction.
+        """Return the load's position p(u), m: (horizontal, up), and along the rotor's axis if the load moves in this direction.
 
         **Arguments**: the coordinates `u`, (count,) each.
         """

@@ -59,7 +59,7 @@ class Mount(eqx.Module):
 
     - `rows`: arrays (np, nd), which times q give a displacement. The first is that of a point of the rotor's axis. The second
       is the tilt of the axis, in 1/m times the unit of a displacement. Machines that do not tilt have the first only
-    - `axes` (np,): the direction of each row in the plane of the loads (0 across, 1 up)
+    - `axes` (np,): the direction of each row in the plane of the loads (0 horizontal, 1 up)
     - `levers`: a lever (count,) for each entry of `rows`; None stands for 1, an absent entry for 0. `levers` is (None,) if all
       loads run at the first point, and (None, distances from this point in m) if each load has its own station
     - `rotor_levers`: the same for the rotor's mass centre, scalars

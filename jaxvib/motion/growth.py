@@ -16,7 +16,7 @@ from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, with_nearest_turns
 from jaxvib.motion.integrate import whole_turns, wrap_angles
 from jaxvib.motion.plan import plan_stretch, start_state, with_settled_drives
 from jaxvib.motion.run import Run
@@ -182,7 +182,7 @@ def growth(
         scale = error_scale(first.window.state, unit)
         ours, theirs = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
         if wrap_angles(scene, ours.displacement.dtype)[0]:
-            theirs = turned(theirs, ours)
+            theirs = with_nearest_turns(theirs, ours)
         rates.append(math.log(max(_distance(ours, theirs, scale), 1e-300) / separation) / stretch)
         state, gone = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, theirs)
         other = _at_distance(state, jax.tree.map(jnp.add, state, gone), scale, separation)
@@ -242,7 +242,7 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
     begin = jax.tree.map(lambda x: x[:1], path)
     scale = error_scale(path, natural_units(scene))
     parts = jax.tree.map(
-        lambda x, y, s: np.sum(((x - y) / s) ** 2, axis=tuple(range(1, x.ndim))), turned(path, begin), begin, scale
+        lambda x, y, s: np.sum(((x - y) / s) ** 2, axis=tuple(range(1, x.ndim))), with_nearest_turns(path, begin), begin, scale
     )
     distance = np.sqrt(sum(jax.tree.leaves(parts)))
     farthest = float(np.max(distance))

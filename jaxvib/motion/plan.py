@@ -26,8 +26,8 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, IntegrationPlan, StepControl, frequency_bounds
 from jaxvib.motion.start import Start, initial_state, require_start, validate_state, with_spin, with_spin_up_drive
-from jaxvib.motion.steps import Accuracy, EqualSteps, StepChoice, Tolerance, require, small_number
-from jaxvib.motion.stiffness import fastest_decay, steps_of, stiff_solver
+from jaxvib.motion.steps import Accuracy, EqualSteps, StepChoice, Tolerance, require, validate_tolerance
+from jaxvib.motion.stiffness import equal_step_length, fastest_decay, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.devices import known as numpy_of_known
 from jaxvib.runtime.programs import cached
@@ -221,10 +221,10 @@ def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) 
     if isinstance(chosen, Accuracy):
         if estimate is False:
             raise InputError("estimate", "is False together with accuracy, which needs error estimates; give a Tolerance")
-        accuracy = small_number(chosen.error, "accuracy", end, 1e3)
+        accuracy = validate_tolerance(chosen.error, "accuracy", end, 1e3)
         return StepControl(tolerance=np.asarray(max(1e-2 * accuracy, 10.0 * precision), end.dtype))
     default = 1e-8 if precision < 1e-10 else 1e-5
-    tolerance = default if chosen is None else small_number(chosen.tolerance, "tolerance", end, 10.0)
+    tolerance = default if chosen is None else validate_tolerance(chosen.tolerance, "tolerance", end, 10.0)
     return StepControl(tolerance=np.asarray(tolerance, end.dtype))
 
 
@@ -299,7 +299,7 @@ def plan_ensemble(
         # Refused runs do not influence the steps of the others.
         most = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
         most = most if bool(np.any(allowed)) else [1.0, 0.0]
-        step, implicit = steps_of(
+        step, implicit = equal_step_length(
             most[0], most[1], _EXPLICIT_STEPS_PER_RADIAN, float(end) / number_of_steps if number_of_steps else None
         )
         number_of_steps = number_of_steps or max(_MIN_STEPS, math.ceil(float(end) / step - 1e-9))

@@ -170,7 +170,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
                 f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
                 f"{rotor} at {speed_text(rotors, 6)}",
-                f"  {self.extent(self.scene)}",
+                f"  {self.amplitude_text(self.scene)}",
                 f"  {self._severity()}",
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),

@@ -19,7 +19,7 @@ from jaxvib.equations.state import ExciterState, State
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
-from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, with_nearest_turns
 from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate, whole_turns, wrap_angles
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, plan_run
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
@@ -330,7 +330,7 @@ def _estimate_error(
     if control.steps is not None:
         found = found & (control.steps != coarser.steps)
     ours = window.state
-    theirs = turned(theirs, ours) if wrap_angles(scene, window.time.dtype)[0] else theirs
+    theirs = with_nearest_turns(theirs, ours) if wrap_angles(scene, window.time.dtype)[0] else theirs
     difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
     error = estimated_error(difference, _shrink(control, coarser), scene, steps, fastest * window.time[-1])
     return jnp.where(found & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]

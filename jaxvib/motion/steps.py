@@ -86,7 +86,7 @@ def require(chosen: object, *kinds: type) -> None:
         raise InputError("stepsize_controller", f"is {quoted(chosen)}; it must be one of: {allowed}")
 
 
-def small_number(value: float, name: str, time: Array, least: float) -> float:
+def validate_tolerance(value: float, name: str, time: Array, least: float) -> float:
     """Return a tolerance or an accuracy; it must be at least `least` times the rounding unit of the precision of `time`.
 
     **Raises** `InputError` for other values.

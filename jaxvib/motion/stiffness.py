@@ -74,7 +74,7 @@ def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rod
     return Rodas4() if size <= _MAX_IMPLICIT_SIZE and float(fastest_decay(scene)) > _STIFF_RATE_RATIO * float(fastest) else None
 
 
-def steps_of(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
+def equal_step_length(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
     """Return the length of equal steps, s, and True if they have to be implicit.
 
     **Arguments**: `fastest` rate of the motion, rad/s; rate of the `decay`, 1/s; number of explicit steps `per_radian` of the

@@ -33,7 +33,8 @@ def times(matrix: Array, vector: Array) -> Array:
 
 
 def small_inverse(a: Sequence[Sequence[_Entry]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
-    """Return x of a x = b for a few equations, unrolled; the entries may be arrays of many such systems."""
+    """Return the function that maps b to the solution x of a x = b, unrolled for a few equations; the entries may be arrays of
+    many such systems."""
     n = len(a)
     if n == 1:
         return lambda b: (b[0] / a[0][0],)

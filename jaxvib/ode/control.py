@@ -124,15 +124,15 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         start = jnp.where(accept, t1, t0)
         end = start + factor * (t1 - t0)
         root = jnp.where(accept, root, root_before)
-        result = moved_on(accept, start, t1, end)
+        result = step_success(accept, start, t1, end)
         if left is not None:
             left = left - 1
             result = diffrax.RESULTS.where(left >= 0, result, diffrax.RESULTS.max_steps_reached)
         return accept, start, end, False, (root, left), result
 
 
-def moved_on(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
-    """Return the success of a step: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
+def step_success(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
+    """Return the outcome of a step: after a rejected step from `start` to `before`, the next one, to `end`, must be shorter."""
     shorter = (end > start) & (end < before)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 

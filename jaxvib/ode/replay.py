@@ -41,7 +41,7 @@ def solve(
 
     Reverse derivatives replay the steps that the run has taken. If the controller chose the steps again in the backward pass,
     rounding would change them: after some hundred turns the steps would differ, and the derivatives would be inconsistent
-    (errors up to 1e-3). Therefore a run that is differentiated records the start of each step and some of the states. The
+    (errors up to 1e-3). Therefore a run that is differentiated records the end of each step and some of the states. The
     backward pass recomputes the states in between and transposes each step separately, from the last one to the first:
 
         (y_i+1, dense_i) = step(y_i, t_i, t_i+1, numbers),    saved(t) = within(dense_i, t_i, t_i+1, t)
@@ -100,7 +100,7 @@ class _Record(NamedTuple):
     """Record of a run: its number of steps, the end of each step (max_steps,), and states at regular numbers of steps."""
 
     steps: Array
-    starts: Array
+    ends: Array
     states: Y
 
 
@@ -122,9 +122,9 @@ def _forward(
 ) -> tuple[diffrax.Solution, _Record]:
     """Integrate, and record the run."""
     end, first_step, y0, args, saveat, term = inputs
-    starts = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None)
+    ends = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None)
     states = diffrax.SubSaveAt(steps=_spacing(y0, rest[1]))
-    recorded_inputs = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, starts, states]), term)
+    recorded_inputs = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, ends, states]), term)
     solution = _solve(recorded_inputs, controller, diffrax.ForwardMode(), *rest)
     assert solution.ts is not None and solution.ys is not None
     record = _Record(solution.stats["num_accepted_steps"], solution.ts[1], solution.ys[2])
@@ -196,8 +196,8 @@ class _BackwardPass:
 
     def span(self, i: Array) -> tuple[Array, Array]:
         """Start and end of step i."""
-        starts = self.record.starts[jnp.maximum(i - 1, 0)]
-        return jnp.where(i == 0, 0.0, starts), _end_before(self.controller, self.record.starts[i])
+        start = self.record.ends[jnp.maximum(i - 1, 0)]
+        return jnp.where(i == 0, 0.0, start), _end_before(self.controller, self.record.ends[i])
 
     def step(self, y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
         """Return the state after a step, and the data of the interpolation within it."""

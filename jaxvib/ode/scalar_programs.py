@@ -70,8 +70,8 @@ def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
     """Return the results of a program on scalars whose values the compiler cannot recompute for each use.
 
     Every value with several uses and more than a few operations is fenced, see `jaxvib.numerics.fence`. Otherwise the
-    computing time grows without bound for nested shared parts, as in derivatives of equations: 4096 samples of 3000 operations
-    took 8 s.
+    computing time grows without bound for nested shared parts, as in derivatives of equations: a batch of 4096 evaluations of
+    3000 operations took 8 s.
     """
     jaxpr = program.jaxpr
     uses: dict[Var, int] = {}

@@ -15,7 +15,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.batch import BATCH_SIZE, PARTS_OF_RUN, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
-from jaxvib.motion.stiffness import fastest_decay, steps_of
+from jaxvib.motion.stiffness import equal_step_length, fastest_decay
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.operations import calls_python, program_text
 from jaxvib.runtime.programs import cached
@@ -113,7 +113,7 @@ def planned(scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], unti
     most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
     window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), most, until / 2.0)
     given = None if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
-    step, implicit = steps_of(float(np.max(fastest)), float(np.max(decay)), 1.0, given)
+    step, implicit = equal_step_length(float(np.max(fastest)), float(np.max(decay)), 1.0, given)
     if until / step > _MAX_STEPS:
         name = "until" if steps is None else "steps"
         raise InputError(name, f"needs {until / step:.3g} steps for every run; give a shorter run or fewer steps")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.ode.control import PIController, moved_on
+from jaxvib.ode.control import PIController, step_success
 
 
 @eqx.filter_jit
@@ -73,5 +73,5 @@ def test_the_largest_error_of_all_parts_decides():
 
 def test_a_step_that_cannot_be_shorter_ends_the_run():
     for accept, end, fine in ((True, 1.0, True), (False, 1.5, True), (False, 2.0, False), (False, 1.0, False)):
-        found = moved_on(jnp.asarray(accept), jnp.asarray(1.0), jnp.asarray(2.0), jnp.asarray(end))
+        found = step_success(jnp.asarray(accept), jnp.asarray(1.0), jnp.asarray(2.0), jnp.asarray(end))
         assert found == (diffrax.RESULTS.successful if fine else diffrax.RESULTS.dt_min_reached)

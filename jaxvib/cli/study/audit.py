@@ -85,14 +85,14 @@ def audit_text(found: jv.Audit) -> str:
         heading = f"changes by effects, %; requested accuracy {100.0 * found.accuracy:g} %"
         absent = any(not row.present for row in found.effects)
         lines.append(table(f"{heading}; in brackets: added effects" if absent else heading, head, rows))
-    lines += [f"{row.effect}: {row.says}" for row in found.effects if row.says]
+    lines += [f"{row.effect}: {row.note}" for row in found.effects if row.note]
     offs = [
         [t.tier, *map(_percent, (t.amplitude, t.foundation_force, t.omega)), _seconds(t.seconds), _seconds(t.compile)]
         for t in found.tiers
     ]
     if offs:
         lines.append(table("tiers: error, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], offs))
-    lines += [f"{t.tier}: {t.says}" for t in found.tiers]
+    lines += [f"{t.tier}: {t.note}" for t in found.tiers]
     if found.numbers:
         numbers = [[n.name, f"{n.value:.3g}", f"{n.limit:.3g}", n.advice] for n in found.numbers]
         lines.append(
@@ -102,7 +102,7 @@ def audit_text(found: jv.Audit) -> str:
                 numbers,
             )
         )
-        lines += [f"{n.name.partition(':')[0]}: {n.says}" for n in found.numbers]
+        lines += [f"{n.name.partition(':')[0]}: {n.note}" for n in found.numbers]
     return "\n".join(lines)
 
 

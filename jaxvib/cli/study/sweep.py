@@ -54,7 +54,7 @@ def sweep(
         click.echo(f"stopped: finished cases are saved in {path}; run the same command again to continue", err=True)
         raise
     show.end()
-    _tell(found, output, "sweep")
+    _print_result(found, output, "sweep")
 
 
 @app.command("show")
@@ -75,10 +75,10 @@ def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory:
         x, y = over or (None, None)
         for name, figure in figures(store, measure, x=x, y=y, theory=theory):
             output.picture(f"{name}.png", lambda drawn=figure: drawn)
-    _tell(found, output, "show")
+    _print_result(found, output, "show")
 
 
-def _tell(found: Sweep, output: Output, name: str) -> None:
+def _print_result(found: Sweep, output: Output, name: str) -> None:
     if name == "sweep":
         output.picture("sweep.png", found.plot)
     rows = [[status, str(cases), f"{100.0 * cases / found.cases:.3g} %"] for status, cases in found.counts]

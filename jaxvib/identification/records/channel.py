@@ -46,8 +46,8 @@ class Channel(eqx.Module):
       "angle" or "torque" of the rotor, "current" of the motor
     - `at`: number of the platform, from 1, or (x, y), m, of a point of a body, for kinds that measure a motion; default: the
       place of the exciter
-    - `direction` in which a positive reading points: "up", "down", "across", "-across", or a pair (across, up) of any length;
-      default: up
+    - `direction` in which a positive reading points: "up", "down", "across" (horizontal), "-across", or a
+      pair (horizontal, up) of any length; default: up
     - `unit` of the samples, such as "g", "mm/s" or "rpm", or a multiple of a unit, such as "10 g" for a file in V of a sensor
       with 100 mV/g; default: the unit stated in the file, otherwise the SI unit
     - `gain_error`: relative standard uncertainty of the gain; default: 0.01 for acceleration, 0 for other kinds; typical: 0.01
@@ -139,7 +139,7 @@ def _place(at: int | Sequence[Number] | None, where: str) -> int | tuple[float, 
 
 
 def _direction(direction: str | Sequence[float] | None, where: str) -> tuple[float, float]:
-    """Return the unit vector (across, up) of a direction."""
+    """Return the unit vector (horizontal, up) of a direction."""
     field = f"{where}: direction"
     if direction is None:
         return _DIRECTIONS["up"]

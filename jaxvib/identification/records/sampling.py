@@ -21,8 +21,9 @@ _JITTER = 0.01
 _GAP = 1.5
 """Interval between samples, relative to the step, above which readings are missing."""
 
-_DROPOUT, _LONGER = 20, 10
-"""Smallest number of equal readings of a dropout, and its length relative to all but the longest percent of such stretches."""
+_MIN_DROPOUT, _MIN_RATIO = 20, 10
+"""A stretch of equal readings is a dropout if it has at least this number of readings, and is at least this factor longer than
+99 % of all stretches of equal readings."""
 
 _BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
 """Widths of the last bin of the histogram relative to all values; number of readings in it, relative to the next four bins and
@@ -80,7 +81,7 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
         if count > _MAX_MISSING * value.size:
             share = f"is constant in stretches for {count} of {value.size} readings, {first}"
             raise InputError(where, f"{share}: the sensor or its cable failed; use another part of the record")
-        notes.append(f"{where} is constant in stretches of in all {count} readings (dropouts), {first}; left out")
+        notes.append(f"{where} is constant in stretches with {count} readings in total (dropouts), {first}; left out")
         value = np.where(dropped, np.nan, value)
     time, value, more = _on_grid(time, value, where)
     return time, value, notes + more
@@ -163,7 +164,7 @@ def dropouts(value: np.ndarray) -> np.ndarray:
     usual = max(float(np.quantile(lengths, 0.99)), 1.0)
     with np.errstate(invalid="ignore"):
         inside = (value[starts] > np.nanmin(value)) & (value[starts] < np.nanmax(value))
-    long = (lengths >= max(_DROPOUT, _LONGER * usual)) & inside
+    long = (lengths >= max(_MIN_DROPOUT, _MIN_RATIO * usual)) & inside
     return np.repeat(long, lengths)
 
 

@@ -29,10 +29,10 @@ _AXES = {"up": 1, "axis": 2}
 
 
 class Typical(NamedTuple):
-    """Effect with typical values, for a scene that does not have it; `says` describes these values."""
+    """Effect with typical values, for a scene that does not have it; `note` describes these values."""
 
     effect: Effect
-    says: str
+    note: str
 
 
 def terms_of(effects: Iterable[Effect], *kinds: type[T]) -> list[T]:

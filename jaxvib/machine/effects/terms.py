@@ -30,7 +30,7 @@ Resistance: TypeAlias = Callable[[Loads, Coordinates, Coordinates], Coordinates]
 class GravityField:
     """Uniform gravity, which changes the normal forces of loads. Its force on the loads themselves is a `LoadPotential`.
 
-    **Attributes**: `axis` of a load's position against which gravity acts (0 across, 1 up, 2 along the rotor's axis); `g`,
+    **Attributes**: `axis` of a load's position against which gravity acts (0 horizontal, 1 up, 2 along the rotor's axis); `g`,
     m/s^2.
     """
 
@@ -105,7 +105,7 @@ def _potential_force(energy: Energy, loads: Loads, u: Coordinates) -> Coordinate
 
 
 class Imbalance(NamedTuple):
-    """Imbalance of a rotor at one angle: `static` (across, up) kg m, `moment` about the tilts kg m^2."""
+    """Imbalance of a rotor at one angle: `static` (horizontal, up) kg m, `moment` about the tilts kg m^2."""
 
     static: tuple[Array, Array]
     moment: tuple[Array, Array]
@@ -139,7 +139,7 @@ class Friction(NamedTuple):
 
     - `lever` (count,) m, with the sign of the torque on the load
     - `reaction` (count,) N
-    - `normal`: two (count,) arrays (across, up) in kg, or None if N does not depend on accelerations
+    - `normal`: two (count,) arrays (horizontal, up) in kg, or None if N does not depend on accelerations
     - `others`: levers of a load's further coordinates, if friction acts on them
     - `one_sided`: True if there is no friction while N is negative
     """

@@ -88,9 +88,9 @@ def from_matrices(
     - `damping` C (nd, nd)
     - `gyroscopic` G (nd, nd): G times the rotor speed n times q' is a force; skew-symmetric. None without a rotor
     - `places`: a list of points at which exciters may sit, numbered from 1 in `Exciter(at=)`. Each is a list of the indices
-      of its coordinates, [up], [across, up] or [across, up, rotation], or a matrix (1 to 3, nd) that gives its
-      displacement from q; all places have the same number of directions. "Across" is horizontal
-    - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or across
+      of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
+      displacement from q; all places have the same number of directions
+    - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or horizontal
       and up (nb = 2); default: the force is unknown, and results state 0
     - `reduce`: largest number of coordinates; typical: 6 to 20 (default: 12); None keeps all
 

@@ -182,7 +182,8 @@ class _Bodies(Machine):
 
 
 class PlaneBody(_Bodies):
-    """Rigid body with the coordinates q = (x, y, psi): its centre of mass across and up, and its anticlockwise rotation.
+    """Rigid body with the coordinates q = (x, y, psi): displacement of its centre of mass to the right and up, anticlockwise
+    rotation.
 
         m x'' = f_x,    m y'' = f_y,    J psi'' = moment of the forces
         a point at (a, b) moves by B q,    B = [[1, 0, -b], [0, 1, a]]

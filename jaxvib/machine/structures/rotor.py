@@ -22,7 +22,9 @@ _MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
 
 
 class Rotor(Machine):
-    """Rigid rotor on two isotropic supports; q = (y, z, theta, psi): its mass centre across and up, the tilts of its axis.
+    """Rigid rotor on two isotropic supports, with the coordinates q = (y, z, theta, psi).
+
+    y and z are the displacements of the mass centre, horizontal and up; theta and psi are the tilts of the axis.
 
         M y'' + b1 y' + b2 theta' + c1 y + c2 theta = f_y
         M z'' + b1 z' + b2 psi' + c1 z + c2 psi = f_z
@@ -221,7 +223,9 @@ def _require_body(across: float, along: float) -> None:
 
 
 class PlanarRotor(Machine):
-    """Rotor on one isotropic support, which moves across and up without tilt: M y'' + b y' + k y = f_y, and the same for z.
+    """Rotor on one isotropic support, moving horizontally and vertically without tilt.
+
+        M y'' + b y' + k y = f_y,    M z'' + b z' + k z = f_z
 
     **Attributes**; typical values: see `planar_rotor`
 
@@ -250,14 +254,14 @@ class PlanarRotor(Machine):
         )
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the motion of the rotor across and up. **Raises** `InputError` for a place."""
+        """Return the mount, at the rotor's centre. **Raises** `InputError` if a place `at` is given."""
         if at is not None:
             self.rows_at(at, "at")
         return Mount(rows=(jnp.eye(2, dtype=self.mass.dtype),), axes=(0, 1))
 
 
 def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarRotor:
-    """Return a rotor that moves across and up on one isotropic support.
+    """Return a rotor that moves horizontally and vertically on one isotropic support.
 
         M y'' + b y' + k y = f_y,    M z'' + b z' + k z = f_z
 

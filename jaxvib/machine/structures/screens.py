@@ -20,7 +20,7 @@ inertia = 3800.0            # kg m^2, about the centre of mass
 
 [[machine.supports]]        # two coil springs at the feed end; the natural frequency up is about 3 Hz
 at = [-1.6, -0.3]
-stiffness = ["280 N/mm", "460 N/mm"]    # across, up
+stiffness = ["280 N/mm", "460 N/mm"]    # horizontal, vertical
 damping = [2000.0, 2500.0]              # N s/m
 # angle = "0 deg"           # turns both springs anticlockwise
 
@@ -60,7 +60,7 @@ inertia = 1700.0            # kg m^2, about the centre of mass
 
 [[machine.supports]]        # springs at the feed end
 at = [-1.3, -0.1]
-stiffness = ["250 N/mm", "350 N/mm"]    # across, up
+stiffness = ["250 N/mm", "350 N/mm"]    # horizontal, vertical
 damping = [1800.0, 2000.0]              # N s/m
 
 [[machine.supports]]        # springs at the discharge end
@@ -89,7 +89,7 @@ inertia = 160.0             # kg m^2, about the centre of mass
 
 [[machine.supports]]        # rear springs
 at = [-0.8, -0.15]
-stiffness = ["80 N/mm", "126 N/mm"]     # across, up
+stiffness = ["80 N/mm", "126 N/mm"]     # horizontal, vertical
 damping = [300.0, 400.0]                # N s/m
 
 [[machine.supports]]        # front springs

@@ -49,15 +49,15 @@ class Trajectory(eqx.Module):
     @property
     def rotor_angle(self) -> Array:
         """Angle of the rotor of a scene with one exciter, rad, without whole turns. **Raises** `InputError` for several."""
-        return of_the_only(self.rotor_angles, "rotor_angles")
+        return only_exciter_value(self.rotor_angles, "rotor_angles")
 
     @property
     def rotor_speed(self) -> Array:
         """Speed of the rotor of a scene with one exciter, rad/s. **Raises** `InputError` for several."""
-        return of_the_only(self.rotor_speeds, "rotor_speeds")
+        return only_exciter_value(self.rotor_speeds, "rotor_speeds")
 
 
-def of_the_only(values: tuple[Array, ...], name: str) -> Array:
+def only_exciter_value(values: tuple[Array, ...], name: str) -> Array:
     """Return the value of the only exciter. **Raises** `InputError` that names the values of several."""
     if len(values) != 1:
         raise InputError(name, f"are those of {len(values)} exciters; read {name}[0] and so on")
@@ -94,7 +94,7 @@ class AbstractMeasured(eqx.Module):
         """True if amplitudes, force and speeds no longer change."""
         return self.drift < 1e-3
 
-    def extent(self, scene: Scene) -> str:
+    def amplitude_text(self, scene: Scene) -> str:
         """Return the amplitudes and the foundation force of a `scene` as a line of text."""
         structure = scene.machine.structure()
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)

@@ -138,14 +138,14 @@ def estimated_error(
     return difference * kept + 2.0 * float(np.finfo(scene.top_speed.dtype).eps) * (steps + radians)
 
 
-def turned(state: State, to: State) -> State:
+def with_nearest_turns(state: State, to: State) -> State:
     """Return a state (or several states) with angles shifted by whole turns so that they are nearest to the angles of `to`.
 
     In single precision angles are kept within one turn, and one of two close runs may have one turn more than the other.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.zeros(1), np.zeros(1), (np.array([phi]),), (np.array([50.0]),)) for phi in (3.1, -3.1))
-    >>> round(float(turned(a, b).angle[0][0]), 4)
+    >>> round(float(with_nearest_turns(a, b).angle[0][0]), 4)
     -3.1832
     """
     xp = numpy_of((state, to))

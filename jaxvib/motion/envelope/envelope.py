@@ -42,9 +42,9 @@ from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
-from jaxvib.motion.steps import Tolerance, require, small_number
+from jaxvib.motion.steps import Tolerance, require, validate_tolerance
 from jaxvib.numerics.linalg import magnitude
-from jaxvib.ode.control import Decision, WrappedController, moved_on
+from jaxvib.ode.control import Decision, WrappedController, step_success
 from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
@@ -113,7 +113,7 @@ class _Tolerance(WrappedController):
         keep, start, end, jumped, state, result = self.controller.adapt_step_size(
             t0, t1, sizes(y0), sizes(y1_candidate), args, error, error_order, controller_state
         )
-        moved = moved_on(keep, start, t1, end)
+        moved = step_success(keep, start, t1, end)
         return keep, start, end, jumped, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, moved, result)
 
 
@@ -207,7 +207,7 @@ def envelope(
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if isinstance(chosen, Tolerance):
-        chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
+        chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
     given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     choices = solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     if isinstance(start, str) and start == "jam" and scene.is_plain and not jams_of.is_ready(scene):

@@ -13,7 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import speed_text
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.motion.analysis.measure import AbstractMeasured, of_the_only
+from jaxvib.motion.analysis.measure import AbstractMeasured, only_exciter_value
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -34,7 +34,7 @@ class EnvelopeStatus(eqx.Enumeration):
     not_finite = "the motion grew without bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     no_start = "the initial state does not exist or is not finite"
-    unstable = "the exciters turn at one speed, but this motion is unstable: the least disturbance ends it"
+    unstable = "the exciters turn at one speed, but this motion is unstable: even the smallest disturbance ends it"
     would_separate = (
         "all loads are at nearly one angle, and this motion is unstable: slightly separated loads move away from it"
     )
@@ -74,7 +74,7 @@ class Envelopes(eqx.Module):
     @property
     def rotor_speed(self) -> Array:
         """Speed of the rotor of a scene with one exciter, rad/s. **Raises** `InputError` for several."""
-        return of_the_only(self.rotor_speeds, "rotor_speeds")
+        return only_exciter_value(self.rotor_speeds, "rotor_speeds")
 
 
 class Envelope(AbstractMeasured, PathsOfPoints, Result):
@@ -128,7 +128,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
                 f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), {rotor} at {rotors}",
-                f"  {self.extent(self.scene)}",
+                f"  {self.amplitude_text(self.scene)}",
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
         )

@@ -146,7 +146,7 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     >>> found.status_name, found.caught_at.tolist(), round(float(found.resonances[0]), 1), round(float(found.speed[0]))
     ('caught', [1], 14.1, 14)
 
-    Source: I. I. Blekhman, Vibrational Mechanics, 2000; the criterion is ours.
+    Source: I. I. Blekhman, Vibrational Mechanics, 2000; the criterion of capture is derived here.
     """
     scene = validate_scene(scene)
     if all(exciter.drive.ideal for exciter in scene.exciters):

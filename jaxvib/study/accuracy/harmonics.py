@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 
 class HarmonicConvergence(Result):
-    """Errors of jams with a limited number of harmonics.
+    """Errors of exact jams that are computed with a limited number of harmonics.
 
     **Attributes**
 
     - `harmonics` (n,): the highest harmonic of the carrier
-    - `omega` (jams,), rad/s
+    - `omega` (jams,): load speeds, rad/s
     - `error` (n, jams): relative error of the rotor speed, by comparison with twice the largest number of points
-    - `known` (n, jams): estimate of this error from each jam alone
+    - `estimate` (n, jams): estimate of this error from each jam alone
     """
 
     status = Computed.done
@@ -50,12 +50,12 @@ class HarmonicConvergence(Result):
     omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "omega"))
     harmonics: np.ndarray = eqx.field(metadata=in_unit("", "harmonics"))
     error: np.ndarray = eqx.field(metadata=in_unit("", "harmonics", "omega"))
-    known: np.ndarray = eqx.field(metadata=in_unit("", "harmonics", "omega"))
+    estimate: np.ndarray = eqx.field(metadata=in_unit("", "harmonics", "omega"))
 
     def summary(self) -> str:
         """Return a line of text for each number of harmonics: the largest error and the largest estimate."""
-        rows = zip(self.harmonics, np.max(self.error, axis=1), np.max(self.known, axis=1), strict=True)
-        return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {known:.1e}" for n, error, known in rows)
+        rows = zip(self.harmonics, np.max(self.error, axis=1), np.max(self.estimate, axis=1), strict=True)
+        return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {estimate:.1e}" for n, error, estimate in rows)
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the error over the highest harmonic, a line for each load speed; estimates dashed.
@@ -65,7 +65,7 @@ class HarmonicConvergence(Result):
         names = [speed_text(w, 4) for w in self.omega]
         from jaxvib.draw.comparison import convergence_chart  # slow import
 
-        return convergence_chart(self.harmonics, self.error, self.known, names=names, ax=ax)
+        return convergence_chart(self.harmonics, self.error, self.estimate, names=names, ax=ax)
 
 
 @validated
@@ -80,7 +80,7 @@ def harmonic_convergence(
     - `omega`: load speeds, rad/s or text; typical: 1 to 5 speeds on the branch
     - `points` of the collocation, ascending, see `jam_orbit`; typical: 4 to 24 (the default)
 
-    **Returns** `HarmonicConvergence`. **Raises** `InputError` for points that do not ascend, speeds not positive.
+    **Returns** `HarmonicConvergence`. **Raises** `InputError` if the points do not ascend, or if a speed is not positive.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -89,16 +89,16 @@ def harmonic_convergence(
     >>> [bool(error < most) for error, most in zip(found.error[:, 0], (1e-4, 1e-10))]
     [True, True]
 
-    Source: ours, on `jam_orbit`.
+    Source: this package; the jams are those of `jam_orbit`.
     """
     if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
         raise InputError("points", f"are {quoted(points)}; give numbers of points in ascending order")
     speeds = jnp.atleast_1d(numbers(omega, "rad/s", "omega", None, low=0.0, open_low=True))
     half = has_half_turn_symmetry(scene.all_effects)
     rows = [_errors(scene, speeds, grid_of(m, half).theta.size) for m in (*points, 2 * points[-1])]
-    n, known = (np.stack([np.asarray(row[k]) for row in rows]) for k in range(2))
+    n, estimate = (np.stack([np.asarray(row[k]) for row in rows]) for k in range(2))
     highest = np.array([grid_of(m, half).orders[-1] for m in points])
-    return HarmonicConvergence(np.asarray(speeds), highest, np.abs(n[:-1] / n[-1] - 1.0), known[:-1])
+    return HarmonicConvergence(np.asarray(speeds), highest, np.abs(n[:-1] / n[-1] - 1.0), estimate[:-1])
 
 
 @cached

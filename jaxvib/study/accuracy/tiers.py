@@ -99,7 +99,7 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
     >>> [f"{abs(a / b - 1):.0e}" for a, b in zip(tiers.leading.omega, tiers.exact.omega)]
     ['1e-06', '1e-05', '1e-04']
 
-    Source: the antiphase paper for the leading order, see `jam_modes`; the comparison is ours.
+    Source: the antiphase paper for the leading order, see `jam_modes`; the comparison: this package.
     """
     loads, factors = jammed_loads(scene), np.atleast_1d(numbers(factors, "", "factors", None, low=0.0, open_low=True)).tolist()
     jams_of_masses: list[tuple[Jam, Orbit]] = []

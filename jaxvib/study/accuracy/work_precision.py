@@ -17,7 +17,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, with_nearest_turns
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.plan import enough_steps
@@ -102,7 +102,7 @@ def work_precision(
     >>> [row.tier for row in cost.rows if row.error < 1e-6][0], cost.reference_error < 1e-9
     ('exact orbit', True)
 
-    Source: ours; sources of the tiers: see `jam_modes`, `jam_orbit`, `envelope`, `simulate`.
+    Source: this package; sources of the tiers: see `jam_modes`, `jam_orbit`, `envelope`, `simulate`.
     """
     require_one_of(quantity, QUANTITIES, "quantity")
     unknown = [name for name in solvers if name not in SOLVERS]
@@ -279,7 +279,7 @@ def _final_state(request: _Request, end: float | None) -> Cost:
     def error(run: Run) -> float:
         last, exact = _last(run), _last(best())
         single = run.error.dtype.itemsize < 8  # in single precision the number of whole turns of angles is unknown
-        value = float(scaled_error(turned(last, exact) if single else last, exact, scale()))
+        value = float(scaled_error(with_nearest_turns(last, exact) if single else last, exact, scale()))
         return value if np.isfinite(value) else np.inf
 
     rows = _full(request, initial_state(request.scene), lambda tolerance: end, error)

@@ -87,7 +87,7 @@ class Audit(Result):
         for tier in self.tiers:
             lines.append(f"  {tier.tier}: {tier.words()}")
         for found in self.numbers:
-            lines.append(f"  {found.name} = {found.value:.3g}: {found.advice}; {found.says}")
+            lines.append(f"  {found.name} = {found.value:.3g}: {found.advice}; {found.note}")
         return "\n".join(lines)
 
     @validated
@@ -202,7 +202,7 @@ def _with_computed_advice(row: NumberRow, effects: Sequence[EffectRow]) -> Numbe
     """Return the row of a dimensionless number, with the advice from the audit of its effect if that has a clear result."""
     for effect in effects:
         if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
-            return row._replace(advice=effect.advice, says=f"{row.says}; the advice is that of the computed effect")
+            return row._replace(advice=effect.advice, note=f"{row.note}; the advice is that of the computed effect")
     return row
 
 

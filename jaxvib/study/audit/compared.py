@@ -47,7 +47,7 @@ class EffectRow(NamedTuple):
     - cost of the effect (value with the effect minus value without it): `operations` of the equations of motion; `seconds` of a
       run of 100 turns; `compile`: processor time to trace and compile that run, s; NaN without timings. Small differences of
       times are timing noise
-    - `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `says`: the reason
+    - `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `note`: the reason
     """
 
     effect: str
@@ -62,7 +62,7 @@ class EffectRow(NamedTuple):
     seconds: float
     compile: float
     advice: str
-    says: str
+    note: str
 
     @property
     def change(self) -> float:
@@ -179,18 +179,18 @@ def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, acc
         seconds=sign * (ours[0] - theirs[0]),
         compile=sign * (ours[1] - theirs[1]),
         advice="",
-        says=variant.says,
+        note=variant.note,
     )
     if isinstance(repeated.comparison, JamComparison) and tier == "full" and own.kind != "jammed":
         lost = f"a run from the jam reached another motion ({own.kind})"
-        return row._replace(advice="cannot tell", says="; ".join(filter(None, [row.says, lost])))
+        return row._replace(advice="cannot tell", note="; ".join(filter(None, [row.note, lost])))
     return row._replace(**_advice(row, new.kind, old.kind, accuracy))
 
 
 def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, str]:
-    """Return `advice` and `says` of a row, for a motion that is `new` with the effect and `old` without it."""
-    advice_if_needed = "needed" if row.present or row.says == "as given" else "perhaps needed"
-    sentences = [row.says]
+    """Return `advice` and `note` of a row, for a motion that is `new` with the effect and `old` without it."""
+    advice_if_needed = "needed" if row.present or row.note == "as given" else "perhaps needed"
+    sentences = [row.note]
     if new != old:
         sentences.append(f"without it: {old}; with it: {new}")
     if new != old and "unsettled" not in (new, old):
@@ -205,4 +205,4 @@ def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, st
     else:
         advice = "cannot tell"
         sentences.append(f"the motion is periodic only to {row.uncertainty:.1e}")
-    return {"advice": advice, "says": "; ".join(filter(None, sentences))}
+    return {"advice": advice, "note": "; ".join(filter(None, sentences))}

@@ -24,14 +24,14 @@ class NumberRow(NamedTuple):
     """Dimensionless number of a scene.
 
     **Attributes**: its `name` and `value`; the `limit` above which an effect may be needed; the `advice` ("perhaps needed"
-    above the limit, otherwise "negligible"); `says`: a sentence about the number.
+    above the limit, otherwise "negligible"); `note`: a sentence about the number.
     """
 
     name: str
     value: float
     limit: float
     advice: str
-    says: str
+    note: str
 
 
 def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -> list[NumberRow]:
@@ -50,7 +50,7 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
 
     Effects of the scene have no row. **Returns** a list of `NumberRow`.
 
-    Source: ours; Artyunin and Sumenkov 2019 for the first number: they state that gravity is below 0.5 %.
+    Source: this package; for the first number Artyunin and Sumenkov 2019, who state that gravity is below 0.5 %.
     """
     if not np.isfinite(values.omega) or values.omega == 0.0:
         return []
@@ -70,8 +70,8 @@ def gravity_share(radius: float, omega: float, g: float = _G) -> float:
     return g / (radius * omega**2)
 
 
-def _row(name: str, value: float, limit: float, says: str) -> NumberRow:
-    return NumberRow(name, value, limit, "perhaps needed" if value > limit else "negligible", says)
+def _row(name: str, value: float, limit: float, note: str) -> NumberRow:
+    return NumberRow(name, value, limit, "perhaps needed" if value > limit else "negligible", note)
 
 
 def _arm(scene: Scene) -> float:
@@ -104,22 +104,22 @@ def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     half = math.asin(min(ratio, 1.0))
     filled = n * half / math.pi
     if filled >= 1.0:
-        says = f"{own[1]}the loads do not fit on the track: use lighter loads, or more than one track"
-        return NumberRow("crowding: N arcsin(r/R)/pi", filled, 1.0, "perhaps needed", says)
+        note = f"{own[1]}the loads do not fit on the track: use lighter loads, or more than one track"
+        return NumberRow("crowding: N arcsin(r/R)/pi", filled, 1.0, "perhaps needed", note)
     if not own[1]:
         return None
     lost = 1.0 - math.sin(n * half) / (n * math.sin(half))
-    says = (
+    note = (
         f"{own[1]}side by side they fill {100.0 * filled:.3g} % of the track and lose this share of unbalance: give ball_radius"
     )
-    return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, says)
+    return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, note)
 
 
 def _distance(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
     if not np.isfinite(values.closest) or has_term(scene.all_effects, LoadInteraction):
         return None
-    says = "diameter over the smallest distance of two loads: above 1 they pass through each other, and load_contact is needed"
-    return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, says)
+    note = "diameter over the smallest distance of two loads: above 1 they pass through each other, and load_contact is needed"
+    return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, note)
 
 
 def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
@@ -130,13 +130,13 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
     normal_force = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (n,)))) * arm * values.omega**2
     if scene.loads.has_bearing:
         lever, of = 0.5 * _BEARING * _BEARING_WIDTH * arm, f"mu2 = {_BEARING:g}, {1e3 * _BEARING_WIDTH * arm:.3g} mm wide"
-        says, name = f"of a ball bearing ({of}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
+        note, name = f"of a ball bearing ({of}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
     else:
         own = _ball_radius(scene)
         assert own is not None
         lever, name = _ROLLING / own[0] * arm, "rolling: k (R/r) m R Omega^2 / drag torque"
-        says = f"{own[1]}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"
-    return _row(name, lever * normal_force / drag, accuracy, says)
+        note = f"{own[1]}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"
+    return _row(name, lever * normal_force / drag, accuracy, note)
 
 
 def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
@@ -147,10 +147,10 @@ def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRo
     whole = float(1.0 / (port @ jnp.linalg.solve(model.mass, port.T))[0, 0])
     n = scene.loads.count
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.inertia_factor() * scene.loads.mass, (n,))))
-    says = (
+    note = (
         "the model has no tilts: if the machine can tilt, the rotating loads couple its tilts (as the inertia of a rotor does)"
     )
-    return _row("gyroscopic: sum kappa m / M", loads / whole, accuracy, says)
+    return _row("gyroscopic: sum kappa m / M", loads / whole, accuracy, note)
 
 
 def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
@@ -159,8 +159,8 @@ def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | No
         return None
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
     weight = _G * (float(jnp.trace(machine.carrier().mass)) + loads)
-    says = "foundation force over weight: above 1, springs under the machine would have to pull; stop, cubic_support"
-    return _row("lift: R / (M g)", values.foundation_force / weight, 1.0, says)
+    note = "foundation force over weight: above 1, springs under the machine would have to pull; stop, cubic_support"
+    return _row("lift: R / (M g)", values.foundation_force / weight, 1.0, note)
 
 
 _NUMBERS: tuple[Callable[[Scene, MotionValues, float], NumberRow | None], ...] = (

@@ -28,7 +28,7 @@ class TierRow(NamedTuple):
       for `amplitude` that of the coordinate with the largest error, in units of the largest amplitude; NaN if `applicable` is
       False
     - `seconds` of a computation, and additional seconds of the first one, `compile`; NaN without timings
-    - `says`: its purpose, or the reason why it cannot compute the quantities
+    - `note`: its purpose, or the reason why it cannot compute the quantities
     """
 
     tier: str
@@ -38,15 +38,15 @@ class TierRow(NamedTuple):
     omega: float
     seconds: float
     compile: float
-    says: str
+    note: str
 
     def words(self) -> str:
         """Return the row as text."""
         if not self.applicable:
-            return f"not applicable; {self.says}"
+            return f"not applicable; {self.note}"
         off = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))
         took = "" if math.isnan(self.seconds) else f", {self.seconds:.2g} s"
-        return f"error {100.0 * off:.2g} %{took}; {self.says}"
+        return f"error {100.0 * off:.2g} %{took}; {self.note}"
 
 
 def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues, repeats: int) -> list[TierRow]:
@@ -58,21 +58,21 @@ def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, re
     nothing = (math.nan,) * 5
     refusal = tier.refusal(scene)
     if refusal is not None:
-        return TierRow(tier.name, False, *nothing, says=refusal)
+        return TierRow(tier.name, False, *nothing, note=refusal)
     call = _call(tier, scene, comparison, reference)
     if isinstance(call, str):
-        return TierRow(tier.name, False, *nothing, says=call)
+        return TierRow(tier.name, False, *nothing, note=call)
     try:
         found, seconds, compiling = timed(call, repeats) if repeats else (call(), math.nan, math.nan)
     except (InputError, ComputationError) as problem:
-        return TierRow(tier.name, False, *nothing, says=str(problem))
+        return TierRow(tier.name, False, *nothing, note=str(problem))
     amplitude, size = np.abs(np.asarray(found.amplitude)), np.asarray(reference.amplitude)
     if not np.all(np.isfinite(amplitude)):
         status = getattr(found, "status", None)
-        return TierRow(tier.name, False, *nothing, says="this motion does not exist" if status is None else status_name(status))
-    says = tier.purpose
+        return TierRow(tier.name, False, *nothing, note="this motion does not exist" if status is None else status_name(status))
+    note = tier.purpose
     if isinstance(comparison, JamComparison) and isinstance(found, MotionValues) and found.kind != "jammed":
-        says = f"the run left the jam: {found.kind}"
+        note = f"the run left the jam: {found.kind}"
     off = (amplitude - size) / np.max(size)
     return TierRow(
         tier.name,
@@ -82,7 +82,7 @@ def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, re
         float(found.omega) / reference.omega - 1.0,
         seconds,
         compiling,
-        says,
+        note,
     )
 
 

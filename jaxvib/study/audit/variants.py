@@ -24,12 +24,12 @@ _DROOP = 0.015
 
 class Variant(NamedTuple):
     """Variant of the audited scene with one effect added or removed: `name` of the effect; `present`: True if the audited scene
-    has it; the varied `scene`; `says`: the values with which it was added."""
+    has it; the varied `scene`; `note`: the values with which it was added."""
 
     name: str
     present: bool
     scene: Scene
-    says: str = ""
+    note: str = ""
 
 
 class WithoutGyroscopic(Machine):
@@ -95,8 +95,8 @@ def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[
             usual = effect.typical(scene.machine, scene.loads, scene.drive.speed, jnp.asarray(amplitude))
             if usual is not None:
                 more = scene.replace(effects=(*scene.all_effects, usual.effect))
-                yield Variant(kind, False, more, usual.says)
+                yield Variant(kind, False, more, usual.note)
     if scene.drive.constant:
         slower = ConstantSpeed(scene.drive.speed * (1.0 - _DROOP))
-        says = f"a motor that loses {100.0 * _DROOP:g} % of its speed: induction_motor, dc_motor"
-        yield Variant("weak drive", False, eqx.tree_at(lambda s: s.drive, scene, slower), says)
+        note = f"a motor that loses {100.0 * _DROOP:g} % of its speed: induction_motor, dc_motor"
+        yield Variant("weak drive", False, eqx.tree_at(lambda s: s.drive, scene, slower), note)

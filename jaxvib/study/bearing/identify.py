@@ -143,14 +143,14 @@ def identify_bearing(
 
     - `pendulum`: a `BearingPendulum`
     - `record` of its swing; typical: 250 to 10,000 samples over 10 to 60 s, first amplitude 3 to 60 deg
-    - `dry`: True to find mu2 as well (the pendulum needs `bearing`)
+    - `dry`: True to identify the dry friction mu2 as well (the pendulum then needs the diameter `bearing`)
     - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
       intervals; typical: 0.01 to 0.03 (0.03 in the paper; default 0)
     - `throw`: raise if no fit is found
 
     **Returns** `Identified`. **Raises** `InputError` for a record that cannot be fitted, `ComputationError` "not_converged".
 
-    Source: Artyunin, Sumenkov 2019, who determine mu1 from two amplitudes; the fit to the whole record is ours.
+    Source: Artyunin, Sumenkov 2019, who determine mu1 from two amplitudes; the fit to the whole record: this package.
     """
     if dry and pendulum.bearing is None:
         raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")

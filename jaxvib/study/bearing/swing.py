@@ -110,10 +110,10 @@ class Swing(Result):
 
     - `status`: a `SwingStatus`
     - `time` (n,), s
-    - `angle` (n,), rad from hanging, and `rate` (n,), rad/s
-    - `stopped_at`, s, NaN if it still swings
-    - `width`, rad/s, over which dry friction was smoothed, NaN without
-    - `steps` taken
+    - `angle` (n,), rad, from the hanging position, and angular velocity `rate` (n,), rad/s
+    - `stopped_at`: time, s, at which the pendulum stopped; NaN if it still swings
+    - `width`, rad/s: range of angular velocities over which dry friction was smoothed; NaN without dry friction
+    - `steps`: number of steps of the integration
     """
 
     status: SwingStatus
@@ -160,7 +160,7 @@ def swing(
 
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
 
-    If the pendulum turns within the dead zone |tan f| < mu2 d/(2 l), dry friction holds it: it stays there for good.
+    If the pendulum turns within the dead zone |tan f| < mu2 d/(2 l), dry friction holds it permanently.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -169,9 +169,9 @@ def swing(
     - `angle` from hanging, rad, and `rate`, rad/s (default 0), at time[0]; typical: 3 to 60 deg
     - `viscous` mu1, N m s; typical: 3e-4 to 2e-3
     - `dry` mu2, no unit; typical: about 0.0015 for ball bearings; default: no dry friction
-    - `width`, rad/s, of the passage through 0 of the sign of sliding; default: a twentieth of the dead zone's angle times the
-      natural frequency, so that a swing as small as the dead zone loses 0.1 % too little, a larger one less. A smaller width
-      needs more steps
+    - `width`, rad/s: range of f' over which the dry friction changes its sign; default: a twentieth of the dead zone's angle
+      times the natural frequency. A swing as small as the dead zone then loses 0.1 % too little energy; the error of larger
+      swings is smaller. A smaller width needs more steps
     - `stepsize_controller`: `Tolerance` of a step, relative, and in rad; typical: 1e-6 to 1e-9 (the default; in single
       precision 1e-5). Or a controller of diffrax
     - `solver`, `adjoint`, `max_steps`: as in diffrax

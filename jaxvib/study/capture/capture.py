@@ -125,9 +125,9 @@ class Capture(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the share of captured starts over the initial speed, and the threshold, onto the axes `ax` if controller.
+        """Plot the share of captured starts over the initial speed, and the threshold, onto the axes `ax` if given.
 
-        **Returns** a matplotlib figure, or the controller `ax`.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.capture import threshold_chart  # slow import
 

@@ -34,7 +34,7 @@ class CriterionMap(Result):
     - `speeds` (S,), rad/s; `mass_factor` (M,) and `drag_factor` (D,): factors on the mass and drag of the scene's loads
     - `predicted` (M, S): True if the criterion predicts stable auto-balancing (it does not depend on the drag)
     - `growth` (D, M, S), 1/s: exact growth rate, stable if negative
-    - `right` (D, M): share of the speeds at which both agree
+    - `agreement` (D, M): share of the rotor speeds at which both agree
     - `boundary` (M, B), rad/s: the criterion's boundaries, ascending, NaN for an absent one
     - `shift` (D, M, B): (exact - predicted)/predicted for each lower or upper end of an interval of the criterion. It is
       compared with the same end of the exact interval of stability that overlaps most with this interval; NaN if no exact end
@@ -48,7 +48,7 @@ class CriterionMap(Result):
     drag_factor: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor"))
     predicted: np.ndarray = eqx.field(metadata=in_unit("", "mass_factor", "speeds"))
     growth: np.ndarray = eqx.field(metadata=in_unit("1/s", "drag_factor", "mass_factor", "speeds"))
-    right: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor"))
+    agreement: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor"))
     boundary: np.ndarray = eqx.field(metadata=in_unit("rad/s", "mass_factor", "end"))
     shift: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor", "end"))
 
@@ -60,7 +60,9 @@ class CriterionMap(Result):
             cells = []
             for m in range(self.mass_factor.size):
                 shift = np.abs(self.shift[d, m][~np.isnan(self.shift[d, m])])
-                cells.append(f"{self.right[d, m]:.3f} ({np.mean(shift):.2%})" if shift.size else f"{self.right[d, m]:.3f}")
+                cells.append(
+                    f"{self.agreement[d, m]:.3f} ({np.mean(shift):.2%})" if shift.size else f"{self.agreement[d, m]:.3f}"
+                )
             lines.append(f"{factor:>16.3g}" + "".join(f"{cell:>16}" for cell in cells))
         return "\n".join(lines)
 
@@ -98,7 +100,7 @@ def criterion_map(
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(40.0))
     >>> found = jv.criterion_map(scene, speeds=[20.0, 26.0, 29.5, 40.0], mass=[0.1, 2.0], drag=[1.0], steps=24)
-    >>> found.right.tolist()
+    >>> found.agreement.tolist()
     [[1.0, 0.75]]
 
     Source: the limits of the criterion are named in Filimonikhin et al. 2022, section 6, without numbers.
@@ -135,8 +137,8 @@ def criterion_map(
 
     for cell, found in in_parallel(exact, np.ndindex(shift.shape[:2])):
         growth[cell], shift[cell] = found
-    right = np.mean((growth < 0.0) == predicted[None], axis=-1)
-    return CriterionMap(grid, mass_factor, drag_factor, predicted, growth, right, boundary, shift)
+    agreement = np.mean((growth < 0.0) == predicted[None], axis=-1)
+    return CriterionMap(grid, mass_factor, drag_factor, predicted, growth, agreement, boundary, shift)
 
 
 def _shifts(exact: np.ndarray, grid: np.ndarray, boundary: np.ndarray) -> np.ndarray:

@@ -84,7 +84,7 @@ def stability_map(
     - `omega`: the range of load speeds, rad/s
     - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
 
-    **Returns** `StabilityMap`. **Raises** `InputError` if has_point are no values, or if they do not ascend.
+    **Returns** `StabilityMap`. **Raises** `InputError` if there are no values, or if they do not ascend.
 
     >>> import jaxvib as jv
     >>> def machine(eps):
@@ -94,7 +94,7 @@ def stability_map(
     >>> [[p.kind for p in points] for points in chart.special]
     [['fold'], ['fold', 'torus']]
 
-    Source: ours, on the diagrams of `exact_branches`.
+    Source: this package; the diagrams are those of `exact_branches`.
     """
     x = np.asarray(values, dtype=float)
     if x.ndim != 1 or x.size == 0 or not np.all(np.diff(x) > 0.0):
@@ -148,7 +148,7 @@ def stability_onset(
     >>> round(stability_onset(machine, "torus", (0.02, 0.05), omega=(0.36, 0.5), points=60, accuracy=0.5), 4)
     0.0398
 
-    Source: ours, on the diagrams of `exact_branches`.
+    Source: this package; the diagrams are those of `exact_branches`.
     """
 
     def has_point(x: float) -> bool:

@@ -71,7 +71,7 @@ def test_nan_is_left_out_and_counted():
 @pytest.mark.parametrize("level", [0.0, 0.123])
 def test_dropouts_are_left_out_and_counted(level):
     found = run(changed(SIGNAL, slice(800, 900), level))
-    assert "is constant in stretches of in all 100 readings (dropouts), the first at 0.8 s; left out" in found.notes[0]
+    assert "is constant in stretches with 100 readings in total (dropouts), the first at 0.8 s; left out" in found.notes[0]
     assert np.all(np.isnan(found.values["frame"][800:900])) and not np.any(np.isnan(found.values["frame"][:800]))
 
 

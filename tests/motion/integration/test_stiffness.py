@@ -9,7 +9,7 @@ from hard_cases.reference_model import reference_model
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
-from jaxvib.motion.stiffness import fastest_decay, is_unresolved, steps_of
+from jaxvib.motion.stiffness import equal_step_length, fastest_decay, is_unresolved
 from jaxvib.ode.dopri8 import UnrolledDopri8
 
 DRAGS = (300.0, 1e3, 1e5, 1e9)
@@ -46,10 +46,13 @@ def test_fastest_decay_is_that_of_the_dense_damping_matrix(drag, damping, count)
 
 
 def test_steps_resolve_decay_or_are_implicit():
-    assert steps_of(60.0, 20.0, 4.0) == (1.0 / 240.0, False)
-    assert steps_of(60.0, 3000.0, 4.0) == (1e-3, False)
-    assert steps_of(60.0, 6001.0, 4.0) == (1.0 / 1920.0, True)
-    assert steps_of(60.0, 20.0, 4.0, 1e-3) == (1e-3, False) and steps_of(60.0, 4000.0, 4.0, 1e-3) == (1e-3, True)
+    assert equal_step_length(60.0, 20.0, 4.0) == (1.0 / 240.0, False)
+    assert equal_step_length(60.0, 3000.0, 4.0) == (1e-3, False)
+    assert equal_step_length(60.0, 6001.0, 4.0) == (1.0 / 1920.0, True)
+    assert equal_step_length(60.0, 20.0, 4.0, 1e-3) == (1e-3, False) and equal_step_length(60.0, 4000.0, 4.0, 1e-3) == (
+        1e-3,
+        True,
+    )
     assert bool(is_unresolved(7000.0, 1e-3)) and not bool(is_unresolved(5000.0, 1e-3))
 
 
@@ -83,7 +86,7 @@ def test_unresolved_runs_are_named(monkeypatch):
     """Explicit steps are given for unknown numbers."""
     from jaxvib.motion import plan
 
-    monkeypatch.setattr(plan, "steps_of", lambda *_: (1.0, False))
+    monkeypatch.setattr(plan, "equal_step_length", lambda *_: (1.0, False))
     many = jv.ensemble(of_drag, jnp.asarray([1.0, 1e5]), 5.0, stepsize_controller=jv.EqualSteps(1200))
     assert [str(s) for s in np.asarray(many.resolved)] == ["True", "False"]
     assert "too long for the decay of the loads by drag" in many.summary()

@@ -248,9 +248,9 @@ def test_criterion_improves_for_lighter_loads_and_stronger_drag():
     """Loads of 0.1, 0.3 and 3 % of their platform's mass. On the heaviest, stronger drag makes it worse again."""
     speeds = np.linspace(12.0, 90.0, POINTS)
     found = jv.criterion_map(loaded("two_mass", 3), speeds=speeds, mass=[0.1, 0.3, 3.0], drag=[0.1, 1.0, 10.0])
-    assert np.all(np.diff(found.right, axis=1) <= 0.0) and np.all(found.right[:, 2] < found.right[:, 0] - 0.2)
-    assert np.all(np.diff(found.right[:, :2], axis=0) > 0.0)
-    assert found.right[1, 2] > found.right[2, 2] > found.right[0, 2]
+    assert np.all(np.diff(found.agreement, axis=1) <= 0.0) and np.all(found.agreement[:, 2] < found.agreement[:, 0] - 0.2)
+    assert np.all(np.diff(found.agreement[:, :2], axis=0) > 0.0)
+    assert found.agreement[1, 2] > found.agreement[2, 2] > found.agreement[0, 2]
     first = found.shift[:, :, 0]
     assert np.all(np.diff(first, axis=1) > 0.0)
     assert np.all(np.diff(first[:, :2], axis=0) < 0.0) and first[2, 2] > first[1, 2]

@@ -85,7 +85,7 @@ def test_change_by_an_effect_is_that_of_both_scenes(found):
 
 def test_an_effect_from_outside_is_audited(found):
     seal = found.effects[1]
-    assert (seal.effect, seal.present, seal.says, seal.advice) == ("seal_friction", False, "as given", "needed")
+    assert (seal.effect, seal.present, seal.note, seal.advice) == ("seal_friction", False, "as given", "needed")
     more = jv.jam_orbit(jv.Scene(SCENE.machine, SCENE.loads, SCENE.drive, (jv.Gravity(), SEAL)), mode=1)
     np.testing.assert_allclose(seal.omega, more.omega / found.omega - 1.0, rtol=1e-6)
     assert seal.omega > 0.0 and seal.operations > 0  # the seal drags the loads along: they jam faster
@@ -282,7 +282,7 @@ def test_numbers_are_those_of_the_equations():
     radius = (3.0 / (4.0 * np.pi * 7850.0)) ** (1.0 / 3.0)
     sized = jv.balls(count=5, mass=1.0, radius=0.1, drag=0.5, ball_radius=radius)
     np.testing.assert_allclose(rows["loads side by side"].value, 1.0 - sized.unbalance() / heavy.unbalance(), rtol=1e-9)
-    assert rows["loads side by side"].advice == "perhaps needed" and "31.2 mm" in rows["loads side by side"].says
+    assert rows["loads side by side"].advice == "perhaps needed" and "31.2 mm" in rows["loads side by side"].note
     rolling = jv.RollingFriction(3e-5)
     friction = rolling.friction(sized, (jnp.zeros(5),), (jnp.full(5, 27.0),), jnp.asarray(60.0), {})
     torque = float(jnp.sum(friction.forces({0: jnp.zeros(5), 1: jnp.zeros(5)})[0]))
@@ -293,7 +293,7 @@ def test_numbers_are_those_of_the_equations():
     np.testing.assert_allclose(rows["lift"].value, 600.0 / (9.81 * 55.0), rtol=1e-9)
     full = jv.Scene(SCENE.machine, jv.balls(count=12, mass=1.0, radius=0.1, drag=0.5), SCENE.drive)
     crowded = {row.name.partition(":")[0]: row for row in dimensionless_numbers(full, values, 0.01)}
-    assert crowded["crowding"].value > 1.0 and "do not fit" in crowded["crowding"].says
+    assert crowded["crowding"].value > 1.0 and "do not fit" in crowded["crowding"].note
     assert "gravity" not in {row.name.partition(":")[0] for row in dimensionless_numbers(SCENE, values, 0.01)}
     near = values._replace(closest=0.5)
     meets = [row for row in dimensionless_numbers(scene, near, 0.01) if row.name.startswith("contact")]
