@@ -243,7 +243,7 @@ def require_rotating_masses(scene: Scene) -> None:
     **Raises** `InputError` for other exciters and for effects with terms other than `AVERAGED_TERMS`.
     """
     for k, exciter in enumerate(scene.exciters):
-        with within(scene.place_of(k)):
+        with within(scene.prefix_of(k)):
             if exciter.loads is None:
                 continue
             if exciter.unbalance is not None:

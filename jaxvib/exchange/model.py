@@ -151,7 +151,7 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
     input_signals, output_signals = list(force_inputs(carrier)), list(foundation_forces(carrier))
     angle_signals = []
     for k, exciter in enumerate(scene.exciters):
-        angle, speed, acceleration, torque = _rotor_signals(scene.place_of(k))
+        angle, speed, acceleration, torque = _rotor_signals(scene.prefix_of(k))
         is_prescribed = exciter.drive.ideal and by_input
         angles.append(zero if is_prescribed else None)
         if not exciter.drive.ideal:
@@ -231,7 +231,7 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
     put(places.displacement, coordinate_signals(carrier, "displacement", 0))
     put(places.velocity, coordinate_signals(carrier, "velocity", 1))
     for k, own in enumerate(places.exciters):
-        place = scene.place_of(k)
+        place = scene.prefix_of(k)
         put_loads(f"{place}angle", "rad", own.angle)
         put_loads(f"{place}rate", "rad/s", own.rate)
         if own.rotor is not None:

@@ -184,7 +184,7 @@ def _at_rest(scene: Scene, speed: Array) -> StateSpace:
     carrier = scene.machine.structure()
     states = (*coordinate_signals(carrier, "displacement", 0), *coordinate_signals(carrier, "velocity", 1))
     places = [
-        f"{scene.place_of(k) or 'exciter.'}{('across', 'up')[axis]}"
+        f"{scene.prefix_of(k) or 'exciter.'}{('across', 'up')[axis]}"
         for k, exciter in enumerate(scene.exciters)
         for axis in scene.machine.mounting(exciter.at).axes
     ]

@@ -85,8 +85,8 @@ def _prescribed(scene: Scene, k: int, exciter: Exciter, run: MeasuredRun) -> Rot
     if not exciter.drive.ideal:
         raise InputError(
             run.source,
-            f"has no channel of the rotor's angle, and {scene.place_of(k)}drive is {exciter.drive.kind!r}, whose speed depends "
-            "on the machine; add a channel of kind pulses, angle or speed",
+            f"has no channel of the rotor's angle, and {scene.prefix_of(k)}drive is {exciter.drive.kind!r}, whose speed "
+            "depends on the machine; add a channel of kind pulses, angle or speed",
         )
     return RotorAngle(None, exciter.drive, (-math.inf, math.inf), False, 0.0, ())
 

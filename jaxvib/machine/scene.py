@@ -228,10 +228,10 @@ class Scene(Part):
             if exciter.loads is not None:
                 for effect in shared:
                     effect.validate(machine, exciter.loads)
-            with within(self.place_of(k)):
+            with within(self.prefix_of(k)):
                 machine.require_body(exciter.body)
             _require_stations(machine, exciter)
-            with within(self.place_of(k)):
+            with within(self.prefix_of(k)):
                 _require_fit(machine, exciter)
 
     @property
@@ -301,7 +301,7 @@ class Scene(Part):
         exciter = one.with_parts(known.pop("loads"), known.pop("drive"))
         return Scene(**known, exciters=[exciter])
 
-    def place_of(self, k: int) -> str:
+    def prefix_of(self, k: int) -> str:
         """Return the prefix of the names of the parts of exciter `k`: "exciters[1].", or "" if there is one exciter."""
         return f"exciters[{k}]." if len(self.exciters) > 1 else ""
 

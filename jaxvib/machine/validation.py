@@ -119,7 +119,7 @@ def implausible_numbers(scene: Scene) -> list[str]:
         notes.append(f"{name} is {value}; a plain number is in {si}: did you mean '{meant}'?")
 
     for k, exciter in enumerate(scene.exciters):
-        place, loads = scene.place_of(k), exciter.loads
+        place, loads = scene.prefix_of(k), exciter.loads
         speed = float(exciter.drive.speed)
         if speed > _MAX_SPEED:
             note(f"{place}drive.speed", speed_text(speed), "rad/s", f"{speed:g} rpm")
@@ -141,7 +141,7 @@ def _rebuild(scene: Scene) -> None:
     """Construct each part of a scene again. **Raises** `InputError` for a known value that is not allowed."""
     rebuild_part(scene.machine, "machine")
     for k, exciter in enumerate(scene.exciters):
-        with within(scene.place_of(k)):
+        with within(scene.prefix_of(k)):
             if exciter.loads is not None:
                 rebuild_part(exciter.loads, "loads")
             rebuild_part(exciter.drive, "drive")
@@ -169,7 +169,7 @@ def _require_valid(key: _SceneKey) -> None:
     _rebuild(scene)
     for k, exciter in enumerate(scene.exciters):
         if exciter.loads is not None:
-            with within(scene.place_of(k)):
+            with within(scene.prefix_of(k)):
                 require_comparable(scene.machine, exciter.loads, exciter.drive)
 
 

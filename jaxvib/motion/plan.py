@@ -362,6 +362,6 @@ def with_settled_drives(scene: Scene, problem: str) -> Scene:
     for k, exciter in enumerate(scene.exciters):
         drive = exciter.drive
         if not drive.constant and (drive.ideal or scene.is_plain):
-            raise InputError(f"{scene.place_of(k)}drive", f"is {quoted(drive.kind)}; {problem}")
+            raise InputError(f"{scene.prefix_of(k)}drive", f"is {quoted(drive.kind)}; {problem}")
         scene = scene if drive.constant else eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, drive.settled())
     return scene

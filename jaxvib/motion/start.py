@@ -176,7 +176,7 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
         raise InputError("rotation", f"is {quoted(rotation)}; it must be 'rolling' or 'none'")
     exciters = []
     for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
-        with within(scene.place_of(k)):
+        with within(scene.prefix_of(k)):
             exciters.append(_exciter_with_spin(exciter, own, rotation))
     return State(state.displacement, state.velocity, exciters=exciters)
 
@@ -257,7 +257,7 @@ def validate_state(scene: Scene, state: State, mode: int | None, separation: Num
     nd = scene.machine.structure().mass.shape[0]
     _require_shapes(state, displacement=nd, velocity=nd)
     for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
-        with within(scene.place_of(k)):
+        with within(scene.prefix_of(k)):
             if exciter.drive.ideal != (own.rotor is None):
                 motor, ideal = (
                     "(angle, speed), because the angle and speed of a motor's rotor are part of the state",
@@ -290,5 +290,5 @@ def require_start(scene: Scene, state: State) -> None:
     for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         for term in terms_of(exciter.effects, LoadInteraction):
             if term.validate_start is not None and exciter.loads is not None:
-                with within(scene.place_of(k)):
+                with within(scene.prefix_of(k)):
                     when_known(lambda *u, term=term, loads=exciter.loads: term.validate_start(loads, u), *own.angle)

@@ -95,7 +95,7 @@ class VibrationMeasures(eqx.Module):
     - `static_load` (nd,), N: weight that each support carries
     - `dynamic_load` (nd,), N zero to peak, of each support
     - `torque`, N m, and `power`, W: means at the shaft of the rotor
-    - `coordinates`: their names
+    - `coordinates`: the names of the coordinates
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -254,7 +254,7 @@ def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number 
 
     **Arguments**
 
-    - `amplitude` U (2,), m, complex: amplitudes across (horizontal, along x) and up, u = Re(U e^{i w t})
+    - `amplitude` U (2,), m, complex: amplitudes horizontal (along x) and up, u = Re(U e^{i w t})
     - `speed` w, rad/s or text; typical: 75 to 160
     - `slope` of the deck, rad or text, measured anticlockwise from x; typical: "-15 deg" to 0 (the default)
 
@@ -270,7 +270,7 @@ def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number 
     from experiments for conveyors that throw than for those that slide.
     """
     if jnp.shape(amplitude) != (2,):
-        raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give the two amplitudes across and up")
+        raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give two amplitudes, horizontal and up")
     when_known(_require_finite, amplitude)
     w, tilt = number(speed, "rad/s", "speed", low=0.0, open_low=True), number(slope, "rad", "slope")
     return _conveying_speed(jnp.asarray(amplitude, complex), w, tilt)

@@ -114,7 +114,7 @@ def ellipse_of(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0
     semi-axes 5 and 5 mm, anticlockwise, a circle, 5.099 g, throw number 5.099
     """
     if jnp.shape(amplitude) != (2,):
-        raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give the two amplitudes across and up")
+        raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give two amplitudes, horizontal and up")
     when_known(_require_finite, amplitude)
     w, along = number(speed, "rad/s", "speed"), number(slope, "rad", "slope")
     return _ellipse_of(jnp.asarray(amplitude), w, along, number(remainder, "", "remainder", low=0.0))
@@ -152,7 +152,7 @@ class Deck(Result):
     **Attributes** (n points)
 
     - `points` (n, 2), m, of the body
-    - `amplitude` U (n, 2), m: complex amplitudes across and up
+    - `amplitude` U (n, 2), m: complex amplitudes, horizontal and up
     - `ellipses`: an `Ellipse` whose arrays are (n,)
     - `motion_spread`: root mean square over the points of |U_p - mean| divided by |mean|; 0 if all points have the same
       motion; typical: 0.01 to 0.3
@@ -259,7 +259,7 @@ class PathsOfPoints(eqx.Module):
 
 
 def rows_in_plane(machine: Machine, place: Place, name: str = "at") -> Array:
-    """Return the rows (2, nd) of a point, across and up. A machine that moves up only has zeros across."""
+    """Return the rows (2, nd) of a point, horizontal and up. If a machine only moves up, the first row is 0."""
     rows = machine.rows_at(place, name)
     return rows if rows.shape[0] == 2 else jnp.concatenate([jnp.zeros_like(rows), rows])
 

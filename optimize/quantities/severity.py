@@ -107,8 +107,8 @@ def transmissibility(*, mode: int, tier: Tier = "leading") -> Quantity:
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier` as `amplitude`.
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.01 to 5. A number of a mode that the machine does not
-    have raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.01 to 5. A mode that the machine does not have raises
+    `InputError` when the quantity is computed.
 
     >>> from optimize import transmissibility
     >>> (transmissibility(mode=3) < 0.1).words
@@ -128,8 +128,8 @@ def shaft_torque(*, mode: int, tier: Tier = "leading") -> Quantity:
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier`: "leading" (the default) or "exact".
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.1 to 20 N m. A number of a mode that the machine does not
-    have raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.1 to 20 N m. A mode that the machine does not have
+    raises `InputError` when the quantity is computed.
 
     >>> from optimize import shaft_torque
     >>> shaft_torque(mode=3).unit

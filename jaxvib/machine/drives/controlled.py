@@ -27,7 +27,7 @@ class TorqueTable(Motor):
     - `torques` at these speeds, N m: the first positive, the last 0 or negative; typical: -10 to 200
     - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
-    Its `speed` without a load is the last one at which the torque becomes 0.
+    Its no-load `speed` is the last speed at which the torque falls to 0.
 
     **Raises** `InputError` for a wrong unit, speeds that do not ascend, and torques that do not fall to 0.
 

@@ -95,7 +95,7 @@ class NamePlateMotor(Motor):
 
 def _require_below(rated: float, supply: float) -> None:
     if rated >= supply * (1.0 - 1e-6):
-        raise InputError("drive.rated_speed", f"is {rated:g} rad/s; it must be below the supply's {supply:g} rad/s")
+        raise InputError("drive.rated_speed", f"is {rated:g} rad/s; it must be below the supply's frequency, {supply:g} rad/s")
 
 
 def _require_breakdown(slip: float) -> None:

@@ -23,9 +23,9 @@ Reaction = Literal["exact", "run_up", "steady"]
 def sliding_sign(slip: Array, width: Array) -> Array:
     """Return tanh(slip / width), the sign of a sliding speed, smooth over the `width`.
 
-    With the exact sign, a joint does not move if its load is the fraction f < 1 of the largest friction. With the smooth sign
-    it creeps at the speed width artanh(f), which tends to 0 with the width. An oscillation with the largest speed v loses less
-    energy to dry friction than with the exact sign; the relative difference is (pi^2/24) (width/v)^2.
+    With the exact sign, a bearing does not turn if the torque on it is the fraction f < 1 of the largest friction torque. With
+    the smooth sign it creeps at the speed width artanh(f), which tends to 0 with the width. An oscillation with the largest
+    speed v loses less energy to dry friction than with the exact sign; the relative difference is (pi^2/24) (width/v)^2.
 
     >>> [round(float(sliding_sign(x, 0.1)), 4) for x in (-1.0, 0.0, 0.05, 1.0)]
     [-1.0, 0.0, 0.4621, 1.0]
@@ -62,8 +62,8 @@ class DryFriction(Effect):
     - `coefficient` mu2, at least 0; typical: about 0.0015 for ball bearings, 0.001 to 0.005 for rolling bearings
     - `diameter` d of the bearing, m; typical: 0.005 to 0.05
     - `reaction`: one of the three names above (default: "exact")
-    - `width`, rad/s, of the sliding speed over which the sign is smoothed, see `sliding_sign`; typical: 0.01 (the default) to
-      1. A smaller width is more exact and needs more steps
+    - `width`, rad/s: range of sliding speeds over which the sign is smoothed, see `sliding_sign`; typical: 0.01 (the default)
+      to 1. A smaller width is more exact and needs more steps
 
     **Raises** `InputError` for values that are not allowed.
 

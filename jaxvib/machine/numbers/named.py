@@ -155,7 +155,7 @@ def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
     """Yield each part of a scene after its name and its path. Repeatable effects are numbered from 0."""
     yield "machine", ("machine",), scene.machine
     for k, exciter in enumerate(scene.exciters):
-        place, path = scene.place_of(k), ("exciters", k)
+        place, path = scene.prefix_of(k), ("exciters", k)
         for section in ("loads", "drive"):
             if (part := getattr(exciter, section)) is not None:
                 yield place + section, (*path, section), part
@@ -166,7 +166,7 @@ def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
         counted[effect.kind] += 1
     for k, exciter in enumerate(scene.exciters):
         for j, effect in enumerate(exciter.effects):
-            yield f"{scene.place_of(k)}effects.{effect.kind}", ("exciters", k, "effects", j), effect
+            yield f"{scene.prefix_of(k)}effects.{effect.kind}", ("exciters", k, "effects", j), effect
 
 
 def _steps(part: eqx.Module, steps: Sequence[Any]) -> tuple[_Path, NumberSpec]:

@@ -87,8 +87,8 @@ def from_matrices(
     - `mass` M and `stiffness` K (nd, nd), symmetric, M positive definite, K without negative eigenvalues
     - `damping` C (nd, nd)
     - `gyroscopic` G (nd, nd): G times the rotor speed n times q' is a force; skew-symmetric. None without a rotor
-    - `places`: a list of points at which exciters may sit, numbered from 1 in `Exciter(at=)`. Each is a list of the indices
-      of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
+    - `places`: a list of points to which exciters can be attached, numbered from 1 in `Exciter(at=)`. Each is a list of the
+      indices of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
       displacement from q; all places have the same number of directions
     - `foundation`: (T_K, T_C), two arrays (nb, nd): the force on the foundation is T_K q + T_C q', up (nb = 1) or horizontal
       and up (nb = 2); default: the force is unknown, and results state 0

@@ -72,13 +72,13 @@ class Rotor(Machine):
         stiffness = terms(self.stiffness, self.stiffness_terms)
         damping = terms(self.damping, self.damping_terms)
         zero = jnp.zeros_like(self.mass)
-        across, tilt = self._directions()
+        translation, tilt = self._directions()
         return Carrier(
             mass=matrix(self.mass, zero, self.transverse_inertia),
             damping=matrix(*damping),
             stiffness=matrix(*stiffness),
-            foundation_stiffness=stiffness[0] * across + stiffness[1] * tilt,
-            foundation_damping=damping[0] * across + damping[1] * tilt,
+            foundation_stiffness=stiffness[0] * translation + stiffness[1] * tilt,
+            foundation_damping=damping[0] * translation + damping[1] * tilt,
             coordinates=("y", "z", "theta", "psi"),
             coordinate_units=("m", "m", "rad", "rad"),
         )
@@ -106,10 +106,10 @@ class Rotor(Machine):
             raise InputError(name, f"is {place}, which numbers a platform; on a rotor give a position, m from the mass centre")
         if isinstance(place, Sequence) or (isinstance(place, jax.Array) and place.ndim > 0):
             raise InputError(name, f"is {quoted(place)}, a point of a body; on a rotor give a position, m from the mass centre")
-        across, tilt = self._directions()
+        translation, tilt = self._directions()
         shared = self.stations if self.stations.ndim == 0 else None
         distance = shared if place is None else jnp.asarray(place)
-        return across if distance is None else across + distance * tilt
+        return translation if distance is None else translation + distance * tilt
 
     def _directions(self) -> tuple[Array, Array]:
         """Return rows (2, 4) of the mass centre, and of the tilt of the axis."""
@@ -186,14 +186,14 @@ def rotor(
     places = read(2, position=position)["position"]
     if stiffness_terms is None:
         when_known(_require_two_places, places)
-    across, along = read(transverse_inertia=transverse_inertia, polar_inertia=polar_inertia).values()
-    when_known(_require_body, across, along)
+    transverse, polar = read(transverse_inertia=transverse_inertia, polar_inertia=polar_inertia).values()
+    when_known(_require_possible_inertia, transverse, polar)
     return Rotor(
         **read(mass=mass),
         **read(2, stiffness=stiffness, damping=damping),
         **read(stations=stations),
-        transverse_inertia=across,
-        polar_inertia=along,
+        transverse_inertia=transverse,
+        polar_inertia=polar,
         position=places,
         stiffness_terms=terms("stiffness_terms", stiffness_terms),
         damping_terms=terms("damping_terms", damping_terms),
@@ -216,10 +216,10 @@ def _require_two_places(places: np.ndarray) -> None:
         raise InputError("machine.position", f"puts both supports at {places[0]:g} m, {problem}")
 
 
-def _require_body(across: float, along: float) -> None:
-    if along > 2.0 * across * (1.0 + 1e-6):
-        most = f"it cannot exceed twice the transverse inertia, {2.0 * across:g} kg m^2 (a thin disc)"
-        raise InputError("machine.polar_inertia", f"is {along:g} kg m^2; {most}")
+def _require_possible_inertia(transverse: float, polar: float) -> None:
+    if polar > 2.0 * transverse * (1.0 + 1e-6):
+        most = f"it cannot exceed twice the transverse inertia, {2.0 * transverse:g} kg m^2 (a thin disc)"
+        raise InputError("machine.polar_inertia", f"is {polar:g} kg m^2; {most}")
 
 
 class PlanarRotor(Machine):

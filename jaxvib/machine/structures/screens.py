@@ -12,7 +12,7 @@ gravity = true              # weight of the unbalances: a motor that is too weak
 """
 
 SCREENS = {
-    "linear_screen": """# A linear screen: two motors that turn against each other throw the deck at 45 degrees.
+    "linear_screen": """# A linear screen: two motors turn in opposite directions, and the deck throws at 45 degrees.
 """
     + _HEAD
     + """mass = 2600.0               # kg, with the motors, without the material
@@ -72,7 +72,7 @@ damping = [1800.0, 2000.0]
 at = [0.0, 0.03]            # the shaft, in the drawing of the side wall
 direction = -1              # clockwise: with the flow of material to the right
 unbalance = { force = "70 kN", at = "900 rpm" }
-unbalance_mass = 120.0      # kg, counted at the shaft
+unbalance_mass = 120.0      # kg, added to `mass`, at the shaft
 [exciters.drive]
 kind = "induction_motor"    # 7.5 kW with a belt; speed and torque at the shaft
 speed = "900 rpm"
@@ -81,7 +81,7 @@ breakdown_slip = 0.3
 inertia = 1.1               # kg m^2, of shaft, unbalance, pulleys and motor, at the shaft
 """
     + _GRAVITY,
-    "feeder": """# A feeder: two motors under its rear end throw the trough at 25 degrees.
+    "feeder": """# A feeder: two motors under its rear end turn in opposite directions, and the trough throws at 25 degrees.
 """
     + _HEAD
     + """mass = 400.0                # kg, with the motors, without the material

@@ -65,8 +65,8 @@ class MotorRunUp(Result):
     - `caught_at` (exciter,): number of the resonance, from 1, that the exciter does not pass; 0 if it passes all below its
       working speed
     - `peak_amplitude` (nd,), m, zero to peak, and `peak_force`, N: largest values on the way
-    - `least_torque`: the factor by which the torques of all motors can be multiplied until one of them does not pass; NaN if it
-      was not requested, and if even motors 64 times as strong do not pass
+    - `least_torque`: the smallest factor by which the torques of all motors can be multiplied such that all exciters still pass
+      their resonances; NaN if it was not requested, or if even motors 64 times as strong do not pass
     - `run`: the averaged motion, an `Envelope`
     - `scene`
     """
@@ -122,15 +122,15 @@ class _Scaled(MotorWrapper):
 def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     """Run the motors of a scene up from rest by the averaged equations, and name the resonances that catch exciters.
 
-    An exciter is caught by the lowest natural frequency below 0.95 of its working speed that its speed at the end does not
-    exceed by 5 %.
+    An exciter has passed a natural frequency if its speed at the end is at least 5 % higher. It is caught by the lowest natural
+    frequency that it has not passed, if this frequency is below 0.95 of its working speed.
 
     **Arguments**
 
     - `scene` as for `envelope`, with at least one motor
-    - `until`, s or text: end of the run, after which an exciter that has not passed counts as caught; typical: 5 to 60
-    - `least`: True to search for `least_torque` by bisection, in about 16 runs, to 1 %. A motor that passes is assumed to pass
-      with more torque
+    - `until`, s or text: end of the run; an exciter that has not passed by then is regarded as caught; typical: 5 to 60
+    - `least`: True to search for `least_torque` by bisection, in about 16 runs, to 1 %. The search assumes that a motor that
+      passes also passes with more torque
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between capture and
     passage use `simulate`.

@@ -225,7 +225,7 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
         name = scene.machine.structure().coordinates[stiff]
         advice = "too high for this precision; use a softer spring or leave this coordinate out of the machine"
         if np.any(port[:, stiff]):
-            raise InputError("machine.exciter", f"stands on {name}, where the stiffness is {advice}")
+            raise InputError("machine.exciter", f"is attached to {name}, where the stiffness is {advice}")
         raise InputError("machine.stiffness", f"is at {name} {advice}")
 
 

@@ -53,7 +53,7 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], j
 MARKS = {
     "fold": "fold: the jam ends and the loads jump",
     "torus": "torus: the jam begins to pulsate",
-    "symmetry": "loss of symmetry: loads separate, or half-turns differ",
+    "symmetry": "loss of symmetry: loads separate, or the two halves of a turn differ",
     "period_doubling": "period doubles",
 }
 """Meanings of special points, for a legend."""

@@ -226,10 +226,10 @@ def jam_modes(scene: Scene) -> JamModes:
     - Rising pieces (odd modes) are stable by slope, falling ones are not
     - If the branch has more peaks than resonances, the lowest peaks, each of which covers a narrow range of rotor speeds, are
       ignored
-    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor
-      speed, and the force of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The
-      amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use
-      `simulate`
+    - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
+      speed, that of the loads at the load speed. At this order the imbalance therefore exerts no mean torque on the loads.
+      The amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters,
+      use `simulate`
 
     **Arguments**: `scene` with a drive of constant speed and loads with drag; typical: loads of 0.1 % to 5 % of the machine's
     mass. The relative error of the result is about this share times the magnification at resonance, see `jam_orbit`.

@@ -146,10 +146,10 @@ def phase_jams(
       load speeds, the speed is solved for as well (`phase_jam`)
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out
-    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force acts at the rotor
-      speed, and the force of the loads at the load speed, so that it exerts no mean torque on the loads at this order. The
-      amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters, use
-      `simulate`
+    - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
+      speed, that of the loads at the load speed. At this order the imbalance therefore exerts no mean torque on the loads.
+      The amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters,
+      use `simulate`
 
     **Arguments**
 
@@ -217,7 +217,7 @@ def _distinct(
     starts = np.bincount(which, starts, once.size).astype(int)
     places: list[int] = []
     reached: list[int] = []
-    near = 0  # first of `places` whose speed is close enough for the same jam
+    near = 0  # first of `places` whose speed is close enough to be the same jam
     for m in np.argsort(-omega[once], kind="stable"):
         k = once[m]
         while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME_SPEED_DIFFERENCE * omega[places[near]]:
@@ -241,7 +241,7 @@ def _jams_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
 
 def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
-    """Return True if the branch has a jam with this growth, or its mirror image, at that place at the scene's drag."""
+    """Return True if point `place` of the branch is, at the scene's drag, a jam with this `growth` (or its mirror image)."""
     near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
     return near and abs(float(branch.growth[place] - growth)) < 1e-3 * abs(float(growth))
 

@@ -75,7 +75,7 @@ class Orbit(Result):
     - `stable`: True if small deviations of the loads from this motion decay, that is `multiplier` < 1
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
     - `multipliers`: all Floquet multipliers, complex; those of loads that separate from each other are the last ones
-    - `trivial`: the multiplier that is 1, as computed
+    - `trivial`: computed value of the multiplier of a shift in time, which is exactly 1
     - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m (rad for tilts), `force_harmonics` (nb, K), N: the
       c_k. Loads that have equal parameters have one deviation (G = 1), otherwise each has its own (G = count)
     - `deviation_orders` and `orders`: the k of these harmonics
@@ -422,7 +422,7 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     def halley(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry
         first, second, third = derivatives @ wave.T * side[None]
-        below = -jnp.finfo(second.dtype).tiny  # almost 0; the step then goes uphill in any case
+        below = -jnp.finfo(second.dtype).tiny  # almost 0; the step then always goes uphill
         step = first / jnp.minimum(second - 0.5 * first * third / jnp.minimum(second, below), below)
         theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), starts, starts + width)
         sine, cosine = sine_and_cosine(k[None] * theta[:, None])

@@ -74,9 +74,10 @@ def jam_orbit(
     - `near`: load speed, rad/s or text, from which a motion at the scene's rotor speed is searched for
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-9 (the default; in
       single precision 1e-3). A smaller value costs little, because the error falls exponentially with the number of harmonics
-    - `points`: a fixed number of collocation points (on half a period without gravity, otherwise on a period) in place of an
-      accuracy; typical: 12 to 32. The time grows at least with the square of this number. Under `jit` and `vmap` the values
-      that decide on this number are not known; the default is then 16 (33), and the status shows if it is too small
+    - `points`: a fixed number of collocation points (on half a period without gravity, otherwise on a whole period) in place of
+      an accuracy; typical: 12 to 32. The time grows at least with the square of this number. Under `jit` and `vmap` the values
+      that decide on this number are not known; the default is then 16 on half a period and 33 on a whole period, and the
+      status shows if it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
     **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,

@@ -45,7 +45,7 @@ def newton(
     """Return the root of the equations that `linearize` evaluates at the unknowns, or the best unknowns found.
 
     **Arguments**: `move(unknowns, change, length)`: the unknowns after at most the fraction `length` of a Newton step; `start`
-    of the unknowns; a `change` of zeros; `one` in the precision of the unknowns.
+    of the unknowns; a `change` of zeros; `one`: the number 1 in the precision of the unknowns.
     """
     tiny = 128.0 * jnp.finfo(change.dtype).eps
     no = jnp.asarray(False)

@@ -197,7 +197,7 @@ def plan_synchronous(
     scene = validate_scene(scene)
     require_terms(scene.all_effects, _SYNCHRONOUS_TERMS, "is|are not part of a synchronous motion")
     for k, exciter in enumerate(scene.exciters):
-        _require_one_body(exciter, scene.place_of(k))
+        _require_one_body(exciter, scene.prefix_of(k))
         scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, exciter.drive.settled())
     shaken = [e for e in scene.exciters if e.drive.ideal and e.loads is None]
     motors = [e.drive.speed for e in scene.exciters if not e.drive.ideal and not isinstance(e.drive, SwitchedOff)]

@@ -122,7 +122,7 @@ class _Disturbances(NamedTuple):
 
     **Attributes**: M^-1 K, M^-1 C and M^-1 G as `stiffness`, `damping` and `gyroscopic`; `shift` M^-1 B^T sum_g S_g, `port` B,
     `accelerance` of the port; `share` of each body of loads in the `total` unbalance; `lever` total/I of each;
-    `omega`, `speed` of the loads and the rotor, (P,), and the same (1, 1, P), `w` and `n`.
+    `omega` (P,) of the loads and `speed` (P,) of the rotor; `w` and `n`: the same numbers with the shape (1, 1, P).
     """
 
     model: CoincidentModel

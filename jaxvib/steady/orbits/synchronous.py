@@ -94,13 +94,12 @@ class SynchronousOrbit(PathsOfPoints, Result):
       directions of the force the root of their summed squares
     - `stable`: True if small disturbances decay, that is `multiplier` < 1
     - `multiplier`: largest modulus of the non-trivial Floquet multipliers
-    - `multipliers`: all Floquet multipliers, complex; `trivial`: the multiplier that is 1, as computed, NaN if an ideal drive
-      turns an unbalance, because a shift in time is then not a solution
+    - `multipliers`: all Floquet multipliers, complex; `trivial`: computed value of the multiplier of a shift in time, which is
+      exactly 1; NaN if an ideal drive turns an unbalance, because a shifted motion is then not a solution
     - `residual` of the equations of motion, relative; `error`: estimated relative error of speed and displacements, and error
       of angles in rad, due to the number of harmonics
     - `deviation_harmonics` (bodies, K), rad: alpha_k + psi_k of each load or rotor, `displacement_harmonics` (nd, K), m (rad
-      for rotations), and `force_harmonics` (directions, K), N, of the force on the
-      foundation; orders 0, 1, 2, ...
+      for rotations), and `force_harmonics` (directions, K), N, of the force on the foundation; orders 0, 1, 2, ...
     - `scene`
     """
 
@@ -195,9 +194,9 @@ def synchronous_orbit(
     angles), by Newton's method from the given speed and phases. If this start is far from every motion, another motion may be
     found, or none. The turning body of an exciter is
 
-    - the rotor with its unbalance, without loads. Under a motor, Omega follows from the motors' torques. An ideal drive turns
-      it by th_k = sigma_k n t (phase 0) and gives Omega = n
-    - the loads at one angle on a balanced rotor under an ideal drive: the exciters jam together
+    - the rotor with its unbalance, if the exciter has no loads. Omega follows from the torques of the motors; an ideal drive
+      instead prescribes th_k = sigma_k n t (phase 0) and Omega = n
+    - the loads, all at one angle, if the rotor is balanced and has an ideal drive: the loads of all exciters jam at one speed
 
     **Arguments**: `scene` without effects that release the rotation of loads about their own centres; and
 

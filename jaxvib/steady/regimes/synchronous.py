@@ -64,7 +64,7 @@ _REGIMES_PER_PROGRAM = 16
 class RegimeStatus(eqx.Enumeration):
     """Outcomes of one synchronous regime. The value of each member is the message shown to the user."""
 
-    found = "the rotating masses can turn with one speed in this way"
+    found = "the rotating masses can turn at one speed in this way"
     degenerate = (
         "one of a family: phases can change without a change of torques, so that even the smallest disturbance changes them"
     )

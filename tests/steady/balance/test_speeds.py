@@ -41,7 +41,7 @@ def test_intervals_that_touch_are_one_and_empty_ones_none():
 @pytest.mark.parametrize(
     ("stiffness", "says"),
     [
-        ((1e4, 1e30), "machine.exciter stands on y2, where the stiffness is too high for this"),
+        ((1e4, 1e30), "machine.exciter is attached to y2, where the stiffness is too high for"),
         ((1e30, 1e4), "machine.stiffness is at y1 too high for this precision"),
         ((1e12, 1e4), None),
         ((1e4, 0.0), None),
