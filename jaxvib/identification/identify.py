@@ -182,9 +182,9 @@ def identify(
       pendulum a `Record`
     - `unknown`: names of numbers of the scene or of arrays of them, such as "machine.stiffness"
     - `known`: values of numbers with their standard errors, such as {"machine.mass[1]": "95 kg +- 1 %"}; without an error the
-      value is exact. Numbers that are neither unknown nor here have the values of the scene exactly
-    - `dry`, `instrument`: of a pendulum only. `dry`: True to find mu2 as well. `instrument`: relative uncertainty of J;
-      typical: 0.01 to 0.03 (default 0)
+      value is exact. Numbers that are neither in `unknown` nor in `known` have the values of the scene exactly
+    - `dry`, `instrument`: only for a pendulum. `dry`: True to identify the dry friction mu2 as well. `instrument`: relative
+      uncertainty of J; typical: 0.01 to 0.03 (default 0)
     - `throw`: raise if no fit is found
 
     **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,

@@ -147,7 +147,7 @@ def _direction(direction: str | Sequence[float] | None, where: str) -> tuple[flo
         require_one_of(direction, _DIRECTIONS, field)
         return _DIRECTIONS[direction]
     if len(direction) != 2:
-        raise InputError(field, f"is {quoted(direction)}; write up, down, across, -across or a pair (across, up)")
+        raise InputError(field, f"is {quoted(direction)}; write up, down, across, -across or a pair (horizontal, up)")
     across, up = (float(number(each, "", f"{field}[{k}]")) for k, each in enumerate(direction))
     length = math.hypot(across, up)
     if length == 0.0:

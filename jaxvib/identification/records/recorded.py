@@ -76,7 +76,7 @@ def _between(time: np.ndarray, low: float, high: float, values: np.ndarray) -> n
 
 
 def _find(recorded: Sequence[Recorded], channel: Channel, where: str) -> Recorded:
-    """Return the channel of the file with a name, which may include its unit and have letters of any size."""
+    """Return the channel of the file with a name, which may include its unit; upper and lower case are not distinguished."""
     wanted = channel.name.strip().lower()
     for name_of in (
         lambda each: each.name,

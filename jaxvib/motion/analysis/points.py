@@ -23,7 +23,7 @@ class PointMotion(eqx.Module):
 
     Returned by `Run.point`.
 
-    **Attributes**: `time` (nt,) s; `displacement` (nt, 2) m and `velocity` (nt, 2) m/s, across and up.
+    **Attributes**: `time` (nt,) s; `displacement` (nt, 2) m and `velocity` (nt, 2) m/s, horizontal and up.
     """
 
     time: Array = eqx.field(metadata=in_unit("s", "time"))

@@ -359,10 +359,10 @@ def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[.
     if program is None:
         return on_arrays, args
 
-    def on_numbers(t: Array, y: Array, args: list[Array]) -> Array:
+    def on_scalars(t: Array, y: Array, args: list[Array]) -> Array:
         return jnp.stack(jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
 
-    return on_numbers, scalars_of(args)
+    return on_scalars, scalars_of(args)
 
 
 def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:

@@ -49,11 +49,11 @@ class Audit(Result):
 
     - `accuracy`: the requested relative accuracy
     - `motion`: description of the compared motion
-    - `kind` of the motion of the scene as given, before any effect is taken out or put in; its `omega`, rad/s, `amplitude`
+    - `kind` of the motion of the scene as given, before any effect is removed or added; its `omega`, rad/s, `amplitude`
       (nd,), m (rad for tilts), and `foundation_force`, N; `fold`: the rotor speed at which the jam ends, rad/s
     - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if times were not measured)
     - `effects`, `tiers` and `numbers`: lists of `EffectRow`, `TierRow`, `NumberRow`
-    - `coordinates`: their names
+    - `coordinates`: the names of the coordinates
     """
 
     status: AuditStatus

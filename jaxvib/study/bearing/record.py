@@ -99,7 +99,7 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
 
     - Lines that begin with # and empty lines are skipped
     - The first line may have names, with units in it or in the next line: `time (s), angle (deg)`, `t [ms]`, `ANGLE_DEG`;
-      capital and small letters are equal
+      upper and lower case are not distinguished
     - Columns with the names time and angle (t, phi, theta, ...) without a unit are in s and rad; other columns need a unit
     - If columns are separated by semicolons, tabs or blanks, numbers may have a decimal comma
 
