@@ -128,7 +128,7 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
             else "no jam mode at this speed",
         ]
         if rows:
-            lines.append("stays, no: after a small disturbance the loads (balls, rollers, pendulums) leave")
+            lines.append("stays, no: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
         for mode, each in measures.items():
@@ -223,7 +223,7 @@ def _phases(scene: jv.Scene, output: Output) -> None:
             for jam in jams
         ]
         rotor = speed_text(scene.drive.speed)
-        head = [unit, "", "loads stand", "at, degrees", "foundation force, N"]
+        head = [unit, "", "pattern of the loads", "phases, degrees", "foundation force, N"]
         title = f"light-load jams with unequal phases; rotor {rotor}"
         if not rows:
             return f"no jam at {rotor}"

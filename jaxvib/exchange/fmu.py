@@ -276,7 +276,7 @@ def _variables(scene: Scene, equations: Equations, branches: int, step: float) -
 
 _MODEL = """/* Equations of one scene, written by jaxvib.
 
-   p parameters, t time, x states, u inputs, y outputs; constants are what `prepare` computes of the parameters. */
+   p parameters, t time, x states, u inputs, y outputs; constants are what `prepare` computes from the parameters. */
 
 #define STATES {states}
 #define INPUTS {inputs}

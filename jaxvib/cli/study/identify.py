@@ -42,7 +42,9 @@ def _with_number_options(command: Command) -> Command:
 @click.argument("record", type=click.Path(path_type=Path))
 @_with_number_options
 @click.option("--columns", "record__columns", help="Names of the columns of time and angle, such as 't,phi'.")
-@click.option("--dry/--no-dry", "identify__dry", default=None, help="Identify mu2 of dry friction as well as mu1.")
+@click.option(
+    "--dry/--no-dry", "identify__dry", default=None, help="Identify the dry friction mu2 as well as the viscous friction mu1."
+)
 @shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify numbers of a machine from recorded runs, or the friction of a bearing from a recorded swing.
