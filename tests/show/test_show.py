@@ -152,7 +152,7 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
         (lambda run, orbit: jv.animate(run, end=3.0), "begin selects .* the run keeps 0 to 2 s"),
         (
             lambda run, orbit: jv.animate(run, begin=0.0, seconds=1.0),
-            "end advances the rotor by 0.955 turns",
+            "end turns the rotor by 0.955 turns",
         ),
         (lambda run, orbit: jv.animate(run, seconds=-1.0), "seconds is -1 s; it must be greater than 0"),
         (lambda run, orbit: jv.animate(run, fps=0), "fps is 0; it must be a whole number"),

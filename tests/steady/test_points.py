@@ -188,7 +188,7 @@ def test_run_without_a_trajectory_refuses_its_whole_motion():
 @pytest.mark.parametrize(
     ("amplitude", "speed", "says"),
     [
-        (jnp.ones(3), 100.0, r"^amplitude has the shape \(3,\); give the two amplitudes across and up"),
+        (jnp.ones(3), 100.0, r"^amplitude has the shape \(3,\); give two amplitudes, horizontal and up"),
         (jnp.array([1.0, jnp.nan]), 100.0, r"^amplitude is .*; finite numbers are needed"),
         (jnp.ones(2), jnp.asarray(True), "^speed is "),
     ],
