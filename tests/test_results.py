@@ -104,7 +104,7 @@ def audited():
         EffectRow("gravity", True, "exact orbit", 0.1, 0.2, np.nan, 1e-3, 1e-9, 14, 0.1, 0.2, "needed", ""),
         EffectRow("stop", False, "full", 1e-5, 0.0, 0.0, np.nan, 1e-9, 60, np.nan, np.nan, "negligible", "as given"),
     ]
-    tiers = [TierRow("leading order", False, *[np.nan] * 5, says="refused"), TierRow("full", True, *[1e-3] * 5, says="all")]
+    tiers = [TierRow("leading order", False, *[np.nan] * 5, note="refused"), TierRow("full", True, *[1e-3] * 5, note="all")]
     numbers = [NumberRow("lift: R / (M g)", 2.0, 1.0, "perhaps needed", "springs would have to pull")]
     own = dict(kind="jam mode 1", omega=27.0, amplitude=np.ones(1), foundation_force=9.0, fold=90.0, coordinates=("y1",))
     cost = dict(operations=200, seconds=0.1, compile=2.0, effects=rows, tiers=tiers, numbers=numbers)
