@@ -37,7 +37,10 @@ WRONG = {
         lambda: changed(lambda s: s.loads.mass, 1e18),
         "loads.mass gives 3e+18 kg for all loads on a machine of 215 kg",
     ),
-    "weak drag": (lambda: changed(lambda s: s.loads.drag, 1e-300), "loads.drag changes a load's speed by the fraction 1.0e-302"),
+    "weak drag": (
+        lambda: changed(lambda s: s.loads.drag, 1e-300),
+        "loads.drag changes a load's speed by the fraction 1.0e-302",
+    ),
     "an effect": (
         lambda: changed(lambda s: s.all_effects[0].g, -9.81, scene(effects=(jv.Gravity(),))),
         "effects.gravity.g is -9.81 m/s^2; it must be at least 0",
