@@ -35,7 +35,7 @@ _SPEEDS = 81
 """Number of rotor speeds of a Campbell diagram."""
 
 _PREPARED_COUNTS = 7
-"""How many other numbers of loads are compiled while the page is open."""
+"""Number of counts of loads, other than the present one, for which programs are compiled while the page is open."""
 
 
 class SceneOrProblem(NamedTuple):
