@@ -2,8 +2,8 @@
 
 **Carrier.** Let theta be the loads' mean angle and Omega = theta' their mean rate, phi_j = theta + psi_j, w_j = phi_j'. The
 motion is q = Re(Y e^{i theta}), q' = Re(V e^{i theta}), and the position of a load is Re(R e e^{i phi}) with e = (1, -i) for
-the directions (across, up). The carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'', where M includes the
-loads' masses, become without any approximation
+the directions (horizontal, up). The carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'', where M includes
+the loads' masses, become without any approximation
 
     Y' = V - i Omega Y
     V' = A - i Omega V,     M A = - (C + n G) V - K Y + B^T e sum_j S_j e^{i psi_j} (w_j^2 - i w_j'),     S_j = m_j R_j

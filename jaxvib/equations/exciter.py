@@ -47,7 +47,7 @@ from jaxvib.machine.mount import scaled
 from jaxvib.numerics.linalg import small_inverse
 
 Axes = dict[int, Array]
-"""Vectors (count,) by axis: 0 across, 1 up."""
+"""Vectors (count,) by axis: 0 horizontal, 1 up."""
 
 
 class Motion(NamedTuple):

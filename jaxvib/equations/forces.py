@@ -42,7 +42,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
     - `scene`: supports of the machine and effects that are supports (`CubicSupport`, `Stop`) are included
     - `state` of the scene; typical: displacements of 0.1 to 10 mm
 
-    **Returns** an array, N: one entry (up) for platforms, two (across, up) for rotors.
+    **Returns** an array, N: one entry (up) for platforms, two (horizontal, up) for rotors.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),

@@ -225,4 +225,4 @@ def test_the_path_of_a_rotors_axis(run):
     axis = turned.plot_path().axes[0]
     across, up = axis.lines[0].get_data()
     np.testing.assert_allclose(np.stack([across, up], axis=1), 1e3 * moved[-across.size :])
-    assert axis.get_aspect() == 1.0 and (axis.get_xlabel(), axis.get_ylabel()) == ("across, mm", "up, mm")
+    assert axis.get_aspect() == 1.0 and (axis.get_xlabel(), axis.get_ylabel()) == ("horizontal, mm", "vertical, mm")

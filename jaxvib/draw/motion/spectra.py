@@ -101,17 +101,17 @@ def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes |
     >>> import numpy as np
     >>> t = np.linspace(0.0, 6.0, 50)
     >>> path_chart({"centre": (np.cos(t), np.sin(t))}).axes[0].get_xlabel()
-    'across, mm'
+    'horizontal, mm'
     """
     figure, (axis,) = panels(1, size=(5.0, 4.8), ax=ax)
-    for k, (name, (across, up)) in enumerate(paths.items()):
+    for k, (name, (x, y)) in enumerate(paths.items()):
         color = COLORS[k % len(COLORS)]
-        axis.plot(1e3 * across, 1e3 * up, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)
-        axis.plot(1e3 * across[-1:], 1e3 * up[-1:], "o", color=color, mec="black", zorder=3)
+        axis.plot(1e3 * x, 1e3 * y, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)
+        axis.plot(1e3 * x[-1:], 1e3 * y[-1:], "o", color=color, mec="black", zorder=3)
     axis.plot([], [], "o", color="white", mec="black", label="where it ends")
     axis.plot([0.0], [0.0], "+", color="black", ms=9.0)
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("across, mm")
-    axis.set_ylabel("up, mm")
+    axis.set_xlabel("horizontal, mm")
+    axis.set_ylabel("vertical, mm")
     legend_above(axis, 3)
     return figure if ax is None else ax
