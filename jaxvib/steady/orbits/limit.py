@@ -39,8 +39,11 @@ if TYPE_CHECKING:
 
 __all__ = ["LimitStatus", "SynchronizationLimit", "synchronization_limit"]
 
-_PHASE_STEP = 0.1
+_STEP = 0.1
 """Change of the phase between two points of a branch, rad."""
+
+_SPEED_PER_STEP = 0.1
+"""Relative change of the speed that counts as a phase of 1 rad, if no phase is free."""
 
 _MAX_BRANCH_POINTS = 70
 """Largest number of points of a branch up to its fold; their phases cover more than a full turn."""
@@ -64,7 +67,8 @@ class SynchronizationLimit(Result):
     - `value` (2,) of the parameter `over`, SI; NaN without a fold
     - `speed` (2,), rad/s, and `phases` (2, N), rad, of the motion at each end, see `SynchronousOrbit`
     - `start`: value of the parameter in the scene, SI
-    - `branch_values` and `branch_phases` (P,): value of the parameter over the phase, rad, of one exciter along the branch
+    - `branch_values`, `branch_phases`, rad, and `branch_speeds`, rad/s, (P,): value of the parameter, phase of one exciter and
+      speed along the branch
     """
 
     outer_axes = ("end",)
@@ -76,6 +80,7 @@ class SynchronizationLimit(Result):
     start: np.ndarray = eqx.field(metadata=in_unit(""))
     branch_values: np.ndarray = eqx.field(metadata=in_unit("", "branch_point"))
     branch_phases: np.ndarray = eqx.field(metadata=in_unit("rad", "branch_point"))
+    branch_speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "branch_point"))
     over: str = eqx.field(static=True, metadata=in_unit(""))
 
     def summary(self) -> str:
@@ -85,24 +90,32 @@ class SynchronizationLimit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the parameter over the phase along the branch. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the parameter over the phase, or over the speed of a single motor, along the branch.
+
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
         from jaxvib.draw.results import signals_chart  # slow import
 
         values = [(self.over, np.asarray(self.branch_values)[:, None], [self.over])]
-        return signals_chart(np.rad2deg(np.asarray(self.branch_phases)), values, x_label="phase, degrees", ax=ax)
+        label, along = "phase, degrees", np.rad2deg(np.asarray(self.branch_phases))
+        if np.ptp(along) < 1e-6:
+            label, along = "speed, rad/s", np.asarray(self.branch_speeds)
+        return signals_chart(along, values, x_label=label, ax=ax)
 
 
 @validated
 def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str) -> SynchronizationLimit:
     """Return the range of a parameter of the scene in which a synchronous motion exists; folds of the exact motion limit it.
 
-    Along a branch of motions the parameter is a smooth function of the phase of an exciter; a fold is a maximum or minimum of
-    this function. Each point of the branch is therefore solved for the parameter at a given phase, and the fold is the root of
-    the slope. The equations are not singular at a fold.
+    Along a branch of motions the parameter is a smooth function of the phase of an exciter, or of the speed if only one motor
+    turns; a fold is a maximum or minimum of this function. Each point of the branch is therefore solved for the parameter at a
+    given phase or speed, and the fold is the root of the slope. The equations are not singular at a fold.
+
+    For a single motor, the range is that in which a resonance catches the motor, or in which the motor has passed it.
 
     **Arguments**
 
-    - `scene` with two or more exciters, not all of them turned by ideal drives
+    - `scene`, not all of whose exciters are turned by ideal drives
     - `regime`: a motion with `speed` and `phases`, such as a `SynchronousOrbit` of the scene
     - `over`: name of the parameter, such as "exciters[1].drive.speed", "exciters[0].unbalance"
 
@@ -128,24 +141,29 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
         raise InputError(f"over.{over}", f"has {number.size} entries; name one, for example {over}[0]")
     counts, forced = body_counts(scene), is_forced(scene)
     free = [k for k, count in enumerate(counts) if count][not forced :]
-    if not free:
-        raise InputError("scene", "has no exciter whose phase is free; give two exciters with motors, or with loads")
+    if not free and forced:
+        raise InputError("scene", "has no exciter whose speed or phase is free; give an exciter with a motor, or with loads")
     own = number.path[1] if number.path[0] == "exciters" else None
-    exciter = own if own in free else free[0]
+    exciter = (own if own in free else free[0]) if free else None
     orbit = synchronous_orbit(scene, regime)
     points = 2 * orbit.displacement_harmonics.shape[1] - 1
     value = float(np.ravel(np.asarray(number.leaf(scene)))[number.entry or 0])
-    start = _Point(np.asarray(value), np.asarray(orbit.speed), np.asarray(orbit.phases), np.asarray(0.0), np.asarray(True))
+    unit = float(orbit.speed)
+    near = _Point(*map(np.asarray, (value, orbit.speed, orbit.phases, 0.0, True, 0.0)))
 
-    def at(point: _Point, phase: float) -> _Point:
-        phases = np.array(point.phases)
-        phases[exciter] = phase
-        found = _branch_point(scene, over, point.value, point.speed, phases, exciter, points)
-        return _Point(*map(np.asarray, found))
+    def at(point: _Point, along: float) -> _Point:
+        phases, speed = np.array(point.phases), np.asarray(point.speed)
+        if exciter is None:
+            speed = np.asarray(unit * (1.0 + _SPEED_PER_STEP * along), speed.dtype)
+        else:
+            phases[exciter] = along
+        found = map(np.asarray, _branch_point(scene, over, point.value, speed, phases, exciter, points))
+        new = _Point(*found, along=np.asarray(along))
+        return new if exciter is not None else new._replace(slope=new.slope * unit * _SPEED_PER_STEP)
 
-    first = at(start, float(start.phases[exciter]))
+    first = at(near, 0.0 if exciter is None else float(near.phases[exciter]))
     rising = 1.0 if float(first.slope) > 0.0 else -1.0
-    ends = [_fold(at, first, exciter, towards) for towards in (-rising, rising)]
+    ends = [_fold(at, first, towards) for towards in (-rising, rising)]
     branch = [*reversed(ends[0][1]), first, *ends[1][1]]
     return SynchronizationLimit(
         status=member(LimitStatus, np.array(["not_found" if end is None else "found" for end, _ in ends])),
@@ -154,42 +172,42 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
         phases=np.stack([np.full_like(first.phases, np.nan) if end is None else end.phases for end, _ in ends]),
         start=np.asarray(value),
         branch_values=np.array([float(point.value) for point in branch]),
-        branch_phases=np.array([float(point.phases[exciter]) for point in branch]),
+        branch_phases=np.array([float(point.phases[exciter or 0]) for point in branch]),
+        branch_speeds=np.array([float(point.speed) for point in branch]),
         over=over,
     )
 
 
 class _Point(NamedTuple):
     """Point of a branch: `value` of the parameter, `speed` and `phases` (N,) of the motion; `slope` of the value over the
-    phase; `is_met`: True if the equations are satisfied."""
+    coordinate `along` the branch; `is_met`: True if the equations are satisfied."""
 
     value: np.ndarray
     speed: np.ndarray
     phases: np.ndarray
     slope: np.ndarray
     is_met: np.ndarray
+    along: np.ndarray
 
 
-def _fold(
-    at: Callable[[_Point, float], _Point], first: _Point, exciter: int, towards: float
-) -> tuple[_Point | None, list[_Point]]:
-    """Return the fold in one direction of the phase, or None, and the points of the branch up to it."""
-    points, here, step = [], first, _PHASE_STEP
-    while len(points) < _MAX_BRANCH_POINTS and step > 1e-3 * _PHASE_STEP:
-        new = at(here, float(here.phases[exciter]) + towards * step)
+def _fold(at: Callable[[_Point, float], _Point], first: _Point, towards: float) -> tuple[_Point | None, list[_Point]]:
+    """Return the fold in one direction along the branch, or None, and the points of the branch up to it."""
+    points, here, step = [], first, _STEP
+    while len(points) < _MAX_BRANCH_POINTS and step > 1e-3 * _STEP:
+        new = at(here, float(here.along) + towards * step)
         if not new.is_met:
             step /= 4.0
             continue
         points.append(new)
         if float(new.slope) * float(first.slope) < 0.0:
-            return _refined(at, here, new, exciter), points
+            return _refined(at, here, new), points
         here = new
     return None, points
 
 
-def _refined(at: Callable[[_Point, float], _Point], a: _Point, b: _Point, exciter: int) -> _Point | None:
+def _refined(at: Callable[[_Point, float], _Point], a: _Point, b: _Point) -> _Point | None:
     """Return the point between two others at which the slope is zero, by the Illinois method."""
-    x, y = [float(p.phases[exciter]) for p in (a, b)], [float(p.slope) for p in (a, b)]
+    x, y = [float(p.along) for p in (a, b)], [float(p.slope) for p in (a, b)]
     for _ in range(30):
         middle = x[1] - y[1] * (x[1] - x[0]) / (y[1] - y[0])
         b = at(b, middle)
@@ -212,14 +230,14 @@ def _branch_point(
     value: Array | np.ndarray,
     speed: Array | np.ndarray,
     phases: Array | np.ndarray,
-    exciter: int,
+    exciter: int | None,
     points: int,
 ) -> tuple[Array, ...]:
     """Solve for the motion in which an exciter has its given phase, and for the value of the parameter `over`.
 
-    `points`: number of collocation points on a period.
+    `exciter`: its number; None for the motion that has the given speed. `points`: number of collocation points on a period.
 
-    **Returns** the fields of `_Point`.
+    **Returns** the fields of `_Point` without `along`; `slope` over the phase or the speed.
     """
     value, speed, phases = jnp.asarray(value), jnp.asarray(speed), jnp.asarray(phases)
     number, grid, forced = find_number(scene, over, "over"), grid_of(points, False), is_forced(scene)
@@ -231,17 +249,18 @@ def _branch_point(
 
     start = value / unit
     whole = scene_at(start)
-    x, nd, body = linear_start(whole, grid, speed), whole.coordinates, sum(counts[:exciter])
+    x, nd = linear_start(whole, grid, speed), whole.coordinates
     size, weight = x.size, jnp.minimum(whole.feedback, 1.0)
     pin = np.zeros(x.shape)
-    pin[nd + body] = 1.0 / grid.theta.size
+    if exciter is not None:
+        pin[nd + sum(counts[:exciter])] = 1.0 / grid.theta.size
 
     def equations(x: Array, w: Array, share: Array) -> tuple[Array, Array, Array]:
         found = collocation(scene_at(share), grid, x, w, forced=forced)
         by_value = jax.jvp(lambda s: residual_of(scene_at(s), grid, x, w), (share,), (jnp.ones_like(share),))[1]
         rest = found.matrix.shape[0] - size
         column = jnp.concatenate([by_value.ravel(), jnp.zeros(rest)])[:, None]
-        row = jnp.asarray(np.concatenate([pin.ravel(), np.zeros(rest + 1)]))[None]
+        row = jnp.asarray(np.concatenate([pin.ravel(), [0.0 if exciter is not None else 1.0] * rest, [0.0]]))[None]
         matrix = jnp.concatenate([jnp.concatenate([found.matrix, column], axis=1), row])
         return found.residual, found.scale, matrix
 

@@ -340,9 +340,9 @@ def test_motion_near_a_fold_says_so(general, orbit):
     assert found.status_name in ("at_fold", "under_resolved") and not bool(found.error < 1e-9)
 
 
-def test_limit_needs_a_number_and_a_free_phase(general, orbit):
+def test_limit_needs_a_number_and_a_free_motion(general, orbit):
     with pytest.raises(jv.InputError, match="is not a parameter of this scene"):
         jv.synchronization_limit(general, orbit, over="exciters[1].drive.torque")
-    with pytest.raises(jv.InputError, match="has no exciter whose phase is free"):
+    with pytest.raises(jv.InputError, match="has no exciter whose speed or phase is free"):
         ideal = symmetric([(0.0, 0.0)] * 2, directions=(1, -1), drive=jv.ConstantSpeed(100.0))
         jv.synchronization_limit(ideal, jv.synchronous_orbit(ideal, points=17), over="exciters[1].unbalance")
