@@ -51,7 +51,7 @@ from jaxvib.machine.scene import Exciter, Scene, unbalance
 # The equations
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.state import ExciterState, Spin, State
-from jaxvib.equations.forces import energy, foundation_force, normal_force, power
+from jaxvib.equations.forces import energy, foundation_force, foundation_moment, normal_force, power
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.motion.start import initial_state, with_spin
 
@@ -240,6 +240,7 @@ __all__ = [
     "energy",
     "power",
     "foundation_force",
+    "foundation_moment",
     "normal_force",
     # Measures of a vibration
     "vibration_measures",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -31,6 +31,7 @@ from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached
+from jaxvib.units import Number, numbers
 
 
 @validated
@@ -54,6 +55,36 @@ def foundation_force(scene: Scene, state: State) -> Array:
     Source: the antiphase paper, equation (7).
     """
     return assemble(validate_scene(scene)).foundation_force(state.displacement, state.velocity)
+
+
+@validated
+def foundation_moment(scene: Scene, state: State, about: Sequence[Number] = (0.0, 0.0)) -> Array:
+    """Return the moment of all supports on the foundation about a fixed point, gravity excluded, N m, anticlockwise.
+
+        M = sum_i (r_i - p) x (k_i u_i + c_i u_i')
+
+    **Arguments**
+
+    - `scene`, whose machine is a body in a plane, or several of which one stands on the foundation
+    - `state` of the scene
+    - `about` p (2,), m, measured from the position of this body's centre of mass at rest (the default); typical: the middle of
+      the foundation
+
+    **Returns** a number, N m. **Raises** `InputError` for another machine.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> springs = [jv.support(at=(x, 0.0), stiffness=(1e5, 2e5), damping=(500.0, 900.0)) for x in (-0.5, 1.0)]
+    >>> motor = jv.DCMotor(100.0, stall_torque=60.0, inertia=0.05)
+    >>> screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    >>> scene = jv.Scene(screen, exciters=[jv.Exciter(drive=motor, unbalance=0.4)])
+    >>> state = jv.State(jnp.array([0.0, 1e-3, 0.0]), jnp.zeros(3), exciters=[jv.ExciterState(rotor=(0.0, 0.0))])
+    >>> float(jv.foundation_moment(scene, state)), float(jv.foundation_moment(scene, state, about=(0.25, 0.0)))
+    (100.0, 0.0)
+
+    Source: equilibrium of the foundation.
+    """
+    rows = validate_scene(scene).machine.moment_rows(numbers(about, "m", "about", 2))
+    return rows[0] @ state.displacement + rows[1] @ state.velocity
 
 
 @validated

@@ -147,6 +147,16 @@ class Machine(Part):
             raise InputError(name, problem)
         return self.mount().rows[0]
 
+    def moment_rows(self, about: Array) -> Array:
+        """Return the rows (2, nd) of the moment of all supports on the foundation, anticlockwise: N m per q and per q'.
+
+        **Arguments**: `about` (2,), m: the point fixed in the foundation to which the moment refers.
+
+        **Raises** `InputError` for a machine other than a body in a plane.
+        """
+        problem = f"is of kind {quoted(self.kind)}; the moment on the foundation is defined for bodies in a plane"
+        raise InputError("machine", problem)
+
     @property
     def body_count(self) -> int:
         """Number of bodies on which a point is given by (x, y)."""

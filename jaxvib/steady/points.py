@@ -257,6 +257,16 @@ class PathsOfPoints(eqx.Module):
         motion = self.harmonic()
         return _deck(motion, places, known_number(slope, "rad", "slope"), motion.machine.require_body(body))
 
+    @validated
+    def foundation_moment(self, about: Sequence[Number] = (0.0, 0.0)) -> Array:
+        """Return the amplitude of the moment of the supports on the foundation at the speed of the exciters, N m, zero to peak.
+
+        **Arguments**: `about`: the fixed point to which the moment refers, see `jaxvib.foundation_moment`.
+
+        **Raises** `InputError` for a machine that is not a body in a plane.
+        """
+        return _moment(self.harmonic(), numbers(about, "m", "about", 2))
+
 
 def rows_in_plane(machine: Machine, place: Place, name: str = "at") -> Array:
     """Return the rows (2, nd) of a point, horizontal and up. If a machine only moves up, the first row is 0."""
@@ -267,6 +277,12 @@ def rows_in_plane(machine: Machine, place: Place, name: str = "at") -> Array:
 @cached
 def _ellipse(motion: Harmonic, place: Place, slope: Array) -> Ellipse:
     return _at_rows(motion, rows_in_plane(motion.machine, place), slope)[1]
+
+
+@cached
+def _moment(motion: Harmonic, about: Array) -> Array:
+    rows = motion.machine.moment_rows(about)
+    return magnitude((rows[0] + 1j * motion.speed * rows[1]) @ motion.amplitude)
 
 
 @cached

@@ -134,13 +134,9 @@ class _Bodies(Machine):
         force = {"stiffness": zero[:2], "damping": zero[:2]}
         matrix = {"stiffness": zero, "damping": zero}
         for each in self.supports:
-            rows = self._point_rows(each.at, each.body)
-            if each.to is not None and each.at_other is not None:
-                rows = rows - self._point_rows(each.at_other, each.to)
-            turn = jnp.stack([jnp.cos(each.angle), jnp.sin(each.angle)])
-            along = jnp.stack([turn, jnp.stack([-turn[1], turn[0]])])
+            rows, along = self._support_rows(each)
             for name in matrix:
-                at_point = (along.T * getattr(each, name)[None]) @ along @ rows
+                at_point = _force_rows(each, rows, along, name)
                 if each.to is None:
                     force[name] = force[name] + at_point
                 matrix[name] = matrix[name] + rows.T @ at_point
@@ -173,12 +169,44 @@ class _Bodies(Machine):
             raise InputError(name, f"is {quoted(point)}; on a body in a plane give (x, y), m from its centre of mass")
         return self._point_rows(jnp.asarray(point, dtype), body)
 
+    def moment_rows(self, about: Array) -> Array:
+        """Return the rows (2, nd), see `Machine.moment_rows`.
+
+        **Raises** `InputError` if several bodies stand on the foundation: their distances are not known.
+        """
+        on_foundation = [each for each in self.supports if each.to is None]
+        bodies = sorted({each.body for each in on_foundation})
+        if len(bodies) != 1:
+            standing = " and ".join(map(str, bodies)) if bodies else "none"
+            problem = f"has bodies on the foundation: {standing}; the moment needs one, because it refers to its centre of mass"
+            raise InputError("machine.supports", problem)
+        found = [jnp.zeros(3 * self.body_count, about.dtype)] * 2
+        for each in on_foundation:
+            lever = jnp.stack([about[1] - each.at[1], each.at[0] - about[0]])
+            rows, along = self._support_rows(each)
+            names = ("stiffness", "damping")
+            found = [row + lever @ _force_rows(each, rows, along, name) for row, name in zip(found, names, strict=True)]
+        return jnp.stack(found)
+
+    def _support_rows(self, each: PlaneSupport) -> tuple[Array, Array]:
+        """Return the rows (2, nd) of the motion of a support, and the directions (2, 2) of its springs."""
+        rows = self._point_rows(each.at, each.body)
+        if each.to is not None and each.at_other is not None:
+            rows = rows - self._point_rows(each.at_other, each.to)
+        turn = jnp.stack([jnp.cos(each.angle), jnp.sin(each.angle)])
+        return rows, jnp.stack([turn, jnp.stack([-turn[1], turn[0]])])
+
     def _point_rows(self, at: Array, body: int) -> Array:
         """Return the rows (2, nd) of the point `at` of a body."""
         lever = jnp.stack([-at[1], at[0]])
         own = jnp.concatenate([jnp.eye(2, dtype=at.dtype), lever[:, None]], axis=1)
         before, after = 3 * body, 3 * (self.body_count - body - 1)
         return own if before + after == 0 else jnp.pad(own, ((0, 0), (before, after)))
+
+
+def _force_rows(each: PlaneSupport, rows: Array, along: Array, name: str) -> Array:
+    """Return the rows (2, nd) of the force of a support due to its "stiffness" or "damping"."""
+    return (along.T * getattr(each, name)[None]) @ along @ rows
 
 
 class PlaneBody(_Bodies):

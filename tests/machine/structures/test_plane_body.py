@@ -157,6 +157,68 @@ def test_foundation_force_balances_the_springs_and_dampers():
     np.testing.assert_allclose(found, (jax.grad(stored)(q) + jax.grad(dissipated)(v))[:2], rtol=1e-12)
 
 
+@pytest.mark.parametrize("kind", range(4))
+def test_foundation_moment_balances_the_moments_of_inertia(kind):
+    """d'Alembert: the moments of all accelerated masses about any point, and that on the foundation, have the sum 0."""
+    scene, about = scene_of(3, kind, effects=()), np.array([0.7, -0.4])
+    state = state_of(scene, 1)
+    change = jax.jit(lambda s: jv.vector_field(scene)(T, s))(state)
+    cross = lambda a, b: a[0] * b[1] - a[1] * b[0]  # noqa: E731
+    x, y, psi = np.asarray(change.velocity)
+    total = 60.0 * psi + cross(-about, 200.0 * np.array([x, y]))
+    for exciter, own, rates in zip(scene.exciters, state.exciters, change.exciters, strict=True):
+        at, time = np.asarray(exciter.at), jnp.asarray(T)
+        axis = np.array([x - at[1] * psi, y + at[0] * psi])
+        drive = exciter.turning_drive
+        turning = []
+        if exciter.unbalance is not None:
+            inertia, change_of_speed = (0.0, drive.rotor_acceleration(time)) if own.rotor is None else (1.0, rates.rotor[1])
+            inertia *= float(getattr(exciter.drive, "inertia", 0.0))
+            angle, speed = drive.rotor_angle(time, own.rotor), drive.rotor_speed(time, own.rotor)
+            turning.append((exciter.unbalance, inertia, 0.0, angle, speed, change_of_speed))
+        elif own.rotor is not None:
+            total += float(exciter.drive.inertia) * float(rates.rotor[1])
+        if exciter.loads is not None:
+            m, r = float(exciter.loads.mass), float(exciter.loads.radius)
+            of_loads = zip(own.angle[0], own.rate[0], rates.rate[0], strict=True)
+            turning += [(m * r, 1.4 * m * r**2, m, *map(float, each)) for each in of_loads]
+        for s, inertia, mass, angle, speed, change_of_speed in turning:
+            out, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+            total += inertia * change_of_speed + s * cross(out, axis)
+            total += cross(at - about, mass * axis + s * (change_of_speed * along - speed**2 * out))
+    found = float(jv.foundation_moment(scene, state, about=tuple(about)))
+    np.testing.assert_allclose(found, -float(total), rtol=1e-11)
+
+
+def test_foundation_moment_is_equal_in_all_tiers():
+    springs = [jv.support(at=(x, -0.2), stiffness=(2e4, 3e4), damping=(300.0, 300.0), angle=0.3) for x in (-0.8, 0.7)]
+    body = jv.plane_body(mass=200.0, inertia=60.0, supports=springs)
+    motors = [jv.DCMotor(n, stall_torque=40.0, inertia=0.12) for n in (100.0, 100.2)]
+    parts = zip(motors, PLACES, (1, -1), strict=False)
+    scene = jv.Scene(body, exciters=[jv.Exciter(drive=d, unbalance=0.05, at=at, direction=way) for d, at, way in parts])
+    regime = jv.synchronous_regimes(scene).select(0)
+    assert bool(regime.stable)
+    orbit = jv.synchronous_orbit(scene, regime)
+    runs = [tier(scene, 40.0, save="window") for tier in (jv.simulate, jv.envelope)]
+    states = jax.vmap(orbit.at)(2.0 * jnp.pi * jnp.arange(64) / 64.0)
+    moments = jax.vmap(lambda state: jv.foundation_moment(scene, state, about=(0.2, 0.1)))(states)
+    expected = float(jnp.ptp(moments)) / 2.0
+    for result in (regime, orbit, *runs):
+        np.testing.assert_allclose(result.foundation_moment(about=(0.2, 0.1)), expected, rtol=1e-2)
+
+
+def test_foundation_moment_of_other_machines_is_refused():
+    exciter = jv.Exciter(drive=DRIVES[0], unbalance=0.05)
+    with pytest.raises(jv.InputError, match="defined for bodies in a plane"):
+        scene = jv.Scene(ROTOR, exciters=[exciter])
+        jv.foundation_moment(scene, jv.initial_state(scene))
+    pair = [jv.support(at=(0.0, 0.0), stiffness=(1e5, 1e5), damping=(1e3, 1e3), body=k) for k in (0, 1)]
+    network = jv.plane_network([jv.body(mass=100.0, inertia=20.0)] * 2, pair)
+    scene = jv.Scene(network, exciters=[exciter])
+    with pytest.raises(jv.InputError, match="bodies on the foundation: 0 and 1"):
+        jv.foundation_moment(scene, jv.initial_state(scene))
+
+
 def test_scene_file_round_trip_is_bit_for_bit():
     scene = scene_of(3)
     assert eqx.tree_equal(jv.scene_from_toml(jv.scene_to_toml(scene)), scene)
