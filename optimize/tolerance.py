@@ -94,7 +94,7 @@ def tolerance_ranges(
     machines = list(_machines(scene, tolerances, samples, seed))
     found = []
     for each in quantities:
-        quantity = (each.quantity if isinstance(each, Demand) else each).easy
+        quantity = (each.quantity if isinstance(each, Demand) else each).simplified
         values = np.array([float(quantity(machine)) for machine in machines])
         there = values[np.isfinite(values)]
         kept = np.isfinite(values)

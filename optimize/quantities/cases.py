@@ -150,8 +150,8 @@ class Robust(_OfPart):
         return values
 
     @property
-    def easy(self) -> Quantity:
-        return self.parts[0].easy
+    def simplified(self) -> Quantity:
+        return self.parts[0].simplified
 
 
 @validated

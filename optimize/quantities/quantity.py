@@ -110,12 +110,12 @@ class Quantity:
         return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts)) if self.parts else self
 
     @property
-    def easy(self) -> Quantity:
+    def simplified(self) -> Quantity:
         """Leading-order quantity of the machine with its nominal parameters, for a first search.
 
         The first search is faster, and its best machines are near the final ones.
         """
-        return replace(self, parts=tuple(part.easy for part in self.parts)) if self.parts else self
+        return replace(self, parts=tuple(part.simplified for part in self.parts)) if self.parts else self
 
     def named(self, name: str) -> Quantity:
         """Return the same quantity under another `name`."""
@@ -204,7 +204,7 @@ class BuiltinQuantity(Quantity):
         return replace(self, tier=tier) if tier in self.tiers else self
 
     @property
-    def easy(self) -> Quantity:
+    def simplified(self) -> Quantity:
         return self.at_tier("leading")
 
     def named(self, name: str) -> Quantity:

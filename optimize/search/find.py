@@ -87,10 +87,10 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
     If quantities are expensive (exact motions, integrations, tolerances), a first search uses leading order without tolerances.
     A second search starts from the best distinct machines of the first, and from random ones if tolerances are considered.
     """
-    easy = None if options.begin is not None else problem.easy()
-    if easy is None:
+    simplified = None if options.begin is not None else problem.simplified()
+    if simplified is None:
         return _find(problem, options, report)
-    first = _find(easy, options, lambda what, share: report(what, 0.5 * share))
+    first = _find(simplified, options, lambda what, share: report(what, 0.5 * share))
     if first is None:
         return _find(problem, options, report)
     if first.interrupted:

@@ -84,21 +84,21 @@ class Problem(eqx.Module):
         excess = [demand.excess(evaluation, limit) for demand, limit in zip(self.demands, self.constants, strict=True)]
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
-    def easy(self) -> Problem | None:
+    def simplified(self) -> Problem | None:
         """Return the problem of the first search: leading-order quantities of the machine with its nominal parameters.
 
         Demands on quantities without a leading order are omitted. None if it is the same problem, or if the objective has no
         leading order.
         """
-        objective = self.objective.easy
-        demands = [replace(d, quantity=d.quantity.easy, limit=d.limit.easy) for d in self.demands]
-        held = tuple(HeldQuantity(h.quantity.easy, h.value) for h in self.space.held)
+        objective = self.objective.simplified
+        demands = [replace(d, quantity=d.quantity.simplified, limit=d.limit.simplified) for d in self.demands]
+        held = tuple(HeldQuantity(h.quantity.simplified, h.value) for h in self.space.held)
         same = objective == self.objective and demands == list(self.demands)
         if same and all(a.quantity == b.quantity for a, b in zip(held, self.space.held, strict=True)):
             return None
-        if _hard(objective) or any(_hard(h.quantity) for h in held):
+        if _needs_other_tier(objective) or any(_needs_other_tier(h.quantity) for h in held):
             return None
-        kept = [k for k, d in enumerate(demands) if not (_hard(d.quantity) or _hard(d.limit))]
+        kept = [k for k, d in enumerate(demands) if not (_needs_other_tier(d.quantity) or _needs_other_tier(d.limit))]
         space = eqx.tree_at(lambda s: s.held, self.space, held)
         forms, index = tuple(demands[k] for k in kept), np.asarray(kept, int)
         keys, parts = _keys_and_parts(space, objective, forms)
@@ -117,7 +117,7 @@ def _keys_and_parts(space: DesignSpace, objective: Quantity, demands: Sequence[D
     return _targets((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
 
 
-def _hard(quantity: Quantity) -> bool:
+def _needs_other_tier(quantity: Quantity) -> bool:
     """Return True if part of the quantity is not computed to leading order."""
     return any(isinstance(q, BuiltinQuantity) and q.tier != "leading" for q in walk(quantity))
 

@@ -323,7 +323,7 @@ def _status(met: Array, separates: Array, flat: Array, resolved: Array, accurate
     return OrbitStatus.where(met, known, OrbitStatus.not_converged)
 
 
-def numbers_of(
+def differentiable_fields(
     model: CoincidentModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
     """Return fields of one orbit from its known motion, with derivatives. They are equal to those of `orbits` for the same

@@ -23,7 +23,7 @@ from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.jams.jam import jams_of
-from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, numbers_of, orbits
+from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, differentiable_fields, orbits
 from jaxvib.steady.orbits.plan import OrbitPlan, plan_orbit
 from jaxvib.steady.orbits.search import exact_mode_speeds
 from jaxvib.steady.orbits.solve import Parameter, periodic_motion
@@ -165,7 +165,9 @@ def _outputs(
 ) -> Orbit:
     """Return the outputs that follow from the solved motion, without multipliers and errors."""
     empty = jax.tree.map(lambda _: None, orbit)
-    return dataclasses.replace(empty, **numbers_of(coincident_model(jammed_model(scene)), orbit, value, start, given, points))
+    return dataclasses.replace(
+        empty, **differentiable_fields(coincident_model(jammed_model(scene)), orbit, value, start, given, points)
+    )
 
 
 @cached(outputs_from_solution=_outputs)

@@ -273,15 +273,15 @@ _balance_of = cached(assemble_torque_balance)
 
 @cached
 def _regimes_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
-    return jax.vmap(lambda w, a: _numbers_near(scene, w, a))(omega, phases)
+    return jax.vmap(lambda w, a: _fields_near(scene, w, a))(omega, phases)
 
 
 @cached
 def _regime_near(scene: Scene, omega: Array, phases: Array) -> SynchronousRegime:
-    return SynchronousRegime(**_numbers_near(scene, omega, phases), scene=scene)
+    return SynchronousRegime(**_fields_near(scene, omega, phases), scene=scene)
 
 
-def _numbers_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
+def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     """Return the fields of the regime to which a start leads, without the scene."""
     balance = assemble_torque_balance(scene)
     frozen = jax.lax.stop_gradient(balance)

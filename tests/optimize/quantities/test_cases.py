@@ -49,7 +49,7 @@ def test_statistics_are_those_of_the_samples():
         one = quantity.pieces(Evaluation(SCENE))
         np.testing.assert_allclose(one, values if quantity.statistic == "worst" else [awaited], rtol=1e-12)
     of_two = worst(largest(FIRST, 1.01 * FIRST), {"machine.stiffness": 0.1}, samples=3)
-    assert of_two.pieces(Evaluation(SCENE)).shape == (6,) and of_two.easy == largest(FIRST, 1.01 * FIRST)
+    assert of_two.pieces(Evaluation(SCENE)).shape == (6,) and of_two.simplified == largest(FIRST, 1.01 * FIRST)
 
 
 def test_a_case_is_a_quantity_of_another_scene():
@@ -58,8 +58,8 @@ def test_a_case_is_a_quantity_of_another_scene():
     pieces = under(largest(FIRST, BOTH / "1 N/m"), "stiff", {"machine.stiffness[0]": 7e4}).pieces(Evaluation(SCENE))
     np.testing.assert_allclose(pieces, [7e4, 7e4 * 2e5])
     timed = under(jam_frequency(mode=3, tier="exact"), "x", {"drive.speed": 130.0})
-    assert timed.easy.parts == (jam_frequency(mode=3),) and timed.easy.case == timed.case
-    assert timed.easy.at_tier("exact") == timed
+    assert timed.simplified.parts == (jam_frequency(mode=3),) and timed.simplified.case == timed.case
+    assert timed.simplified.at_tier("exact") == timed
 
 
 @pytest.mark.parametrize(

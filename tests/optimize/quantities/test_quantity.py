@@ -119,10 +119,10 @@ def test_what_asks_knows_its_tiers():
     assert BuiltinQuantity("a_b", "", function, text="said so").words == "said so"
     exact = both.at_tier("exact")
     np.testing.assert_array_equal(exact.pieces(Evaluation(SCENE), -1.0), [-120.0])
-    assert asked == [("exact", (1, 2))] and exact.easy == both and not exact.forward_only
+    assert asked == [("exact", (1, 2))] and exact.simplified == both and not exact.forward_only
     timed = BuiltinQuantity("t", "", function, tier="time")
     assert timed.forward_only and (A + timed).forward_only and (timed * A).forward_only and not (A + both).forward_only
-    assert (A + exact).easy.parts == (A, both) and (A + both).at_tier("exact").parts == (A, exact)
+    assert (A + exact).simplified.parts == (A, both) and (A + both).at_tier("exact").parts == (A, exact)
     assert len(asked) == 1
     parted = BuiltinQuantity(
         "p", "", function, settings=(7,), pieces_function=lambda evaluation, sign, tier, seven: sign * jnp.array([1.0, seven])

@@ -157,16 +157,16 @@ def test_first_search_uses_leading_order_and_no_tolerances():
     force, off = foundation_force(mode=3), {"machine.stiffness": 0.05}
     demands = [TIMED < 3.0, EXACT < 5.0, FIRST < 4.0]
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(EXACT, 7.0)]), expected(force, off, samples=4), demands, 8)
-    first = problem.easy()
+    first = problem.simplified()
     assert first.objective == force and first.batch_size == problem.batch_size == 8
     assert [(held.quantity, float(held.value)) for held in first.space.held] == [(LEADING, 7.0)]
     assert [d.quantity for d in first.demands] == [LEADING, FIRST]  # what is had in time alone is left out
     np.testing.assert_array_equal(first.constants, [5.0, 4.0])
     np.testing.assert_array_equal(first.scales, [5.0, 4.0])
-    assert len(problem.keys) == len(first.keys) == 1 and first.easy() is None
+    assert len(problem.keys) == len(first.keys) == 1 and first.simplified() is None
     assert problem.forward_only and not first.forward_only
     tolerant = problem_of(DesignSpace(SCENE, FREE), largest(FIRST, 2.0 * expected(FIRST, off, samples=4)), [])
-    assert tolerant.parts == tolerant.easy().parts == 2
+    assert tolerant.parts == tolerant.simplified().parts == 2
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_first_search_uses_leading_order_and_no_tolerances():
 )
 def test_some_searches_come_first(objective, held, demands, first):
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(each, 3.0) for each in held]), objective, demands)
-    assert (problem.easy() is not None) == first
+    assert (problem.simplified() is not None) == first
     assert problem.forward_only == (objective is TIMED or TIMED in held)
 
 
