@@ -5,8 +5,9 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.runtime.cache import use_cache
 from jaxvib.runtime.cpu import prepare_cpu
 
-# Units of texts and figures
+# Units of texts and figures, tables from files
 from jaxvib.display import display_units
+from jaxvib.units.tables import csv_column
 
 # Machines
 from jaxvib.machine.carrier import Carrier, Machine
@@ -18,6 +19,7 @@ from jaxvib.machine.structures.platforms import network, one_mass, three_mass, t
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
 
 # Loads
+from jaxvib.machine.drag import drag_of
 from jaxvib.machine.loads import Loads, balls, pendulums, rollers
 from jaxvib.machine.torus import torus_balls
 
@@ -166,6 +168,7 @@ __all__ = [
     "ComputationError",
     "prepare_cpu",
     "display_units",
+    "csv_column",
     "use_cache",
     # Machines
     "Machine",
@@ -184,6 +187,7 @@ __all__ = [
     "planar_rotor",
     "Dimensionless",
     # Loads
+    "drag_of",
     "Loads",
     "balls",
     "rollers",

@@ -10,7 +10,10 @@ from typing import Any
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import Tables, build_part, load_scene, misplaced_name, read_toml, suggest_name
+from jaxvib.machine.numbers.named import find_number
+from jaxvib.machine.scene import Scene
 from jaxvib.units import count, number
+from jaxvib.units.tables import csv_column
 from optimize.quantities import jams, machine, motion, severity
 from optimize.quantities.cases import expected, worst
 from optimize.quantities.quantity import Demand, Quantity
@@ -55,7 +58,8 @@ def load_design(path: str | Path) -> Design:
     - `scene`: the scene file, relative to the design file
     - `[free]`: bounds for each parameter that may change
     - `[ties]`: parameters that follow others
-    - `[choices]`: parameters whose values are chosen from a list, such as a catalogue
+    - `[choices]`: parameters whose values are chosen from a list, or from a catalogue: `file`, a CSV file relative to the
+      design file, and the name of its `column`
     - every `[[hold]]`: a quantity and the value that it keeps; default: its value in the scene
     - every `[[demand]]`: a quantity that is `at_most` or `at_least` a value
     - `[objective]`: the quantity to minimize, or to maximize with `maximize = true`
@@ -95,6 +99,7 @@ def load_design(path: str | Path) -> Design:
     held = [hold(q, more.get("value")) for q, more in values]
     ties = {name: tuple(v) if isinstance(v, list) else v for name, v in tables.get("ties", {}).items()}
     free, choices = dict(tables.get("free", {})), dict(tables.get("choices", {}))
+    choices = {name: _from_catalogue(scene, name, values, Path(path).parent) for name, values in choices.items()}
     space = DesignSpace(scene, free, held, ties=ties, choices=choices)
     demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
     objective, more = quantity_from_table(tables["objective"], "objective", ("maximize",))
@@ -117,6 +122,18 @@ def load_design(path: str | Path) -> Design:
             continue
         count(value, f"search.{name}", low=0 if name in ("seed", "polishing") else 1)
     return Design(space, objective, search, demands)
+
+
+def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
+    """Return the values of a choice; a table with `file`, and `column` if necessary, is a column of a CSV file."""
+    if not isinstance(values, Mapping):
+        return values
+    if not isinstance(values.get("file"), str) or values.keys() - {"file", "column"}:
+        raise InputError(
+            f"choices.{name}", f"is {quoted(dict(values))}; write a list, or file = 'springs.csv', column = 'rate'"
+        )
+    unit = find_number(scene, name, "choices").unit
+    return csv_column(folder / values["file"], unit, values.get("column")).tolist()
 
 
 def _demands(table: object, section: str) -> list[Demand]:
@@ -182,6 +199,7 @@ quantity = "support_frequency_squared"   # sum of k/M over the supports: total s
 
 # [choices]                       # allowed values, such as springs of a catalogue, or numbers of loads
 # "machine.stiffness[0]" = ["20 N/mm", "25 N/mm", "32 N/mm"]
+# "machine.stiffness[1]" = { file = "springs.csv", column = "rate" }    # head of the column: rate (N/mm)
 # "loads.count" = [2, 3, 4]
 
 [objective]

@@ -17,6 +17,7 @@ from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.motion.run import Run
 from jaxvib.results.fields import Plain, in_unit, plain
 from jaxvib.results.result import Result
+from jaxvib.units import unit_ratio
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,6 +30,9 @@ _MAX_SHOWN_PERCENT = 1000.0
 
 _MAX_LINEAR_PERCENT = 10.0
 """Largest change of the objective, per cent, for which a prediction from its slope is shown."""
+
+_EQUAL_VALUE = 1e-4
+"""Relative difference of the objectives of two machines below which they count as equally good."""
 
 _MIN_LIMIT_CHANGE = 1e-6
 """Smallest change of a limit, per cent, that is shown."""
@@ -95,6 +99,7 @@ class Limit(NamedTuple):
       (held quantities: an increase)
     - `gain`: change of the objective, per cent, if the limit is relaxed by 1 %, predicted from this derivative; negative for an
       improvement. A prediction of more than a few per cent is not reliable
+    - `written`: unit of a limit that was written as text, "" for the display unit
     """
 
     what: str
@@ -105,13 +110,21 @@ class Limit(NamedTuple):
     active: bool
     multiplier: float
     gain: float
+    written: str = ""
+
+    def value_text(self) -> str:
+        """Return the value in the unit of the limit as text."""
+        factor = unit_ratio(self.unit, self.written) if self.written else None
+        if factor is not None:
+            return f"{self.value * factor:.5g} {self.written}"
+        unit, factor = shown_unit(self.unit, max(abs(self.value), abs(self.limit)))
+        return f"{self.value * factor:.5g} {unit}".rstrip()
 
     def shortfall(self) -> str:
         """Return the distance of the machine from a violated limit as text."""
         if not math.isfinite(self.violation):
             return "the nearest machine does not have this quantity"
-        unit, factor = shown_unit(self.unit, max(abs(self.value), abs(self.limit)))
-        return f"at best {f'{self.value * factor:.5g} {unit}'.rstrip()}, {100.0 * self.violation:.3g} % off"
+        return f"at best {self.value_text()}, {100.0 * self.violation:.3g} % off"
 
 
 class Influence(NamedTuple):
@@ -210,8 +223,7 @@ class Synthesis(Result):
             return " / ".join(f"{each * factor:+.3g} {unit}".rstrip() for each in changes)
 
         for limit in self.limits:
-            unit, factor = shown_unit(limit.unit, max(abs(limit.value), abs(limit.limit)))
-            values = f"{limit.value * factor:.5g} {unit}".rstrip()
+            values = limit.value_text()
             if limit.violation > 0.0:
                 lines.append(f"  not met: {limit.what}; {limit.shortfall()}")
             elif limit.active:
@@ -221,7 +233,14 @@ class Synthesis(Result):
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for each in ranked[:5]:
             lines.append(f"  1 % less / more {each.what}: {changed(each.less, each.more)}")
-        if len(self.machines) > 1:
+        equal = [m for m in self.machines if abs(m.value - best) <= _EQUAL_VALUE * abs(best)]
+        if len(equal) > 1 and len(equal) == len(self.machines):
+            unit, factor = shown_unit(self.unit, abs(best))
+            value = f"{best * factor:.4g} {unit}".rstrip()
+            lines.append(
+                f"  {len(equal)} different machines are equally good ({value}): the objective does not decide between them"
+            )
+        elif len(self.machines) > 1:
             counts = ", ".join(f"{m.starts} x {m.value:.4g}" for m in self.machines[:6])
             lines.append(f"  {len(self.machines)} different machines: {counts} {self.unit}".rstrip())
         return lines

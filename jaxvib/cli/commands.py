@@ -11,7 +11,7 @@ import click
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, loaded_scene, shared
 from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
-from jaxvib.cli.output import CSV
+from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
 _START_HELP = "Initial state: rest (machine at rest, drive at its speed), jam (with --mode), or spin_up (smooth, from rest)."
@@ -61,7 +61,7 @@ def new(kind: str, output: Output) -> None:
 @click.option("--accuracy", type=float, help="Allowed error of the final state, in place of a tolerance.")
 @click.option("--max-steps", type=int, help="Largest number of time steps.")
 @click.option("--window", is_flag=True, help="Save only the measurements over the last turns, and no trajectory.")
-@CSV
+@csv_options
 @shared
 def simulate(
     scene: Path,

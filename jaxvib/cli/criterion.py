@@ -50,7 +50,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
         pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
         figure, (axis,) = panels(1)
-        criterion_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
+        criterion_chart(axis, speeds, np.asarray(pull), document["balancing"], exact, float(loaded.drive.speed))
         return figure
 
     output.picture("criterion.png", figure)

@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED, TOLERANCE, WITHOUT, Output, app, loaded_scene, shared, table, tolerance_table
-from jaxvib.cli.output import CSV, fields_of
+from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 )
 @WITHOUT
 @TOLERANCE
-@CSV
+@csv_options
 @shared
 def modes(
     scene: Path,
@@ -100,27 +100,11 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
     }
 
     def text() -> str:
-        from jaxvib.display import shown_unit, speed_text, speed_unit  # slow import, which --help does not need
+        from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
+        from jaxvib.steady.jams.jam import modes_table
 
         unit, scale = speed_unit()
-        length, factor = shown_unit("m", max((float(np.max(jam.amplitude)) for jam in jams), default=0.0))
-        rows = [
-            [
-                f"{int(jam.mode)}",
-                f"{scale * float(jam.omega):.5g}",
-                _stays(jam, growth[int(jam.mode)]),
-                *(f"{factor * float(a):.4g}" for a in jam.amplitude),
-                f"{float(jam.foundation_force):.4g}",
-            ]
-            for jam in jams
-        ]
-        head = [
-            "mode",
-            unit,
-            "stays",
-            *(f"{name}, {length}" for name in scene.machine.structure().coordinates),
-            "force, N",
-        ]
+        head, *rows = modes_table(found, growth)
         lines = [
             f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(found.resonances)}",
             table("jam modes (light loads); amplitudes and foundation force are zero to peak", head, rows)
@@ -164,16 +148,6 @@ def _measures_document(jam: jv.Jam, measures: jv.VibrationMeasures) -> dict[str,
     """Return the measures of a jam, with its mode."""
     named = ("stroke", "acceleration", "velocity", "exciter_force", "transmissibility", "isolation_efficiency")
     return {**fields_of(jam, "mode"), **fields_of(measures, *named, "static_load", "dynamic_load", "torque", "power")}
-
-
-def _stays(jam: jv.Jam, growth: float) -> str:
-    """Return a text about the stability of a jam, from its slope and from the growth rate of disturbances that separate
-    loads."""
-    if jam.judgement == "loads cannot stay together":
-        return "no: the loads differ too much"
-    if not bool(jam.stable):
-        return "no"
-    return "yes, if they stay together" if math.isnan(growth) else "yes" if growth < 0.0 else "no: the loads spread"
 
 
 def _left_out(scene: jv.Scene) -> list[str]:

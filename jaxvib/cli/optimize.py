@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,9 +37,6 @@ def optimize(
 ) -> None:
     """Search for the best machine of a DESIGN file; --out saves its scene file, the search, the figures and the motion of the
     verification. Ctrl-C ends the search with the best machine found so far; --resume continues the search."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from jaxvib.machine.files import read_toml
     from jaxvib.machine.rewrite import rewrite_scene
     from optimize import Synthesis, load_design, synthesize, tolerance_ranges
@@ -48,22 +44,14 @@ def optimize(
     loaded = load_design(design)
     given = {"starts": starts, "seed": seed, "searcher": searcher}
     options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
-    output.end_waiting()
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        console=Console(stderr=True, quiet=not sys.stderr.isatty()),
-        transient=True,
-    ) as bar:
-        task = bar.add_task("", total=1.0)
+    with output.progress() as progress:
         best = synthesize(
             loaded.space,
             loaded.objective,
             subject_to=loaded.subject_to,
             begin=None if resume is None else Synthesis.load(resume),
             verify=not no_verify,
-            progress=lambda what, share: bar.update(task, description=what, completed=share),
+            progress=progress,
             **options,
         )
     output.keep("search.npz", best)

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,8 +22,22 @@ if TYPE_CHECKING:
     from jaxvib.results.fields import Plain
     from jaxvib.results.result import Result
 
-CSV = click.option("--csv", type=click.Path(path_type=Path, dir_okay=False), help="Write the curves into this CSV file.")
-"""Option of commands that have curves."""
+
+def csv_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of commands that have curves: --csv, and --decimal-comma for `Output.csv`."""
+    comma = click.option(
+        "--decimal-comma",
+        is_flag=True,
+        expose_value=False,
+        callback=lambda context, _, value: context.meta.update({_COMMA: value}),
+        help="Write decimal commas, and semicolons between columns, into the CSV file.",
+    )
+    path = click.Path(path_type=Path, dir_okay=False)
+    return click.option("--csv", type=path, help="Write the curves into this CSV file.")(comma(command))
+
+
+_COMMA = "jaxvib.decimal_comma"
+"""Name of the option in the context of click."""
 
 
 def fields_of(result: object, *names: str) -> dict[str, object]:
@@ -81,6 +95,18 @@ class Output:
             if sys.stderr.isatty():
                 click.echo("\r\x1b[K", nl=False, err=True)
 
+    @contextlib.contextmanager
+    def progress(self) -> Iterator[Callable[[str, float], None]]:
+        """Show a bar on a terminal; the yielded function takes the name of a step and the finished share (0 to 1)."""
+        from rich.console import Console  # slow imports, which --help does not need
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self.end_waiting()
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+        with Progress(*columns, console=Console(stderr=True, quiet=not sys.stderr.isatty()), transient=True) as bar:
+            task = bar.add_task("", total=1.0)
+            yield lambda what, share: bar.update(task, description=what, completed=share)
+
     def _show_elapsed_time(self) -> None:
         begin = time.monotonic()
         while not self._done.wait(1.0):
@@ -132,7 +158,7 @@ class Output:
         from jaxvib.results.csv import write_csv  # slow import, which --help does not need
 
         self._make(path.parent, "--csv")
-        write_csv(result, axis, path, display=True)
+        write_csv(result, axis, path, display=True, decimal_comma=click.get_current_context().meta.get(_COMMA, False))
         self.files.append(str(path))
 
     def done(self, document: Mapping[str, object], text: Callable[[], str], name: str, result: Result | None = None) -> None:

@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED_TYPE, Output, app, loaded_scene, shared, table
-from jaxvib.cli.output import CSV
+from jaxvib.cli.output import csv_options
 
 if TYPE_CHECKING:
     pass
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="'fixed': the masses of the loads are fixed to the rotor; 'none': without the loads.",
 )
-@CSV
+@csv_options
 @shared
 def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
     """List the whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out adds the Campbell

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Patch
 
 from jaxvib.display import SpeedUnit, speed_unit
 from jaxvib.draw.style import (
@@ -20,6 +21,7 @@ from jaxvib.draw.style import (
     Onto,
     legend_above,
     legend_outside,
+    length_unit,
     log_ticks,
     numbered,
     panels,
@@ -46,6 +48,7 @@ def branch_diagram(
     unit: SpeedUnit | None = None,
     judged: str = "",
     show: Sequence[str] = PARTS,
+    linear: bool = False,
     ax: Onto = None,
 ) -> Drawn:
     """Draw load speed, amplitudes and foundation force, both zero to peak, over the rotor speed, a panel for each.
@@ -56,8 +59,8 @@ def branch_diagram(
 
     - `rotor_speed` (n,), `omega` (n,): rotor speed and load speed, rad/s, drawn in `unit`
     - `stable` (n,): True if stable; `judged`: the criterion of stability, written below the figure
-    - `amplitude` (n, nd): amplitudes, m, drawn in mm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units` None:
-      all m
+    - `amplitude` (n, nd): amplitudes, m, drawn in mm or µm, or rad, drawn in mrad, if `units` (nd,) contains "rad"; `units`
+      None: all m
     - `force` (n,): foundation force, N
     - `resonances`: resonances, rad/s, drawn as horizontal lines
     - `modes` (n,): numbers of the jam modes, written on the line of the operating speed
@@ -65,37 +68,24 @@ def branch_diagram(
     - `names` (nd,): names of the coordinates
     - `at`: operating speed, rad/s, drawn as a vertical line
     - `show`: panels to draw, some of `PARTS`
+    - `linear`: True for linear axes of amplitudes and force, False for logarithmic ones
     """
     unit, scale = speed_unit(unit)
     if not show or any(part not in PARTS for part in show):
         raise InputError("show", f"is {quoted(tuple(show))}; it names some of: {', '.join(PARTS)}")
-    apart = len(names) > 2
-    rows: list[tuple[str, list[tuple[str, np.ndarray]]]] = []
-    for part in show:
-        if part == "speed":
-            rows.append((f"speed of loads, {unit}", [("loads", scale * omega)]))
-        elif part == "force":
-            rows.append(("foundation force, N, zero to peak", [("force", force)]))
-        else:
-            tilts = [units is not None and units[k] == "rad" for k in range(len(names))]
-            each = [(f"{name}, mrad" if tilts[k] else name, 1e3 * amplitude[:, k]) for k, name in enumerate(names)]
-            groups = [[one] for one in each] if apart else [each]
-            rows += [
-                (f"amplitude of {group[0][0]}{'' if tilts[k] else ', mm'}" if apart else "amplitude, mm, zero to peak", group)
-                for k, group in enumerate(groups)
-            ]
+    rows = _branch_rows(show, (unit, scale * omega), amplitude, force, names, units)
     columns = min(3, len(rows))
     lines = -(-len(rows) // columns)
     spare = 0 if ax is not None else lines * columns - len(rows)
     if ax is not None:
         lines, columns = 1, len(rows)
-    figure, axes = panels(lines, columns, size=(4.9, 4.3), ax=ax)
+    figure, axes = panels(lines, columns, size=(3.7, 3.5), ax=ax)
     for empty in axes[len(axes) - spare :] if spare else ():
         empty.set_axis_off()
     n = scale * rotor_speed
     high = float(np.max(n[np.isfinite(n)]))
     crossed = crossings(rotor_speed, stable, modes, at)
-    for axis, (label, group) in zip(axes, rows, strict=False):
+    for axis, (title, label, group) in zip(axes, rows, strict=False):
         for j, (name, values) in enumerate(group):
             solid_and_dashed(
                 axis,
@@ -110,18 +100,28 @@ def branch_diagram(
         axis.plot([], [], color="black", ls=UNSTABLE, label="unstable")
         axis.set_xlim(0.0, high)
         axis.set_xlabel("rotor speed, " + unit)
-        axis.set_ylabel(label)
-        if label.startswith("speed"):
+        if ax is None:
+            axis.set_ylabel(label)
+            axis.set_title(title, loc="left", fontsize="medium")
+        else:  # above the caller's axes is the legend
+            axis.set_ylabel(f"{title}, {label}")
+        if title == _SPEED_TITLE:
             _speed_lines(axis, scale, resonances, marks, high)
+        elif linear:
+            shown = np.stack([values[np.isfinite(rotor_speed)] for _, values in group])
+            axis.set_ylim(0.0, 1.08 * float(np.max(shown, initial=1e-300, where=np.isfinite(shown))))
         else:
             axis.set_yscale("log")
             axis.set_ylim(*log_limits([values for _, values in group], rotor_speed, omega, resonances))
             log_ticks(axis)
         if at is not None:
             axis.axvline(scale * at, label="operating speed; numbers: jam modes", **OPERATING)
-            heights = [float(np.interp(share, [0, 1], v[i : i + 2])) for _, v in group for i, share, _, _ in crossed]
-            markers = [(number, filled) for _ in group for _, _, number, filled in crossed]
-            numbered(axis, scale * at, heights, [number for number, _ in markers], [filled for _, filled in markers])
+            points = []
+            for i, share, number, filled in crossed:
+                heights = [float(np.interp(share, [0, 1], values[i : i + 2])) for _, values in group]
+                points += [(y, number if y == max(heights) else "", filled) for y in heights]
+            if points:
+                numbered(axis, scale * at, *zip(*points, strict=True))
     if ax is None:
         legend_outside(figure, axes, 4 if columns > 1 else 2)
     else:
@@ -129,6 +129,40 @@ def branch_diagram(
     if judged and ax is None:
         figure.supxlabel(f"stable {judged}", fontsize="small", color="#555555")
     return figure if ax is None else ax
+
+
+_SPEED_TITLE = "speed of the loads"
+
+
+def _branch_rows(
+    show: Sequence[str],
+    speed: tuple[str, np.ndarray],
+    amplitude: np.ndarray,
+    force: np.ndarray,
+    names: Sequence[str],
+    units: Sequence[str] | None,
+) -> list[tuple[str, str, list[tuple[str, np.ndarray]]]]:
+    """Return the title, the label and the named curves of each panel; more than two coordinates have a panel each."""
+    tilts = [units is not None and each == "rad" for each in units or names]
+    length, factor = length_unit(amplitude[:, ~np.asarray(tilts)])
+    scaled = [(name, (1e3 if tilts[k] else factor) * amplitude[:, k]) for k, name in enumerate(names)]
+    labels = ["mrad" if tilt else length for tilt in tilts]
+    rows: list[tuple[str, str, list[tuple[str, np.ndarray]]]] = []
+    for part in show:
+        if part == "speed":
+            rows.append((_SPEED_TITLE, speed[0], [("loads", speed[1])]))
+        elif part == "force":
+            rows.append(("foundation force, zero to peak", "N", [("force", force)]))
+        elif len(names) > 2:
+            each = zip(labels, scaled, strict=True)
+            rows += [(f"amplitude of {curve[0]}, zero to peak", label, [curve]) for label, curve in each]
+        else:
+            label = ", ".join(dict.fromkeys(labels))
+            named = [
+                (f"{name}, {each}" if len(set(labels)) > 1 else name, y) for each, (name, y) in zip(labels, scaled, strict=True)
+            ]
+            rows.append(("amplitude, zero to peak", label, named))
+    return rows
 
 
 def log_limits(
@@ -195,7 +229,6 @@ def solid_and_dashed(
 
     `widths` are those of solid and dashed segments. With a `marker`, a few markers distinguish the line without colour.
     """
-    sparse = {"marker": marker, "markevery": 0.11, "ms": 4.0, "mfc": "white"} if marker else {}
     labelled = False
     for along, solid in stretches(stable):
         if not np.any(np.isfinite(x[along]) & np.isfinite(y[along])):
@@ -203,6 +236,8 @@ def solid_and_dashed(
         name = label if solid and not labelled else None
         labelled = labelled or solid
         style, width = ("-", widths[0]) if solid else (UNSTABLE, widths[1])
+        # Few markers on dashed segments, which otherwise look like solid ones.
+        sparse = {"marker": marker, "markevery": 0.15 if solid else 0.3, "ms": 3.5, "mfc": "white"} if marker else {}
         axis.plot(x[along], y[along], color=color, ls=style, lw=width, label=name, **sparse)
 
 
@@ -235,8 +270,6 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
         share = f"   ({ratio:.3g} x)" if there else ""
         text = f"{before:.4g} → {after:.4g}{share}"
         axis.text(1.02, place, text, va="center", fontsize=9, transform=axis.get_yaxis_transform())
-    axis.bar([1.0], [0.0], color=COLORS[0], label="less than before")
-    axis.bar([1.0], [0.0], color=COLORS[3], hatch="///", edgecolor="white", label="more than before")
     axis.axvline(1.0, color="black", lw=0.9)
     axis.set_xscale("log")
     axis.set_xlim(low**1.1, high**1.1)
@@ -248,7 +281,8 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     if title:
         axis.set_title(title, loc="left", pad=24.0, fontsize="medium")
     axis.grid(False, axis="y")
-    legend_above(axis)
+    less, more = Patch(color=COLORS[0]), Patch(facecolor=COLORS[3], hatch="///", edgecolor="white", lw=0.0)
+    legend_above(axis, handles=[less, more], labels=["less than before", "more than before"])
     return figure if ax is None else ax
 
 

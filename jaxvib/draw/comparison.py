@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, legend_above, log_ticks, panels
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Look, Onto, legend_above, log_ticks, panels
 
 
 def tiers_chart(
@@ -150,8 +150,11 @@ def stability_chart(
     if logarithmic:
         axes.set_yscale("log")
         log_ticks(axes)
-    for (kind, points), color, shape in zip(marks.items(), COLORS, itertools.cycle("os^D"), strict=False):
-        axes.plot(scale * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
+    axes.set_xlim(scale * np.nanmin(omega), scale * np.nanmax(omega))
+    for k, (kind, points) in enumerate(marks.items()):
+        # Points of different kinds can lie on each other: hollow marks of different sizes remain visible.
+        look: Look = {"mec": COLORS[k % len(COLORS)], "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
+        axes.plot(scale * points[:, 0], points[:, 1], "os^D"[k % 4], label=kind, **look)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
     axes.set_xlabel(f"speed of loads, {unit}")
     axes.set_ylabel(label)
@@ -172,21 +175,19 @@ def audit_chart(
     changes: Mapping[str, np.ndarray],
     uncertainty: np.ndarray,
     accuracy: float,
-    added: np.ndarray,
     *,
-    ax: Onto = None,
+    ax: Axes | None = None,
 ) -> Drawn:
-    """Draw the relative changes (n,) that n effects with these `labels` cause, a marker for each quantity, and their cost.
+    """Draw the relative changes (n,) that n effects with these `labels` cause, a marker for each quantity.
 
-    A line marks the requested `accuracy`; the range below the `uncertainty` (n,) is grey. A second panel shows the operations
-    that the effects add, `added` (n,), relative to those of the scene.
+    A line marks the requested `accuracy`; the range below the `uncertainty` (n,) is grey.
 
-    >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01, np.array([0.05]))
+    >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01)
     >>> figure.axes[0].get_xlabel()
     'change, %'
     """
     n = len(labels)
-    figure, (left, right) = panels(1, 2, size=(6.0, 1.6 + 0.34 * max(n, 3)), ax=ax)
+    figure, (left,) = panels(1, size=(8.0, 1.6 + 0.34 * max(n, 3)), ax=ax)
     place = np.arange(n)
     shown = np.concatenate([100.0 * values for values in changes.values()] or [np.zeros(0)])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
@@ -206,10 +207,6 @@ def audit_chart(
     left.set_ylim(n - 0.4, -0.6)
     left.set_xlabel("change, %")
     legend_above(left, 3)
-    right.barh(place, 100.0 * added, color=COLORS[0], height=0.55)
-    right.set_yticks(place, [])
-    right.set_ylim(n - 0.4, -0.6)
-    right.set_xlabel("operations that it adds, % of the scene's")
     return figure if ax is None else ax
 
 

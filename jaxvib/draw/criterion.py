@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullLocator
 
 from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import GUIDE, Drawn, Onto, legend_above, log_ticks, panels
+from jaxvib.draw.style import GUIDE, OPERATING, Drawn, Onto, legend_above, log_ticks, panels
 
 _KINDS = (
     ("loads gather (both agree)", "#ececec"),
@@ -70,24 +72,31 @@ def criterion_chart(
     functional: np.ndarray,
     balancing: list[list[float | None]],
     exact: list[list[float]] | None = None,
+    at: float | None = None,
     unit: SpeedUnit | None = None,
 ) -> None:
     """Draw the `functional` of the criterion (S,), kg m^2, over the rotor `speed` (S,), rad/s, drawn in `unit`.
 
-    The intervals of `balancing` are shaded, and the `exact` ones are bars at the bottom. The functional spans many decades near
-    resonances; therefore its sign and magnitude are drawn on a symmetric log scale.
+    Balancing intervals are shaded, exact ones are bars at the bottom, and `at` is the operating speed, rad/s. The functional
+    spans many decades near resonances; therefore its scale is that of arsinh, which is logarithmic for large values of both
+    signs and smooth at 0.
 
     >>> import matplotlib.pyplot as plt, numpy as np
     >>> ax = plt.figure().subplots()
     >>> criterion_chart(ax, np.array([1.0, 2.0, 3.0]), np.array([1.0, -2.0, -1.0]), [[1.5, None]])
     >>> ax.get_ylabel()
-    'f, kg m², gathering > 0, balancing < 0'
+    'criterion f, kg m²'
     """
     size = np.abs(functional[np.isfinite(functional)])
     unit, scale = speed_unit(unit)
     speed = scale * speed
     ax.plot(speed, functional, color="black", linewidth=1.0)
-    ax.set_yscale("symlog", linthresh=np.median(size[size > 0.0]) if np.any(size > 0.0) else 1.0)
+    width = float(np.median(size[size > 0.0])) if np.any(size > 0.0) else 1.0
+    ax.set_yscale("asinh", linear_width=width)
+    least, most = np.ceil(np.log10(width)), np.floor(np.log10(max(width, np.max(size, initial=0.0))))
+    decades = 10.0 ** np.arange(least, max(most, least) + 1.0)
+    ax.set_yticks([*-decades[::-1], 0.0, *decades], minor=False)
+    ax.yaxis.set_minor_locator(NullLocator())
     ax.axhline(0.0, color=GUIDE, linewidth=0.8)
     for start, end in balancing:
         ax.axvspan(
@@ -99,9 +108,13 @@ def criterion_chart(
         )
     for start, end in exact or []:
         ax.axvspan(scale * start, scale * end, ymax=0.03, color="black", linewidth=0)
-    legend = [Patch(color=_KINDS[1][1], alpha=0.5, label="balancing, by the criterion")]
+    legend: list[Patch | Line2D] = [Patch(color=_KINDS[1][1], alpha=0.5, label="balancing, by the criterion")]
     legend += [Patch(color="black", label="balancing, exactly")] if exact is not None else []
+    if at is not None:
+        legend.append(ax.axvline(scale * at, label="operating speed", **OPERATING))
     legend_above(ax, handles=legend)
+    for y, words in ((0.96, "f > 0: loads gather"), (0.05, "f < 0: loads balance the rotor")):
+        ax.text(0.99, y, words, transform=ax.transAxes, ha="right", va="center", fontsize="small", color="#555555")
     ax.set_xlim(speed[0], speed[-1])
     ax.set_xlabel(f"rotor speed, {unit}")
-    ax.set_ylabel("f, kg m², gathering > 0, balancing < 0")
+    ax.set_ylabel("criterion f, kg m²")

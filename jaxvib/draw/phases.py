@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +10,14 @@ from matplotlib.axes import Axes
 from jaxvib.display import SpeedUnit, speed_unit
 from jaxvib.draw.charts import solid_and_dashed
 from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, Drawn, legend_above, log_ticks, panels
+
+_PATTERNS = (
+    "all together",
+    "in two opposite groups",
+    "spread around the circle, cancelling each other",
+    "at other phases",
+)
+"""Patterns of phases, each of which has the same colour and marker in all figures."""
 
 _WIDTHS = (2.2, 1.0)
 """Widths of stable and unstable lines, which differ because overlapping dashes could otherwise look like a stable line."""
@@ -47,8 +54,10 @@ def drag_diagram(
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)
-    colors = dict(zip(dict.fromkeys(name for name, *_ in branches), itertools.cycle(COLORS), strict=False))
-    marks = dict(zip(colors, MARKERS, strict=False))
+    shown = dict.fromkeys(name for name, *_ in branches)
+    places = {name: k for k, name in enumerate(dict.fromkeys((*_PATTERNS, *shown)))}
+    colors = {name: COLORS[places[name] % len(COLORS)] for name in shown}
+    marks = {name: MARKERS[places[name] % len(MARKERS)] for name in shown}
     for name, drag, speed, stable in branches:
         solid_and_dashed(axis, drag, scale * speed, stable, colors[name], widths=_WIDTHS, marker=marks.get(name, ""))
     for name, color in colors.items():

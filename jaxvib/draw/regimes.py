@@ -34,15 +34,16 @@ def regime_chart(
     """
     figure, (top, bottom) = panels(2, size=(7.5, 2.8), share_x=True, ax=ax)
     unit, scale = speed_unit(unit)
-    width = 0.9 * np.min(np.diff(np.log(drag))) if len(drag) > 1 else 0.1
+    # Bars of a few, distant values are narrow: they must not look like statements about the values between them.
+    width = min(0.9 * np.min(np.diff(np.log(drag))), 0.06 * np.log(drag[-1] / drag[0])) if len(drag) > 1 else 0.1
     low = np.zeros(len(drag))
     for k, (kind, share) in enumerate(shares.items()):
         look = {"color": COLORS[k % len(COLORS)], "hatch": HATCHES[k % len(HATCHES)], "edgecolor": "white", "lw": 0.0}
-        top.bar(drag, share, bottom=low, width=drag * width, label=kind, **look)
-        low = low + share
-    top.set_ylabel("share of the starts")
-    top.set_ylim(0.0, 1.0)
-    legend_above(top, len(shares))
+        top.bar(drag, 100.0 * share, bottom=low, width=drag * width, label=kind, **look)
+        low = low + 100.0 * share
+    top.set_ylabel("share of the starts, %")
+    top.set_ylim(0.0, 100.0)
+    legend_above(top, 4)
     bottom.plot(
         np.repeat(drag, omega.shape[1]),
         scale * omega.ravel(),

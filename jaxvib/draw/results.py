@@ -8,7 +8,19 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Drawn, Look, Onto, legend_above, log_ticks, panels
+from jaxvib.draw.style import (
+    COLORS,
+    GUIDE,
+    MARKERS,
+    STROKES,
+    Drawn,
+    Look,
+    Onto,
+    legend_above,
+    length_unit,
+    log_ticks,
+    panels,
+)
 
 
 def modes_chart(
@@ -19,6 +31,7 @@ def modes_chart(
     resonances: np.ndarray | None = None,
     *,
     names: Sequence[str],
+    units: Sequence[str] | None = None,
     unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
@@ -29,9 +42,10 @@ def modes_chart(
     - `mode` (k,): numbers of the modes
     - `omega` (k,): load speeds, rad/s, drawn in `unit`
     - `stable` (k,): stability by slope
-    - `amplitude` (k, nd): amplitudes, m, drawn in mm (tilts: rad, drawn in mrad), with a marker and a colour per coordinate
+    - `amplitude` (k, nd): amplitudes, m, drawn in mm or µm (tilts: rad, drawn in mrad), with a marker and a colour for each
+      coordinate
     - `resonances`: resonances, rad/s, drawn as horizontal lines
-    - `names` (nd,): names of the coordinates
+    - `names`, `units` (nd,): names of the coordinates and their units, "m" or "rad"; `units` None: all m
 
     >>> import numpy as np
     >>> figure = modes_chart(np.array([1, 2]), np.array([3.0, 4.0]), np.array([True, False]), np.ones((2, 1)), names=["y"])
@@ -40,13 +54,17 @@ def modes_chart(
     """
     unit, scale = speed_unit(unit)
     figure, (top, bottom) = panels(2, size=(6.0, 2.6), share_x=True, ax=ax)
-    for axis, values in ((top, scale * omega[:, None]), (bottom, 1e3 * amplitude)):
+    tilts = np.asarray([units is not None and each == "rad" for each in units or names])
+    length, factor = length_unit(amplitude[:, ~tilts])
+    labels = ["mrad" if tilt else length for tilt in tilts]
+    for axis, values in ((top, scale * omega[:, None]), (bottom, np.where(tilts, 1e3, factor) * amplitude)):
         for k in range(values.shape[1]):
             color, mark = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
             for kind, face in ((stable, color), (~stable, "white")):
                 axis.plot(mode[kind], values[kind, k], mark, mfc=face, mec=color)
     for k, name in enumerate(names):
-        bottom.plot([], [], MARKERS[k % len(MARKERS)], color=COLORS[k % len(COLORS)], label=name)
+        label = f"{name}, {labels[k]}" if len(set(labels)) > 1 else name
+        bottom.plot([], [], MARKERS[k % len(MARKERS)], color=COLORS[k % len(COLORS)], label=label)
     legend_above(bottom, 6)
     for k, w in enumerate(() if resonances is None else resonances):
         top.axhline(scale * w, color=GUIDE, lw=0.9, ls=":", label=None if k else "resonance")
@@ -54,12 +72,18 @@ def modes_chart(
     top.plot([], [], "o", color="black", mfc="white", label="unstable")
     legend_above(top)
     top.set_ylabel(f"speed of loads, {unit}")
-    bottom.set_ylabel("amplitude, mm, zero to peak")
+    bottom.set_ylabel(f"amplitude, {', '.join(dict.fromkeys(labels))}, zero to peak")
     bottom.set_xlabel("number of the jam mode")
-    if np.any(amplitude > 0.0):
+    shown = amplitude * np.where(tilts, 1e3, factor)
+    shown = shown[np.isfinite(shown) & (shown > 0.0)]
+    if shown.size:
         bottom.set_yscale("log")
+        bottom.set_ylim(0.6 * np.min(shown), 1.7 * np.max(shown))
         log_ticks(bottom)
-    bottom.set_xticks(mode)
+    there = mode[np.isfinite(omega)]
+    bottom.set_xticks(there)
+    if there.size:
+        bottom.set_xlim(np.min(there) - 0.5, np.max(there) + 0.5)
     return figure if ax is None else ax
 
 
@@ -95,11 +119,18 @@ def shapes_chart(
     return figure if ax is None else ax
 
 
-def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) -> Drawn:
+def phase_circles(
+    sets: Sequence[tuple[str, np.ndarray]],
+    *,
+    weights: np.ndarray | None = None,
+    imbalance: complex = 0.0,
+    ax: Onto = None,
+) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
 
-    An arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel. `ax`
-    must contain one axes object for each circle.
+    A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
+    `weights` (count,), whose sum is 1, are those of the mean; default: equal ones. An orange arrow shows the `imbalance` of the
+    rotor, relative to the unbalance of all loads at one angle. `ax` must contain one axes object for each circle.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
@@ -107,12 +138,12 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) ->
     """
     columns = max(len(sets), 1) if ax is not None else min(max(len(sets), 1), 4)
     rows = 1 if ax is not None else -(-max(len(sets), 1) // columns)
-    figure, axes = panels(rows, columns, size=(3.0, 3.4), ax=ax)
+    figure, axes = panels(rows, columns, size=(3.2, 3.2), ax=ax)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     for k, axis in enumerate(axes):
         axis.set_aspect("equal")
-        axis.set_xlim(-1.8, 1.8)
-        axis.set_ylim(-1.7, 1.7)
+        axis.set_xlim(-1.6, 1.6)
+        axis.set_ylim(-1.35, 1.35)
         axis.set_axis_off()
         if k >= len(sets):
             continue
@@ -122,24 +153,37 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) ->
             e = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
             tick = np.outer(e, [0.96, 1.04])
             axis.plot(tick[0], tick[1], color=GUIDE, lw=0.9)
-            if degrees % 90 == 0:
+            is_free = np.all(np.abs(np.exp(1j * angles) - complex(*e)) > 0.3)  # of loads
+            if degrees % 90 == 0 and is_free:
+                side = {0: "right", 180: "left"}.get(degrees, "center")
                 axis.text(
-                    1.55 * float(e[0]),
-                    1.5 * float(e[1]),
+                    0.88 * float(e[0]),
+                    0.88 * float(e[1]),
                     f"{degrees}°",
-                    ha="center",
+                    ha=side,
                     va="center",
-                    fontsize="small",
+                    fontsize="x-small",
                     color="#555555",
                 )
         _loads_on_circle(axis, angles)
-        mean = np.mean(np.exp(1j * angles)) if angles.size else 0.0
-        if abs(mean) > 0.02:
-            arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": "black", "shrinkA": 0.0, "shrinkB": 0.0}
-            axis.annotate("", (np.real(mean), np.imag(mean)), (0.0, 0.0), arrowprops=arrow)
+        mean = np.average(np.exp(1j * angles), weights=weights) if angles.size else 0.0
+        for value, color in ((mean, "black"), (imbalance, COLORS[1])):
+            if abs(value) > 0.02:
+                arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": color, "shrinkA": 0.0, "shrinkB": 0.0}
+                axis.annotate("", (np.real(value), np.imag(value)), (0.0, 0.0), arrowprops=arrow)
         axis.plot([0.0], [0.0], "+", color="black", ms=7.0)
-        axis.set_title(f"{title}\nresultant {round(float(abs(mean)), 3):g}", fontsize="medium")
+        axis.set_title(f"{title}\n{_resultant_text(mean, imbalance)}", fontsize="medium")
     return figure if ax is None else ax
+
+
+def _resultant_text(mean: complex, imbalance: complex) -> str:
+    """Return the lengths of the arrows as text: of the loads, of the rotor's imbalance and of their sum."""
+    loads, rotor, rest = (f"{round(float(abs(value)), 3):g}" for value in (mean, imbalance, mean + imbalance))
+    return f"loads {loads}, rotor {rotor} (orange), sum {rest}" if abs(imbalance) > 0.02 else f"resultant {loads}"
+
+
+_SIDES, _ENDS = ("right", "left"), ("top", "bottom")
+"""Alignments of a text on the left and on the right of a circle, and below and above it."""
 
 
 def _loads_on_circle(axis: Axes, angles: np.ndarray) -> None:
@@ -155,11 +199,10 @@ def _loads_on_circle(axis: Axes, angles: np.ndarray) -> None:
             axis.plot([np.cos(angles[j])], [np.sin(angles[j])], MARKERS[j % len(MARKERS)], **look)
         e = np.mean(np.exp(1j * angles[group]))
         names = ", ".join(str(j + 1) for j in sorted(group)) if len(group) < 5 else f"{len(group)} loads"
-        place = 1.2 * e / abs(e)
-        box = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8}
-        axis.text(
-            float(np.real(place)), float(np.imag(place)), names, ha="center", va="center", fontsize="small", zorder=4, bbox=box
-        )
+        x, y = 1.15 * np.real(e / abs(e)), 1.15 * np.imag(e / abs(e))
+        # The text begins at the point and extends away from the circle.
+        across, up = (("center" if abs(v) < 0.5 else names_of[int(v > 0.0)]) for v, names_of in ((x, _SIDES), (y, _ENDS)))
+        axis.text(float(x), float(y), names, ha=across, va=up, fontsize="small", zorder=4)
 
 
 def speeds_chart(

@@ -11,8 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
+from jaxvib.display import shown_unit
 from jaxvib.errors import InputError, quoted
 
 Onto: TypeAlias = "Axes | Sequence[Axes] | None"
@@ -49,8 +51,11 @@ _STYLE: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
     "lines.linewidth": 1.4,
     "figure.constrained_layout.use": True,
+    "figure.constrained_layout.w_pad": 0.1,
+    "figure.constrained_layout.h_pad": 0.1,
     "figure.dpi": 130,
 }
 
@@ -114,7 +119,7 @@ def log_places(low: float, high: float, most: int = 9) -> LogLocator:
 def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
     """Set the ticks of a logarithmic axis, whose limits must already be set.
 
-    The labels are powers of ten over three decades or more, otherwise plain numbers; see `log_places` for the positions.
+    The labels are plain numbers if they are short, otherwise powers of ten; see `log_places` for the positions.
 
     >>> figure, (axis,) = panels(1)
     >>> _ = axis.set_yscale("log"), axis.set_ylim(0.4, 3.0)
@@ -126,7 +131,19 @@ def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
     low, high = line.get_view_interval()
     line.set_minor_formatter(NullFormatter())
     line.set_major_locator(log_places(low, high))
-    line.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False) if high / low >= 1e3 else "{x:g}")
+    is_short = low > 0.5e-4 and high < 1e5
+    line.set_major_formatter("{x:g}" if is_short or high / low < 1e3 else LogFormatterSciNotation(labelOnlyBase=False))
+
+
+def length_unit(*values: np.ndarray) -> tuple[str, float]:
+    """Return the display unit of lengths, m, for the axis of a figure, and the factor from m to it.
+
+    >>> length_unit(np.array([0.02])), length_unit(np.array([3e-7]))
+    (('mm', 1000.0), ('µm', 1000000.0))
+    """
+    size = max((float(np.max(np.abs(x), initial=0.0, where=np.isfinite(x))) for x in values), default=0.0)
+    unit, factor = shown_unit("m", min(max(size, 1e-12), 0.999))
+    return unit.replace("um", "µm"), factor
 
 
 def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:
@@ -149,7 +166,8 @@ def load_names(count: int) -> list[str | None]:
 
 
 def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str], filled: Sequence[bool]) -> None:
-    """Draw filled or hollow points at one `x` with their names to the right; names of points that nearly touch share a text.
+    """Draw filled or hollow points at one `x` with their names, if any, to the right; names of points that nearly touch share a
+    text.
 
     The limits of the axes must already be set, because points outside of them are left out.
     """
@@ -158,7 +176,7 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
     to_share = axis.transScale + axis.transLimits
     for k in inside:
         axis.plot([x], [heights[k]], "o", ms=4.5, mfc="black" if filled[k] else "white", mec="black", zorder=4)
-    for share, text in join_names([(float(to_share.transform((x, heights[k]))[1]), names[k]) for k in inside]):
+    for share, text in join_names([(float(to_share.transform((x, heights[k]))[1]), names[k]) for k in inside if names[k]]):
         axis.annotate(
             text,
             (x, to_share.inverted().transform((0.0, share))[1]),
@@ -168,7 +186,7 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
             fontsize="small",
             fontweight="bold",
             zorder=5,
-            bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
 
 

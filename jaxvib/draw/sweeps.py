@@ -10,10 +10,32 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxvib.draw.style import COLORS, Drawn, log_ticks, panels
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, legend_above, log_ticks, panels
 
 _NO_ANSWER_COLOR = "#f4f4f4"
 """Background colour of a map, which is visible for cases without a result."""
+
+_REGIME_COLORS = {
+    "swinging": "#b3b3b3",
+    "jammed": "#000000",
+    "unbalanced": "#88ccee",
+    "balanced": "#44aa99",
+    "parted": "#882255",
+    "unsettled": "#777777",
+    "not jammed": "#b3b3b3",
+    "no result": "#b3b3b3",
+}
+_MODE_COLORS = ("#004488", "#d55e00", "#e69f00", "#332288", "#cc79a7")
+"""Colours of regimes and of jam modes 1, 2, ..., equal in all figures."""
+
+
+def _label_colors(names: Sequence[str]) -> list[str]:
+    """Return the colour of each label."""
+    modes = [name for name in names if name.startswith("jammed, mode ")]
+    own = {name: _MODE_COLORS[(int(name.rpartition(" ")[2]) - 1) % len(_MODE_COLORS)] for name in modes}
+    own |= _REGIME_COLORS
+    return [own.get(name, COLORS[k % len(COLORS)]) for k, name in enumerate(names)]
+
 
 _DASHES = {"fold": "-", "torus": "--", "period doubling": "-.", "symmetry": ":"}
 
@@ -44,7 +66,8 @@ def label_map(
     there = [k for k in range(len(names)) if np.any(codes == k)]
     place = np.full(len(names) + 1, -1)
     place[there] = np.arange(len(there))
-    colours = [_NO_ANSWER_COLOR, *(_light(COLORS[k % len(COLORS)]) for k in range(len(there)))]
+    own = _label_colors(names)
+    colours = [_NO_ANSWER_COLOR, *(_light(own[k]) for k in there)]
     norm = BoundaryNorm(np.arange(-1, len(there) + 1) - 0.5, len(colours))
     axis.pcolormesh(x, y, place[codes], cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
     entries: list[Patch | Line2D] = [Patch(color=colours[k + 1], label=names[which]) for k, which in enumerate(there)]
@@ -52,17 +75,38 @@ def label_map(
         entries.append(Patch(color=_NO_ANSWER_COLOR, label="no result"))
     edges = axis.get_xlim(), axis.get_ylim()
     for kind, parts in (lines or {}).items():
-        dashes = _DASHES.get(kind, ":")
-        for xs, ys in parts:
+        dashes, inside = _DASHES.get(kind, ":"), False
+        for part_x, part_y in parts:
+            xs, ys = _to_edges(part_x, part_y, y, edges[1]) if len(part_x) > 1 else (part_x, part_y)
+            ys, xs = _to_edges(ys, xs, x, edges[0]) if len(part_x) > 1 else (ys, xs)
             axis.plot(xs, ys, color="black", lw=1.1, ls=dashes, marker="." if len(xs) == 1 else None)
-        if parts:
+            within = [(values >= low) & (values <= high) for values, (low, high) in zip((xs, ys), edges, strict=True)]
+            inside = inside or bool(np.any(within[0] & within[1]))
+        if inside:
             entries.append(Line2D([], [], color="black", lw=1.1, ls=dashes, label=f"{kind} bifurcations of exact jams"))
     axis.set_xlim(edges[0])
     axis.set_ylim(edges[1])
     _scales(axis, x_label, y_label, log)
     axis.grid(False)
-    axis.legend(handles=entries, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small")
+    legend_above(axis, 3, handles=entries)
     return figure if ax is None else ax
+
+
+def _to_edges(
+    across: np.ndarray, along: np.ndarray, centres: np.ndarray, edges: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a line whose ends at the first and the last of the `centres` of cells are extended to the `edges` of the map.
+
+    >>> _to_edges(np.array([3.0, 4.0]), np.array([1.0, 2.0]), np.array([1.0, 2.0]), (0.5, 2.5))
+    (array([2.5, 3. , 4. , 4.5]), array([0.5, 1. , 2. , 2.5]))
+    """
+    for end, (centre, edge) in zip((0, -1), zip(centres[[0, -1]], edges, strict=True), strict=True):
+        if along[end] == centre and along[0] != along[-1]:
+            inner = 1 if end == 0 else -2
+            slope = (across[inner] - across[end]) / (along[inner] - along[end])
+            place = 0 if end == 0 else len(along)
+            across, along = np.insert(across, place, across[end] + slope * (edge - centre)), np.insert(along, place, edge)
+    return across, along
 
 
 def _light(colour: str) -> tuple[float, float, float]:
@@ -124,6 +168,10 @@ def points_over(
     return figure if ax is None else ax
 
 
+_MAX_BARS = 15
+"""Number of values up to which confidence intervals are drawn as bars, above it as bands."""
+
+
 def shares_chart(
     x: np.ndarray,
     shares: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
@@ -133,7 +181,7 @@ def shares_chart(
     level: str = "95 %",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw fractions (n,) over x (n,) by name, each with its confidence interval as a band.
+    """Draw fractions (n,) over x (n,) by name, each with its confidence interval as a bar or a band.
 
     `shares` contains the fraction, the lower end and the upper end of its interval, of the confidence `level`.
 
@@ -143,13 +191,19 @@ def shares_chart(
     1
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
-    for k, (name, (share, low, high)) in enumerate(shares.items()):
-        colour = COLORS[k % len(COLORS)]
-        axis.fill_between(x, low, high, color=colour, alpha=0.25, lw=0.0)
-        axis.plot(x, share, color=colour, marker=".", ms=4.0, lw=1.0, label=name)
-    axis.set_ylim(-0.03, 1.03)
-    _scales(axis, x_label, f"fraction of the cases (band: {level} confidence)", (log, False))
-    axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small")
+    for k, (colour, (name, (share, low, high))) in enumerate(zip(_label_colors([*shares]), shares.items(), strict=True)):
+        look = {"color": colour, "ls": STROKES[k % len(STROKES)], "marker": MARKERS[k % len(MARKERS)]}
+        shift = 0.006 * (k - 0.5 * (len(shares) - 1)) if len(x) <= _MAX_BARS else 0.0  # bars beside each other
+        place = x * (x[-1] / x[0]) ** shift if log else x + shift * np.ptp(x)
+        axis.plot(place, 100.0 * share, ms=3.5, lw=1.1, label=name, **look)
+        if len(x) > _MAX_BARS:
+            axis.fill_between(x, 100.0 * low, 100.0 * high, color=colour, alpha=0.15, lw=0.0)
+        else:  # overlapping bands of a few wide intervals could not be told apart
+            reach = 100.0 * np.maximum([share - low, high - share], 0.0)
+            axis.errorbar(place, 100.0 * share, reach, fmt="none", ecolor=colour, elinewidth=0.9, capsize=2.0)
+    axis.set_ylim(-3.0, 103.0)
+    _scales(axis, x_label, f"share of the cases, % ({level} confidence)", (log, False))
+    legend_above(axis, 3)
     return figure if ax is None else ax
 
 
@@ -165,9 +219,9 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, x_label: str, a
     axis.set_ylabel("cases")
     axis.set_xlabel(x_label)
     share = axis.twinx()
-    share.plot(edges, np.concatenate([[0.0], np.cumsum(counts)]) / max(np.sum(counts), 1), color=COLORS[1])
-    share.set_ylim(0.0, 1.02)
-    share.set_ylabel("cumulative fraction", color=COLORS[1])
+    share.plot(edges, 100.0 * np.concatenate([[0.0], np.cumsum(counts)]) / max(np.sum(counts), 1), color=COLORS[1])
+    share.set_ylim(0.0, 102.0)
+    share.set_ylabel("cases up to this value, %", color=COLORS[1])
     share.grid(False)
     return figure if ax is None else ax
 
@@ -187,12 +241,16 @@ def tornado_chart(
     order = np.argsort(np.nan_to_num(np.abs(high - low)))
     figure, (axis,) = panels(1, size=(7.0, 0.45 * len(names) + 1.3), ax=ax)
     for height, k in enumerate(order):
-        for end, colour in ((low[k], COLORS[0]), (high[k], COLORS[1])):
-            axis.barh(height, end - middle, left=middle, color=colour, height=0.55, alpha=0.8)
+        for end, colour, hatch in ((low[k], COLORS[0], ""), (high[k], COLORS[1], "///")):
+            look = {"color": colour, "hatch": hatch, "edgecolor": "white", "lw": 0.0}
+            axis.barh(height, end - middle, left=middle, height=0.55, **look)
     axis.axvline(middle, color="black", lw=0.8)
     axis.set_yticks(np.arange(len(names)), [names[k] for k in order])
     axis.set_xlabel(x_label)
     axis.grid(False, axis="y")
-    entries = [Patch(color=COLORS[0], label="lowest fifth"), Patch(color=COLORS[1], label="highest fifth")]
-    axis.legend(handles=entries, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize="small")
+    entries = [
+        Patch(color=COLORS[0], label="lowest fifth of its values"),
+        Patch(facecolor=COLORS[1], hatch="///", edgecolor="white", label="highest fifth"),
+    ]
+    legend_above(axis, 2, handles=entries)
     return figure if ax is None else ax

@@ -15,6 +15,7 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.errors import CONTROL, InputError, quoted, read_text, within, written
 from jaxvib.machine.carrier import Machine
+from jaxvib.machine.drag import drag_of
 from jaxvib.machine.drives.controlled import Converter, SpeedControl, SpeedProfile, TorqueTable
 from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, InductionMotor, RunUp, SpinUp, SwitchedOff
 from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCircuit, InductionMotorElectrical, NamePlateMotor
@@ -29,6 +30,7 @@ from jaxvib.machine.structures.rotor import planar_rotor, rotor
 from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units.known import require_known, when_known
+from jaxvib.units.tables import csv_column
 
 __all__ = [
     "DRIVES",
@@ -158,7 +160,9 @@ def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> 
 def load_scene(path: str | Path) -> Scene:
     """Read a scene file, see `scene_from_toml`.
 
-    **Arguments**: `path` of a TOML file, at most 16 MB; typical: about 20 lines. The command `jaxvib new` writes examples.
+    **Arguments**: `path` of a TOML file, at most 16 MB; typical: about 20 lines. The command `jaxvib new` writes examples. A
+    drive of the kind `torque_table` may have `file`, a CSV file with speeds and torques, relative to the scene file, in place
+    of its lists.
 
     **Returns** `Scene`. **Raises** `InputError` for a file that cannot be read, and for each error in it, naming the field.
 
@@ -169,7 +173,19 @@ def load_scene(path: str | Path) -> Scene:
     >>> jv.load_scene(path).machine.kind
     'two_mass'
     """
-    return scene_from_tables(read_toml(path))
+    return scene_from_tables(_with_torque_tables(read_toml(path), Path(path).parent))
+
+
+def _with_torque_tables(value: Any, folder: Path) -> Any:
+    """Return the tables of a scene file in which each `file` of a torque table is replaced by its two columns."""
+    if isinstance(value, list):
+        return [_with_torque_tables(each, folder) for each in value]
+    if not isinstance(value, Mapping):
+        return value
+    if value.get("kind") == "torque_table" and isinstance(value.get("file"), str):
+        path, rest = folder / value["file"], {name: each for name, each in value.items() if name != "file"}
+        return {**rest, "speeds": csv_column(path, "rad/s").tolist(), "torques": csv_column(path, "N m").tolist()}
+    return {name: _with_torque_tables(each, folder) for name, each in value.items()}
 
 
 @validated
@@ -307,6 +323,9 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
     entries = {name: _built_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
+    if isinstance(drag := values.get("drag"), Mapping):
+        with within(f"{prefix}drag."):
+            entries["drag"] = build_part(drag_of, drag, "")
     for name in ("motor", "reference"):  # drives within a drive
         if isinstance(values.get(name), Mapping):
             entries[name] = _built(values[name], prefix + name, DRIVES)

@@ -12,7 +12,10 @@ from jaxvib.machine.scene import Scene
 
 _TABLE = re.compile(r"\s*\[([\w.]+)\]")
 _ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)((?:[^\"'#]|\"[^\"]*\"|'[^']*')*?)(\s*)(#\s*(.*))?")
-_NUMBER_AND_UNIT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)")
+_NUMBER_AND_UNIT = re.compile(r"\s*((?:\d{1,4}\s*[x×]\s*)?)([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)")
+
+_RELATIVE = re.compile(r"%|\bloss\b")
+"""Pattern of a damping that is given as a ratio or a loss factor."""
 
 _DIGITS = 8
 """Digits of changed numbers. More would hide the size of a number from a reader."""
@@ -31,14 +34,19 @@ def rewrite_scene(text: str, scene: Scene) -> str:
     stiffness = "44 N/mm"  # was "50 N/mm"; of the support
     """
     read, new = tomllib.loads(text), tomllib.loads(scene_to_toml(scene))
-    old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
+    try:
+        old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
+    except ValueError:  # a text that refers to another file, which would not be found from another folder
+        return scene_to_toml(scene)
     section, lines = "", []
     for line in _whole_entries(text):
         table, entry = _TABLE.match(line), _ENTRY.fullmatch(" ".join(line.split("\n")))
         section = table[1] if table else section
         if entry:
             path = (*section.split("."), entry[2])
-            line = _rewritten_line(line, entry, *(_value_at(tables, path) for tables in (read, old, new)))
+            present, former, value = (_value_at(tables, path) for tables in (read, old, new))
+            is_other = section == "machine" and not _is_close(old[section], new[section])
+            line = _rewritten_line(line, entry, present, former, value, is_other)
         lines.append(line)
     result = "\n".join(lines) + "\n"
     try:
@@ -63,9 +71,12 @@ def _value_at(tables: Any, path: tuple[str, ...]) -> Any:
     return tables
 
 
-def _rewritten_line(line: str, entry: re.Match[str], read: Any, old: Any, new: Any) -> str:
-    """Return a line whose value, `read` in the file, is `old` in SI, with the value `new` in SI."""
-    if old is None or new is None or _is_close(old, new):
+def _rewritten_line(line: str, entry: re.Match[str], read: Any, old: Any, new: Any, is_other_machine: bool) -> str:
+    """Return a line whose value, `read` in the file, is `old` in SI, with the value `new` in SI.
+
+    A damping that is given as a ratio is written as a number for another machine: its constant stays, the ratio does not.
+    """
+    if old is None or new is None or (_is_close(old, new) and not (is_other_machine and _RELATIVE.search(entry[3]))):
         return line
     comment = f"; {entry[6]}" if entry[6] else ""
     former = " ".join(entry[3].split()).replace(", ]", "]").replace("[ ", "[")
@@ -83,9 +94,10 @@ def _with_unit(read: Any, old: Any, new: Any) -> str:
         return f'"{new}"'
     if not isinstance(new, float):
         return str(new).lower()
-    if written is None or not isinstance(old, float) or old == 0.0 or float(written[1]) == 0.0:
+    is_plain = written is None or bool(_RELATIVE.search(read)) or float(written[2]) == 0.0
+    if written is None or is_plain or not isinstance(old, float) or old == 0.0:
         return f"{new:.{_DIGITS}g}"
-    return f'"{new * float(written[1]) / old:.{_DIGITS}g}{written[2]}"'
+    return f'"{written[1]}{new * float(written[2]) / old:.{_DIGITS}g}{written[3]}"'
 
 
 def _is_close(one: Any, other: Any) -> bool:

@@ -18,7 +18,7 @@ from jaxvib.results.fields import Labels, columns, labels_of
 
 
 @validated
-def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool = False) -> Path:
+def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool = False, decimal_comma: bool = False) -> Path:
     """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
     The head of a column consists of the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9
@@ -30,6 +30,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     - `axis`: name of the axis in the metadata of the fields, such as "time" or "point"
     - `path`: path of the file, which is overwritten
     - `display`: True for the units of `display_units`; default: SI units
+    - `decimal_comma`: True for decimal commas, and semicolons between columns, as German and Russian spreadsheets expect;
+      default: decimal points and commas
 
     **Returns** the path. **Raises** `InputError` for an axis that the result does not have, and for a path that cannot be
     written to.
@@ -44,9 +46,10 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
     table = table_along(result, axis, display=display)
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
+        writer = csv.writer(file, lineterminator="\n", delimiter=";" if decimal_comma else ",")
         writer.writerow(table)
-        rows = ([_shown(x) for x in row] for row in zip(*table.values(), strict=True))
+        shown = (lambda x: _shown(x).replace(".", ",")) if decimal_comma else _shown
+        rows = ([shown(x) for x in row] for row in zip(*table.values(), strict=True))
         writer.writerows(row for row, _ in itertools.groupby(rows))  # curves repeat the points at which pieces of them meet
     return path
 

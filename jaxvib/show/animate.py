@@ -163,7 +163,7 @@ def _film(scene: Scene, shown: SampledMotion, history: SampledMotion, fps: float
     assert grid is not None
     grid.set_height_ratios([0.8 * tall + 0.3, 1.3, 1.3])
     figure.set_dpi(100.0)
-    fit(stage, view)
+    fit(stage, view.limits)
     given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
     chosen = view.magnified(shown.displacement) if given is None else given
     reach = chosen * view.scale
@@ -189,12 +189,14 @@ def _film(scene: Scene, shown: SampledMotion, history: SampledMotion, fps: float
     for text in stage.texts:
         text.set_in_layout(False)
     cursors = _plot_histories((lower, below), scene, history)
+    directions = scene.machine.structure().foundation_directions
+    directions = directions if len(directions) > 1 else ("",)
 
     def update(k: int) -> None:
         for artist, part in zip(artists, parts(k), strict=True):
             _move(artist, part.points)
-        total = " ".join(f"{force:8.0f}" for force in shown.force[k])
-        clock.set_text(f"t = {shown.time[k]:8.3f} s    foundation force {total} N")
+        total = ", ".join(f"{name}{force:8.0f} N" for name, force in zip(directions, shown.force[k], strict=True))
+        clock.set_text(f"t = {shown.time[k]:8.3f} s    foundation force {total}")
         for cursor in cursors:
             cursor.set_xdata([shown.time[k]] * 2)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.boundary import validated
 from jaxvib.draw.machine.deck import ellipses, magnification
-from jaxvib.draw.machine.parts import put
+from jaxvib.draw.machine.parts import Part, Text, put
 from jaxvib.draw.style import COLORS, Drawn, panels
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -19,6 +21,12 @@ from jaxvib.units.known import require_known
 
 _INCH = 0.62
 """Inches per unit of a drawing."""
+
+_LETTER = 0.072
+"""Mean width of a letter of a small text, inches."""
+
+Limits = tuple[float, float, float, float]
+"""Left, right, bottom and top of a drawing."""
 
 
 @validated
@@ -48,21 +56,41 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
     ['40 N/mm\\n30 N s/m', 'M1 = 50 kg']
     """
     view = view_of(checked_scene(scene))
-    left, right, bottom, top = view.limits
-    figure, (axis,) = panels(1, size=(_INCH * (right - left), _INCH * (top - bottom) + 0.6), ax=ax)
-    fit(axis, view)
-    pose = at_rest(scene)
-    for part in view.parts(pose, 0.0):
+    pose, title = at_rest(scene), caption(scene)
+    parts, texts = view.parts(pose, 0.0), view.texts(pose, 0.0)
+    limits = left, right, bottom, top = _limits(parts, texts)
+    wide = max(_INCH * (right - left), _LETTER * max(map(len, title.splitlines())))
+    tall = _INCH * (top - bottom) + 0.25 + 0.18 * len(title.splitlines())
+    figure, (axis,) = panels(1, size=(wide, tall), ax=ax)
+    fit(axis, limits)
+    for part in parts:
         put(axis, part)
-    for text in view.texts(pose, 0.0):
+    for text in texts:
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
     if deck is not None:
-        _draw_deck(axis, view, deck)
-    axis.set_title(caption(scene), loc="left", fontsize="small", y=1.0)  # a fixed y is faster than automatic placement
+        _draw_deck(axis, view, deck, limits)
+    elif any(exciter.unbalance is None for exciter in scene.exciters):
+        axis.text(right, bottom, "grey dot: mark on the rotor", ha="right", va="bottom", fontsize="x-small", color="#555555")
+    axis.set_title(title, loc="left", fontsize="small", y=1.0)  # a fixed y is faster than automatic placement
     return figure if ax is None else ax
 
 
-def _draw_deck(axis: Axes, view: View, deck: Deck) -> None:
+def _limits(parts: Sequence[Part], texts: Sequence[Text]) -> Limits:
+    """Return the limits of a drawing without the margins that the forces of an animation need."""
+    points = np.concatenate([part.points for part in parts])
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    for text in texts:
+        lines = text.text.splitlines()
+        width, height = _LETTER / _INCH * max(map(len, lines)), 0.17 / _INCH * len(lines)
+        across = {"center": 0.5, "right": 1.0}.get(text.look.get("ha", "left"), 0.0)
+        up = {"center": 0.5, "top": 1.0}.get(text.look.get("va", "baseline"), 0.0)
+        corner = np.array([text.x - across * width, text.y - up * height])
+        low, high = np.minimum(low, corner), np.maximum(high, corner + np.array([width, height]))
+    (left, bottom), (right, top) = low - 0.15, high + 0.15
+    return float(left), float(right), float(bottom), float(top)
+
+
+def _draw_deck(axis: Axes, view: View, deck: Deck, limits: Limits) -> None:
     if view.scene.machine.places != "plane":
         raise InputError("deck", f"needs a body in a plane, not a machine of kind {quoted(view.scene.machine.kind)}")
     points, amplitude = np.asarray(deck.points), np.asarray(deck.amplitude)
@@ -71,7 +99,7 @@ def _draw_deck(axis: Axes, view: View, deck: Deck) -> None:
     for path in paths:
         axis.plot(*path.T, color=COLORS[1], lw=1.4, zorder=4.0)
         axis.plot(*path[0], "o", color=COLORS[1], ms=3.5, zorder=4.0)
-    left, right, bottom, top = view.limits
+    left, right, bottom, top = limits
     (low_x, low_y), (high_x, high_y) = (extreme(np.concatenate(paths), axis=0) for extreme in (np.min, np.max))
     axis.set_xlim(min(left, low_x - 0.1), max(right, high_x + 0.1))
     axis.set_ylim(min(bottom, low_y - 0.1), max(top, high_y + 0.1))
@@ -87,9 +115,9 @@ def checked_scene(scene: object) -> Scene:
     return scene
 
 
-def fit(axis: Axes, view: View) -> None:
-    """Set the limits of axes to those of the drawing, with equal scales, and hide ticks and frame."""
-    left, right, bottom, top = view.limits
+def fit(axis: Axes, limits: Limits) -> None:
+    """Set the limits of axes to those of a drawing, with equal scales, and hide ticks and frame."""
+    left, right, bottom, top = limits
     axis.set_xlim(left, right)
     axis.set_ylim(bottom, top)
     axis.set_aspect("equal")

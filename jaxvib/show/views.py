@@ -134,10 +134,11 @@ class FrontView(RotorView):
             Part(centre + scale * np.stack([away - middle, along], 1), {"color": GUIDE, "ls": ":", "lw": 0.8, "zorder": 3.1})
         )
         across, up, along = (np.broadcast_to(x, (loads.count,)) for x in places_of(loads, pose.rotors[0].angle))
-        for j in range(loads.count):
-            place = centre + scale * np.array([np.hypot(across[j], up[j]) - middle, along[j]])
-            look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "alpha": 0.75, "lw": 0.8, "zorder": 3.5}
-            found.append(Part(circle(tuple(place), max(scale * own, 0.08), 31), look, True))
+        places = centre + scale * np.stack([np.hypot(across, up) - middle, along], 1)
+        for j, place in enumerate(places):
+            behind = np.sum(np.hypot(*(places[:j] - place).T) < 0.02)  # balls that a ball of the same size would cover
+            look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "lw": 0.8, "zorder": 3.5 + 0.01 * j}
+            found.append(Part(circle(tuple(place), max(scale * own, 0.08) * 0.75**behind, 31), look, True))
         return found
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,9 @@ import numpy as np
 from jaxvib.display import speed_text
 from jaxvib.draw.machine.parts import Part, circle, sector
 from jaxvib.draw.style import COLORS, GUIDE
+from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import Loads
+from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Exciter, Scene
 
 
@@ -101,8 +103,18 @@ def caption(scene: Scene) -> str:
     else:
         found = [f"exciter {', '.join(map(str, own))}: {line.replace(chr(10), ', ')}" for line, own in lines.items()]
     if scene.all_effects:
-        found.append("with " + ", ".join(dict.fromkeys(effect.kind.replace("_", " ") for effect in scene.all_effects)))
+        found.append("with " + ", ".join(dict.fromkeys(map(_effect_words, scene.all_effects))))
     return "\n".join(found)
+
+
+def _effect_words(effect: Effect) -> str:
+    """Return the name of an effect; for an imbalance of the rotor also its size."""
+    words = effect.kind.replace("_", " ")
+    spec = number_specs(type(effect)).get("moment")
+    if spec is None or spec.units != ("kg m",):
+        return words
+    moment: Any = getattr(effect, "moment")  # noqa: B009, not every effect has it
+    return f"{words} {shown(float(moment), 'kg m')}"
 
 
 def _words_of(exciter: Exciter) -> list[str]:
@@ -114,7 +126,8 @@ def _words_of(exciter: Exciter) -> list[str]:
         each = " each" if loads.count > 1 else ""
         named = loads.kind.replace("_", " ") + ("s" if loads.count > 1 else "")
         words += [f"{loads.count} {named}, m = {_span(np.asarray(loads.mass), 'kg')}{each}"]
-        words += [f"R = {shown(track_radius(loads), 'm')}"]
+        radius = getattr(loads, "radius", None)
+        words += [f"R = {shown(track_radius(loads), 'm') if radius is None else _span(np.asarray(radius), 'm')}"]
         drag = getattr(loads, "drag", None)
         if drag is not None:
             words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")

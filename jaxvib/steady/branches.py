@@ -57,6 +57,7 @@ class Branches(AbstractJam):
         unit: SpeedUnit | None = None,
         most: float | None = None,
         show: Sequence[str] = ("speed", "amplitude", "force"),
+        linear: bool = False,
         ax: Onto = None,
     ) -> Drawn:
         """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable
@@ -69,6 +70,7 @@ class Branches(AbstractJam):
         - `unit` of the speeds on the axes, "rad/s", "rpm" or "Hz"
         - `most`: the greatest rotor speed shown, rad/s; default: 4/3 of the scene's rotor speed
         - `show`: names of the panels, such as `("force",)`
+        - `linear`: True for linear axes of amplitudes and force; default: logarithmic ones
         - `ax`: axes to draw onto, as many as there are panels
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or number of axes.
@@ -77,7 +79,7 @@ class Branches(AbstractJam):
         found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
         return plot_branch(
-            self, marks, unit, most, STABILITY_CRITERION, show, ax, np.asarray(self.mode), np.asarray(self.resonances)
+            self, marks, unit, most, STABILITY_CRITERION, show, linear, ax, np.asarray(self.mode), np.asarray(self.resonances)
         )
 
 

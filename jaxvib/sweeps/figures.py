@@ -13,6 +13,7 @@ from jaxvib.display import shown_unit
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.files import scene_from_toml, suggest_name
+from jaxvib.machine.numbers.named import find_number
 from jaxvib.steady.orbits.diagram import exact_branches
 from jaxvib.sweeps.axes import SAMPLE, axis_of, put
 from jaxvib.sweeps.store import Store
@@ -250,9 +251,10 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
         )
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
-    label = f"mean {_measure_label(opened, name)}"
+    label = f"mean over all cases: {_measure_label(opened, name)}"
     _, factor = _display_unit(opened, name)
-    return tornado_chart(axes, *(factor * m for m in (*means.T, found[0] / found[1])), x_label=label, ax=ax)
+    words = [_axis_words(opened, axis) for axis in axes]
+    return tornado_chart(words, *(factor * m for m in (*means.T, found[0] / found[1])), x_label=label, ax=ax)
 
 
 def _fifths(store: Store, axis: str) -> tuple[float, float]:
@@ -289,8 +291,21 @@ def _display_unit(store: Store, name: str) -> tuple[str, float]:
 
 def _axis_label(store: Store, axis: str) -> str:
     unit, _ = _display_unit(store, axis)
+    words = _axis_words(store, axis)
+    return f"{words}, {unit}" if unit else words
+
+
+def _axis_words(store: Store, axis: str) -> str:
+    """Return the name of an axis for a reader: "rotor speed", "stiffness of support 2"."""
     words = {_SPEED: "rotor speed", "start.rate": "initial speed of the loads", "start.angle": "initial angle of the loads"}
-    return f"{words.get(axis, axis)}, {unit}" if unit else words.get(axis, axis)
+    if axis in words:
+        return words[axis]
+    scene = scene_from_toml(store.record["scene"])
+    try:
+        named = find_number(scene, axis, "axis").words(scene)
+    except InputError:  # an axis that is not a number of the scene
+        return axis
+    return named[0] if len(named) == 1 else axis
 
 
 def _measure(store: Store, name: str | None) -> str:

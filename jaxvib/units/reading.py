@@ -35,6 +35,12 @@ _TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(\s*[^\W\d_]|\s+
 """Pattern of one number with a decimal point, then one unit, which may begin with "1/". Other texts are refused as mistakes,
 even if pint could evaluate them."""
 
+_SEVERAL = re.compile(r"(\d{1,4})\s*[x×]\s*(\S.*)")
+"""Pattern of several equal parts side by side, such as "4 x 50 N/mm"."""
+
+_ADDED = ("N/m", "N s/m", "kg", "kg m")
+"""Units of values that add if equal parts are side by side."""
+
 _COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
 
 _SPELLINGS = {
@@ -92,6 +98,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
 
     Strings and pint quantities are converted. If `unit` contains an angle, a frequency in hertz counts as revolutions per
     second (pint alone would convert 25 Hz to 25 rad/s), "1500 1/min" is 1500 rpm, and 1/s without an angle raises an error.
+    Stiffnesses, dampings, masses and unbalances of several equal parts side by side are added: "4 x 50 N/mm".
 
     **Raises** `InputError` for a string that is not a number, an unknown unit, a unit of another dimension, and a value that
     is not a real number (`require_real`).
@@ -111,6 +118,9 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         except ValueError:
             pass
         text = value.strip()
+        several = _SEVERAL.fullmatch(text) if unit in _ADDED and len(text) < 100 else None
+        if several is not None and _SEVERAL.fullmatch(several[2]) is None:
+            return int(several[1]) * to_float(several[2], unit, field)
         parts = _TEXT.fullmatch(text) if len(text) < 100 else None
         if parts is None:
             if len(text) < 100 and _COMMA.fullmatch(text):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
@@ -28,6 +29,9 @@ Tier: TypeAlias = Literal["leading", "exact", "time"]
 TIERS: tuple[Tier, ...] = ("leading", "exact", "time")
 
 Operand: TypeAlias = "Quantity | Number"
+
+_UNIT = re.compile(r"[+-]?[\d.]+(?:[eE][+-]?\d+)?\s*(\S.*)")
+"""Pattern of a limit that is written with a unit, such as "2 mm"."""
 
 
 @dataclass(frozen=True)
@@ -297,6 +301,12 @@ class Demand:
     def words(self) -> str:
         """Demand as part of a sentence."""
         return f"{self.quantity.words} {self.sense} {self.shown}"
+
+    @property
+    def written_unit(self) -> str:
+        """Unit of a limit that was written as text, such as "mm"; "" for other limits."""
+        text = _UNIT.fullmatch(self.shown) if self.shown != self.limit.words else None
+        return text[1] if text else ""
 
     @property
     def constant(self) -> float | None:

@@ -45,9 +45,8 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: SearchResult, 
         active = bool(excess > -1e-6)
         share = -dual * abs(sides[k, 1]) / scale if active else 0.0
         value, limit = float(sides[k, 0]), float(sides[k, 1])
-        rows.append(
-            Limit(demand.words, demand.quantity.unit, value, limit, float(violation), active, float(share), gain(share))
-        )
+        change = (float(share), gain(share), demand.written_unit)
+        rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(violation), active, *change))
     numbers = space.numbers(found.point.z[best])
     low, high = (np.asarray(b) for b in (problem.space.low, problem.space.high))
     sizes = np.abs([low, high])

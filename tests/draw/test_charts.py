@@ -9,10 +9,12 @@ from matplotlib.figure import Figure
 
 from jaxvib.draw.charts import branch_diagram
 from jaxvib.draw.comparison import audit_chart
-from jaxvib.draw.criterion import agreement_maps
+from jaxvib.draw.criterion import agreement_maps, criterion_chart
 from jaxvib.draw.motion.histories import time_histories
 from jaxvib.draw.motion.spectra import path_chart
+from jaxvib.draw.regimes import regime_chart
 from jaxvib.draw.results import growth_chart, phase_circles, shapes_chart
+from jaxvib.draw.sweeps import label_map
 
 
 def branches(**options):
@@ -81,7 +83,7 @@ def test_an_audits_picture_grows_by_a_line_for_each_effect():
     heights = []
     for count in (5, 15):
         labels, each = [f"{k}" for k in range(count)], np.full(count, 1e-3)
-        figure = audit_chart(labels, {"amplitude": each}, each, 0.01, each)
+        figure = audit_chart(labels, {"amplitude": each}, each, 0.01)
         heights.append(figure.get_size_inches()[1])
     assert heights[1] - heights[0] == pytest.approx(3.4)  # inches
 
@@ -103,3 +105,67 @@ def test_growth_has_the_exponent_over_its_second_half():
     np.testing.assert_array_equal(exponent.get_xydata(), [[5.0, 1.5], [8.0, 1.5]])
     box = axis.collections[0].get_paths()[0].get_extents()
     np.testing.assert_allclose([box.x0, box.y0, box.x1, box.y1], [5.0, 1.25, 8.0, 1.75])
+
+
+def test_loads_that_move_equally_are_one_line():
+    time = np.linspace(0.0, 50.0, 4000)
+    motion = 1e-3 * np.sin(20.0 * time)[:, None]
+    one = 10.0 + 0.1 * np.sin(20.0 * time)
+    loads = np.stack([one, one * (1.0 + 1e-7), one + 0.5, one], axis=1)
+    arrays = (time, motion, loads, 20.0 + 0.0 * motion, motion)
+    figure = time_histories(arrays, arrays, names=("y1",), directions=("up",))
+    names = [text.get_text() for text in figure.axes[2].get_legend().get_texts()]
+    assert names == ["loads 1, 2 and 4", "load 3", "rotor"]
+    assert len(figure.axes[3].lines) == 2
+
+
+def test_a_branch_diagram_has_linear_axes_on_request():
+    axes = branches(linear=True).axes
+    assert [axis.get_yscale() for axis in axes] == ["linear"] * 3
+    assert axes[1].get_ylim() == pytest.approx((0.0, 1.08 * 25.0e3))
+
+
+def test_a_history_says_at_what_time_it_begins():
+    time = np.linspace(0.0, 50.0, 4000)
+    motion = 1e-3 * np.sin(20.0 * time)[:, None]
+    for begin, words in ((0.0, "the whole run: "), (120.0, "the last part of the run, from 120 s: ")):
+        arrays = (begin + time, motion, motion, motion, motion)
+        figure = time_histories(arrays, arrays, names=("y1",), directions=("up",))
+        assert figure.axes[0].texts[0].get_text().startswith(words)
+
+
+def test_the_scale_of_the_criterion_has_no_kink():
+    axis = Figure().subplots()
+    criterion_chart(axis, np.linspace(1.0, 3.0, 5), np.linspace(-2.0, 2.0, 5), [[2.0, None]], at=2.0)
+    step = 1e-6
+    slopes = [(axis.transScale.transform((1.0, y + step)) - axis.transScale.transform((1.0, y)))[1] for y in (0.999, 1.001)]
+    assert slopes[0] == pytest.approx(slopes[1], rel=0.01)  # at the median, where a symlog scale has a kink
+    assert "operating speed" in [text.get_text() for text in axis.get_legend().get_texts()]
+    assert list(axis.lines[-1].get_xdata()) == pytest.approx([2.0 * 30.0 / np.pi] * 2)
+
+
+@pytest.mark.parametrize("count", [2, 12])
+def test_bars_of_few_drags_do_not_fill_the_axis(count):
+    drag = np.geomspace(0.5, 5.0, count)
+    axis = regime_chart(drag, {"jammed": np.ones(count)}, np.ones((count, 2)), 2.0).axes[0]
+    widths = [np.log(bar.get_x() + bar.get_width()) - np.log(bar.get_x()) for bar in axis.patches]
+    assert np.sum(widths) < np.log(10.0) and [bar.get_height() for bar in axis.patches] == [100.0] * count
+    assert count > 2 or np.sum(widths) < 0.15 * np.log(10.0)
+
+
+def test_a_regime_and_a_mode_have_their_colour_in_every_map():
+    names = ["swinging", "unsettled", "jammed, mode 1", "jammed, mode 3"]
+    maps = []
+    for codes, own in ((np.array([[0, 2], [1, 3]]), names), (np.array([[2, 1], [0, 0]]), [names[3], names[2], names[1]])):
+        axis = label_map(np.arange(2.0), np.arange(2.0), codes, own, x_label="x", y_label="y").axes[0]
+        maps.append({t.get_text(): p.get_facecolor() for t, p in _entries(axis.get_legend())})
+    same = maps[0].keys() & maps[1].keys()
+    assert len(same) == 3 and all(maps[0][name] == maps[1][name] for name in same)
+
+
+def test_a_line_of_folds_reaches_the_edges_of_its_map():
+    x, y = np.linspace(0.0, 4.0, 5), np.linspace(0.0, 2.0, 3)
+    lines = {"fold": [(np.array([1.0, 2.0, 3.0]), y)], "torus": [(np.array([7.0, 7.0]), y[[0, -1]])]}
+    axis = label_map(x, y, np.zeros((3, 5), int), ["a"], x_label="x", y_label="y", lines=lines).axes[0]
+    np.testing.assert_allclose(axis.lines[0].get_xydata()[[0, -1]], [[0.5, -0.5], [3.5, 2.5]])
+    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "fold bifurcations of exact jams"]

@@ -85,20 +85,20 @@ def test_shares_are_those_of_the_cases(grid):
     axis = plot_shares(grid.store, "drive.speed").axes[0]
     lines = {line.get_label(): np.asarray(line.get_ydata()) for line in axis.lines}
     expected = np.linspace(20.0, 100.0, 11) // 40.0
-    np.testing.assert_array_equal(lines["not jammed"], expected == 0.0)
-    np.testing.assert_array_equal(lines["jammed, mode 2"], expected == 2.0)
+    np.testing.assert_array_equal(lines["not jammed"], 100.0 * (expected == 0.0))
+    np.testing.assert_array_equal(lines["jammed, mode 2"], 100.0 * (expected == 2.0))
 
 
 def test_a_tornado_shows_what_each_number_does(sampled):
     axis = plot_tornado(sampled.store).axes[0]
     ends = {text.get_text(): [] for text in axis.get_yticklabels()}
-    assert list(ends) == ["drive.speed", "loads.drag"]
+    assert list(ends) == ["rotor speed", "drag of each ball"]
     for bar in axis.patches:
         ends[list(ends)[round(bar.get_y() + bar.get_height() / 2.0)]].append(bar.get_x() + bar.get_width())
     # the means of a sum that is linear: at the middles of the lowest and the highest fifth, all else at its own;
     # 600 samples in a fifth are off by about a 600th of the range of the sum
-    np.testing.assert_allclose(ends["loads.drag"], [3.0 * 1.1 + 0.6, 3.0 * 1.9 + 0.6], atol=1e-2)
-    np.testing.assert_allclose(ends["drive.speed"], [4.5 + 0.44, 4.5 + 0.76], atol=1e-2)
+    np.testing.assert_allclose(ends["drag of each ball"], [3.0 * 1.1 + 0.6, 3.0 * 1.9 + 0.6], atol=1e-2)
+    np.testing.assert_allclose(ends["rotor speed"], [4.5 + 0.44, 4.5 + 0.76], atol=1e-2)
 
 
 def test_a_distribution_counts_every_case(sampled):

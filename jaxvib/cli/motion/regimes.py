@@ -8,13 +8,13 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
-from jaxvib.cli.output import CSV, fields_of
+from jaxvib.cli.output import csv_options, fields_of
 
 
 @app.command("regimes")
 @click.argument("scene", type=click.Path(path_type=Path))
 @WITHOUT
-@CSV
+@csv_options
 @shared
 def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """List the synchronous regimes of SCENE: motions in which all exciters turn at one speed; --out adds a picture of

@@ -10,7 +10,7 @@ import click
 import jaxvib as jv
 from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared
 from jaxvib.cli.document import SEPARATION, chosen_steps, measured_document, run_document
-from jaxvib.cli.output import CSV
+from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
 _START = click.option(
@@ -51,7 +51,7 @@ def settle(scene: Path, speed: str | None, tolerance: float | None, output: Outp
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, help="Allowed error of one time step [1e-4].")
 @WITHOUT
-@CSV
+@csv_options
 @shared
 def envelope(
     scene: Path, tolerance: float | None, without: tuple[str, ...], csv: Path | None, output: Output, **options: Any

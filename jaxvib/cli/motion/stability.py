@@ -51,10 +51,11 @@ def stability_map(
     output: Output,
 ) -> None:
     """Map the stability of exact jams of SCENE over a parameter; --out draws the map."""
-    make, read = _varied(loaded_scene(scene, without), vary)
+    loaded = loaded_scene(scene, without)
+    make, read = _varied(loaded, vary)
     x = [read(value, "--value") for value in values]
     found = jv.stability_map(make, x, omega=_range(omega), points=points)
-    output.picture("stability_map.png", lambda: found.plot(label=vary))
+    output.picture("stability_map.png", lambda: found.plot(label=_words_of(loaded, vary)))
     rows = [
         {
             "value": float(value),
@@ -120,6 +121,15 @@ def _varied(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable
 
     found = find_number(scene, name, "--vary")
     return lambda x: put_numbers(scene, (found,), jnp.full(found.size, x)), found.value
+
+
+def _words_of(scene: Scene, name: str) -> str:
+    """Return the name of a parameter in words, with its SI unit, for an axis."""
+    from jaxvib.machine.numbers.named import find_number
+
+    found = find_number(scene, name, "--vary")
+    words = found.words(scene)
+    return f"{words[0] if len(words) == 1 else name}, {found.unit}"
 
 
 def _range(omega: tuple[str, str]) -> tuple[float, float]:

@@ -69,7 +69,9 @@ def audit(
     from jaxvib.units import number
 
     share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
-    found = jv.audit(loaded_scene(scene, without), accuracy=share, possible=None if add_missing else (), **options)
+    loaded = loaded_scene(scene, without)
+    with output.progress() as progress:
+        found = jv.audit(loaded, accuracy=share, possible=None if add_missing else (), progress=progress, **options)
     if found.effects:
         output.picture("audit.png", found.plot)
     output.done(found.as_dict(), lambda: audit_text(found), "audit", found)

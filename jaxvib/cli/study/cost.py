@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -48,9 +48,10 @@ def cost(
     output: Output,
 ) -> None:
     """Measure the cost of accuracy for SCENE: error and computing time of every method; --out adds the figure."""
-    found = jv.work_precision(
-        loaded_scene(scene, speed=speed), quantity, mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats
-    )
+    options: dict[str, Any] = dict(mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats)
+    loaded = loaded_scene(scene, speed=speed)
+    with output.progress() as progress:
+        found = jv.work_precision(loaded, quantity, progress=progress, **options)
     output.picture("cost.png", found.plot)
     output.done(cost_document(found), lambda: cost_table(found), "cost", found)
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, legend_above, load_names, panels
+from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, legend_above, length_unit, load_names, panels
 
 _BINS = 300
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
@@ -70,8 +70,8 @@ def time_histories(
 ) -> Drawn:
     """Draw the histories of a run in two columns: the `whole` run as bands between its peaks, and its last periods as curves.
 
-    The rows are displacements in mm, tilts in mrad if there are any, speeds of loads and rotor in `unit`, and the foundation
-    force in N.
+    The rows are displacements in mm or µm, tilts in mrad if there are any, speeds of loads and rotor in `unit`, and the
+    foundation force in N. Loads that move equally are one line.
 
     **Arguments** (nt times, nd coordinates, nb directions of the force)
 
@@ -88,7 +88,7 @@ def time_histories(
     """
     units = ["m"] * len(names) if units is None else units
     unit, scale = speed_unit(unit)
-    kinds = [(kind, label) for kind, label in (("m", "displacement, mm"), ("rad", "tilt, mrad")) if kind in units]
+    kinds = _kinds(whole[1], units, "displacement", "tilt")
     figure, axes = panels(len(kinds) + 2, 2, size=(5.4, 2.3), widths=(1.7, 1.0), share_x="col", ax=ax)
     period = period_of(end[0], end[1])
     # Each interval is longer than a period; otherwise the band would follow the vibration.
@@ -96,21 +96,23 @@ def time_histories(
     bins = min(_BINS, int(periods / 1.25)) if periods > _MAX_PLAIN_PERIODS else whole[0].size
     part = [values[last_periods(end[0], end[1])] for values in end]
     depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # signals of larger range are drawn first, below smaller ones
-    for row, (kind, label) in enumerate(kinds):
+    for row, (kind, label, factor) in enumerate(kinds):
         own = [k for k in range(len(names)) if units[k] == kind]
         left, right = axes[2 * row : 2 * row + 2]
         for k in own:
-            _band(left, whole[0], 1e3 * whole[1][:, k], k, names[k], bins, depth[k])
+            _band(left, whole[0], factor * whole[1][:, k], k, names[k], bins, depth[k])
         for k in own:
-            right.plot(part[0], 1e3 * part[1][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.3)
+            right.plot(part[0], factor * part[1][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.3)
         left.set_ylabel(label)
         legend_above(left, 6)
     left, right = axes[-4:-2]
-    for k, name in enumerate(load_names(whole[2].shape[1])):
+    for k, name in _equal_loads(whole[2], part[2]):
         _band(left, whole[0], scale * whole[2][:, k], k, name, bins)
         right.plot(part[0], scale * part[2][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
     _draw_rotor_speeds(left, whole[0], scale * whole[3])
-    if whole[2].shape[1] == 0:
+    ends = [np.min(part[2], initial=np.inf), np.max(part[2], initial=-np.inf)]
+    # The ripple of loads that are much slower than the rotor would be invisible on an axis that includes the rotor.
+    if whole[2].shape[1] == 0 or np.all(np.abs(part[3] - np.mean(ends)) < ends[1] - ends[0]):
         _draw_rotor_speeds(right, part[0], scale * part[3])
     left.set_ylabel(f"speed, {unit}")
     legend_above(left, 6)
@@ -121,22 +123,83 @@ def time_histories(
     left.set_ylabel("foundation force, N")
     if len(directions) > 1:
         legend_above(left)
-    for axis, text in zip(axes[:2], ("the whole run: bands between peaks", f"its last {_SHOWN_PERIODS} periods"), strict=True):
+    first, last = float(whole[0][0]), float(whole[0][-1])
+    title = "the whole run" if first < 0.01 * last else f"the last part of the run, from {first:.4g} s"
+    for axis, text in zip(axes[:2], (f"{title}: bands between peaks", f"its last {_SHOWN_PERIODS} periods"), strict=True):
         axis.text(1.0, 1.02, text, transform=axis.transAxes, ha="right", va="bottom", fontsize="small", color="#555555")
     for axis in axes[-2:]:
         axis.set_xlabel("time, s")
+    axes[-1].locator_params(axis="x", nbins=4)
     return figure if ax is None else ax
+
+
+def _kinds(values: np.ndarray, units: Sequence[str], length: str, tilt: str) -> list[tuple[str, str, float]]:
+    """Return the unit, the label and the factor of each kind of coordinates among signals (nt, nd): lengths and tilts."""
+    unit, factor = length_unit(values[:, np.asarray(units) == "m"])
+    kinds = (("m", f"{length}, {unit}", factor), ("rad", f"{tilt}, mrad", 1e3))
+    return [kind for kind in kinds if kind[0] in units]
+
+
+_EQUAL = 0.01
+"""Difference of the speeds of two loads, relative to the range of an axis, below which they are drawn as one line."""
+
+
+def _equal_loads(whole: np.ndarray, end: np.ndarray) -> list[tuple[int, str | None]]:
+    """Return the first of each group of loads that move equally, with the name of the group.
+
+    **Arguments**: speeds `whole` (nt, count) of a run and of its `end` (nt', count).
+
+    >>> import numpy as np
+    >>> t = np.linspace(0.0, 1.0, 9)[:, None]
+    >>> _equal_loads(np.hstack([t, t, -t]), np.hstack([t, t, -t]))
+    [(0, 'loads 1 and 2'), (2, 'load 3')]
+    """
+    count, signals = whole.shape[1], (whole, end)
+    rooms = [_EQUAL * float(np.ptp(values)) + 1e-9 * float(np.max(np.abs(values), initial=0.0)) for values in signals]
+    groups: list[list[int]] = []
+    for k in range(count):
+
+        def is_equal(other: list[int], k: int = k) -> bool:
+            return all(np.max(np.abs(x[:, k] - x[:, other[0]])) <= room for x, room in zip(signals, rooms, strict=True))
+
+        same = next((group for group in groups if is_equal(group)), None)
+        if same is None:
+            groups.append([k])
+        else:
+            same.append(k)
+    names = load_names(count)
+    return [(group[0], names[group[0]] if len(group) == 1 else _group_name(group)) for group in groups]
+
+
+def _group_name(group: Sequence[int]) -> str:
+    """Return the name of several loads: "loads 1 to 3", or "loads 1 and 3"."""
+    if len(group) > 2 and group[-1] - group[0] == len(group) - 1:
+        return f"loads {group[0] + 1} to {group[-1] + 1}"
+    return f"loads {', '.join(str(k + 1) for k in group[:-1])} and {group[-1] + 1}"
 
 
 def _band(
     axis: Axes, time: np.ndarray, values: np.ndarray, k: int, name: str | None, bins: int, depth: float | np.ndarray = 0.0
 ) -> None:
     middle, low, high = band(time, values, bins)
+    if low is not high:
+        low, high = -_smoothed_peaks(-low), _smoothed_peaks(high)
     look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.1, "zorder": 2.0 + 0.01 * float(depth)}
     axis.plot(middle, high, label=name, **look)
     if low is not high:
         axis.plot(middle, low, **look)
         axis.fill_between(middle, low, high, color=look["color"], alpha=0.22, lw=0.0, zorder=look["zorder"])
+
+
+def _smoothed_peaks(values: np.ndarray) -> np.ndarray:
+    """Return a smooth curve that is not below the maxima of intervals.
+
+    An interval contains no whole number of periods, so that the maxima are a saw-tooth. The result is the mean of three
+    neighbouring maxima of three neighbours; each of them includes the interval itself.
+    """
+    padded = np.pad(values, 2, mode="edge")
+    largest = np.maximum(np.maximum(padded[:-2], padded[2:]), padded[1:-1])
+    return (largest[:-2] + largest[1:-1] + largest[2:]) / 3.0
 
 
 def _draw_rotor_speeds(axis: Axes, time: np.ndarray, speeds: np.ndarray) -> None:
@@ -162,21 +225,21 @@ def amplitude_histories(
 ) -> Drawn:
     """Draw the histories of an averaged run, a panel for each quantity; amplitudes are zero to peak.
 
-    `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
+    `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm or µm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
     (nt, count) and `rotor_speed` (nt, exciters) are in rad/s, drawn in `unit`, and the foundation force `force` (nt,
     directions) is in N.
     """
     unit, scale = speed_unit(unit)
-    kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
+    kinds = _kinds(amplitude, units, "amplitude", "amplitude")
     figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)
 
     def lines(axis: Axes, values: np.ndarray, places: Sequence[int], labels: Sequence[str | None]) -> None:
         for k, name in zip(places, labels, strict=True):
             axis.plot(time, values[:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], label=name)
 
-    for axis, (kind, label) in zip(axes, kinds, strict=False):
+    for axis, (kind, label, factor) in zip(axes, kinds, strict=False):
         own = [k for k in range(len(names)) if units[k] == kind]
-        lines(axis, 1e3 * amplitude, own, [names[k] for k in own])
+        lines(axis, factor * amplitude, own, [names[k] for k in own])
         axis.set_ylabel(label)
         legend_above(axis, 6)
     if load_speed.shape[1]:

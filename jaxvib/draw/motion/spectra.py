@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
 from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, legend_above, length_unit, panels
 
 _DECADES = 1e-4
 """Lower end of the amplitude scale, relative to the largest amplitude."""
@@ -96,7 +96,8 @@ def waterfall_chart(
 
 
 def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None) -> Drawn:
-    """Draw paths of points by name: horizontal and vertical coordinates (nt,), m, drawn in mm, with a marker at each end point.
+    """Draw paths of points by name: horizontal and vertical coordinates (nt,), m, drawn in mm or µm, with a marker at each end
+    point.
 
     >>> import numpy as np
     >>> t = np.linspace(0.0, 6.0, 50)
@@ -104,14 +105,16 @@ def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes |
     'horizontal, mm'
     """
     figure, (axis,) = panels(1, size=(5.0, 4.8), ax=ax)
+    unit, factor = length_unit(*(each for path in paths.values() for each in path))
     for k, (name, (x, y)) in enumerate(paths.items()):
         color = COLORS[k % len(COLORS)]
-        axis.plot(1e3 * x, 1e3 * y, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)
-        axis.plot(1e3 * x[-1:], 1e3 * y[-1:], "o", color=color, mec="black", zorder=3)
+        axis.plot(factor * x, factor * y, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)
+        axis.plot(factor * x[-1:], factor * y[-1:], "o", color=color, mec="black", zorder=3)
     axis.plot([], [], "o", color="white", mec="black", label="where it ends")
     axis.plot([0.0], [0.0], "+", color="black", ms=9.0)
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("horizontal, mm")
-    axis.set_ylabel("vertical, mm")
-    legend_above(axis, 3)
+    axis.locator_params(nbins=6)
+    axis.set_xlabel(f"horizontal, {unit}")
+    axis.set_ylabel(f"vertical, {unit}")
+    legend_above(axis, 2)
     return figure if ax is None else ax

@@ -15,6 +15,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.mount import BodyPoint, Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
+from jaxvib.machine.structures.damping import damping_constants
 from jaxvib.units import Number, count
 
 
@@ -60,7 +61,8 @@ def support(
 
     - `at` (2,): the point of the body, (x, y) m from its centre of mass without unbalances; typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
-    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m)
+    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). Also a ratio of it with the mass on
+      this support, "5 % of 250 kg", or a loss factor of rubber at a frequency of vibration, "loss factor 0.1 at 16 Hz"
     - `angle` of the first spring, rad, anticlockwise from x; typical: 0 (the default)
     - `body`: number of the body in a `plane_network`, from 0; typical: 0 (the default)
     - `to`: number of the body at the other end; default: the foundation
@@ -81,7 +83,9 @@ def support(
         raise InputError("at_other", f"is {quoted(at_other)} and to is {to}; a support between two bodies needs both")
     if to == body:
         raise InputError("to", f"is {to}, the body itself; a support joins two different bodies")
-    found = read_numbers(PlaneSupport, "", at=at, stiffness=stiffness, damping=damping, angle=angle)
+    found = read_numbers(PlaneSupport, "", at=at, stiffness=stiffness)
+    constants = damping_constants(damping, "damping", found["stiffness"])
+    found |= read_numbers(PlaneSupport, "", damping=constants, angle=angle)
     other = None if at_other is None else read_numbers(PlaneSupport, "", at_other=at_other)["at_other"]
     return PlaneSupport(**found, at_other=other, body=body, to=to)
 

@@ -14,6 +14,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.machine.structures.damping import damping_constants
 from jaxvib.units import Number, Numbers, count
 
 
@@ -96,14 +97,25 @@ def _platforms(
         raise InputError("machine.exciter", f"is {which}; the machine has platforms 1 to {n}")
 
     read = functools.partial(read_numbers, Platforms, "machine")
-    found = read(n, mass=mass, stiffness=stiffness, damping=damping)
+    found = read(n, mass=mass, stiffness=stiffness)
+    found |= read(n, damping=damping_constants(damping, "machine.damping", found["stiffness"], lambda: found["mass"]))
     of_links = {"link_stiffness": link_stiffness, "link_damping": link_damping}
     for name, value in of_links.items():
         given = len(value) if isinstance(value, (list, tuple)) else getattr(value, "size", 1)
         if not joined and given > 0:
             problem = f"has {given} values, but the machine has no links; leave it out or give links"
             raise InputError(f"machine.{name}", problem)
-    found |= read(len(joined), **of_links) if joined else dict.fromkeys(of_links, jnp.asarray(np.zeros(0), dtype=float))
+    if joined:
+        found |= read(len(joined), link_stiffness=link_stiffness)
+
+        def joined_mass() -> Array:
+            one, other = (found["mass"][np.asarray(joined)[:, end] - 1] for end in (0, 1))
+            return one * other / (one + other)
+
+        constants = damping_constants(link_damping, "machine.link_damping", found["link_stiffness"], joined_mass)
+        found |= read(len(joined), link_damping=constants)
+    else:
+        found |= dict.fromkeys(of_links, jnp.asarray(np.zeros(0), dtype=float))
     return Platforms(**found, links=joined, exciter=which, kind=kind)
 
 
@@ -131,7 +143,8 @@ def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
 
     - `mass` M, kg, loads not included; typical: 50 to 5000
     - `stiffness` k of the support, N/m; typical: 1e4 to 1e6
-    - `damping` b of the support, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M)
+    - `damping` b of the support, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M). Also
+      a ratio of it, "5 %", or a loss factor of rubber at a frequency of vibration, "loss factor 0.1 at 16 Hz": b = 0.1 k/omega
 
     **Returns** `Platforms`. **Raises** `InputError` for a mass that is not positive or a negative coefficient.
 
@@ -162,9 +175,11 @@ def two_mass(
 
     - `mass` (2,), kg, loads not included; typical: 50 to 5000
     - `stiffness` (2,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support
-    - `damping` (2,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M)
+    - `damping` (2,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M) of
+      the platform on its support alone. Also a ratio of it, "5 %", or a loss factor, see `one_mass`
     - `link_stiffness`, N/m; typical: 5e4 to 5e6, that is 1 to 10 times a support
-    - `link_damping`, N s/m; typical: as `damping`
+    - `link_damping`, N s/m; typical: as `damping`. A ratio is relative to the two platforms on the link alone, that is to the
+      mass M_1 M_2/(M_1 + M_2)
     - `exciter`: the number of the platform with the auto-balancer, 1 or 2 (default: 2)
 
     **Returns** `Platforms`. **Raises** `InputError` for wrong lengths, wrong units, masses that are not positive, or negative

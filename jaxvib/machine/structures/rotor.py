@@ -15,6 +15,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.machine.structures.damping import damping_constants
 from jaxvib.units import Number, Numbers
 from jaxvib.units.known import when_known
 
@@ -147,7 +148,8 @@ def rotor(
     - `transverse_inertia` A about a transverse axis, kg m^2, loads not included; typical: 0.05 to 1
     - `polar_inertia` C about the axis of rotation, kg m^2, loads not included, at most 2 A; typical: 0.01 to 0.5
     - `stiffness` k (2,) of the supports, N/m; typical: 1e5 to 1e6
-    - `damping` (2,) of the supports, N s/m; typical: 100 to 1000
+    - `damping` (2,) of the supports, N s/m; typical: 100 to 1000; also a ratio "5 %" or a loss factor, see `one_mass`. With
+      "5 %" at both supports the translation of the rotor without tilt has this ratio
     - `position` (2,) of the supports along the axis, m from the mass centre, one side negative; typical: 0.1 to 0.5
     - `stations` of the loads along the axis, m from the mass centre, one number or one for each load; typical: -0.3 to 0.3,
       default 0
@@ -188,9 +190,12 @@ def rotor(
         when_known(_require_two_places, places)
     transverse, polar = read(transverse_inertia=transverse_inertia, polar_inertia=polar_inertia).values()
     when_known(_require_possible_inertia, transverse, polar)
+    found = {**read(mass=mass), **read(2, stiffness=stiffness)}
+    k = found["stiffness"]
+    constants = damping_constants(damping, "machine.damping", k, lambda: found["mass"] * k / jnp.sum(k))
     return Rotor(
-        **read(mass=mass),
-        **read(2, stiffness=stiffness, damping=damping),
+        **found,
+        **read(2, damping=constants),
         **read(stations=stations),
         transverse_inertia=transverse,
         polar_inertia=polar,
@@ -269,7 +274,8 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
 
     - `mass` M, kg, loads not included; typical: 5 to 50
     - `stiffness` k, N/m; typical: 1e3 for a soft suspension, 1e5 to 1e6 for bearings
-    - `damping` b, N s/m; typical: 50 to 1000
+    - `damping` b, N s/m; typical: 50 to 1000; also a ratio of the critical damping 2 sqrt(k M), "5 %", or a loss factor, see
+      `one_mass`
 
     **Returns** `PlanarRotor`. **Raises** `InputError` for wrong units and values that are not allowed.
 
@@ -279,7 +285,9 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
 
     Source: the special case of Artyunin 2013, equation (1), see `PlanarRotor`.
     """
-    found = read_numbers(PlanarRotor, "machine", mass=mass, stiffness=stiffness, damping=damping)
+    found = read_numbers(PlanarRotor, "machine", mass=mass, stiffness=stiffness)
+    constants = damping_constants(damping, "machine.damping", found["stiffness"], lambda: found["mass"])
+    found |= read_numbers(PlanarRotor, "machine", damping=constants)
     return PlanarRotor(**found, kind="planar_rotor")
 
 

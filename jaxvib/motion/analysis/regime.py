@@ -147,7 +147,10 @@ class Regime(Result):
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
-        return phase_circles([(self.label, np.asarray(self.phase))], ax=ax)
+        title = self.label
+        if self.label in ("balanced", "unbalanced"):
+            title += f"\n{100.0 * float(self.unbalance):.2g} % of the loads' unbalance left"
+        return phase_circles([(title, np.asarray(self.phase))], ax=ax)
 
 
 @validated

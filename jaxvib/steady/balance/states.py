@@ -129,7 +129,10 @@ class BalancedStates(Result):
         """Plot the arrangements in the rotor's frame, each on a circle. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import phase_circles  # slow import
 
-        return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)], ax=ax)
+        sides = _sides(circular_loads(self.scene))
+        named = [(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)]
+        whole = float(np.sum(sides))
+        return phase_circles(named, weights=sides / whole, imbalance=_imbalance(self.scene) / whole, ax=ax)
 
 
 @validated

@@ -66,6 +66,7 @@ def plot_branch(
     most: float | None,
     judged: str,
     show: Sequence[str],
+    linear: bool,
     ax: Onto,
     modes: np.ndarray | None = None,
     resonances: np.ndarray | None = None,
@@ -74,8 +75,9 @@ def plot_branch(
 
     **Arguments**: `marks`: special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most`: the
     greatest rotor speed shown, rad/s (default: 4/3 of the scene's rotor speed); `judged`: text on how stability is determined;
-    `show`: names of the panels; `ax`: axes to draw onto; `modes`: the number of the jam mode at each point, default: from the
-    resonances and the slope; `resonances` (nd,) rad/s, default: computed here.
+    `show`: names of the panels; `linear`: True for linear axes of amplitudes and force; `ax`: axes to draw onto; `modes`: the
+    number of the jam mode at each point, default: from the resonances and the slope; `resonances` (nd,) rad/s, default:
+    computed here.
 
     **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel.
     """
@@ -107,5 +109,6 @@ def plot_branch(
         unit=unit,
         judged=judged,
         show=show,
+        linear=linear,
         ax=ax,
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, speed_text
+from jaxvib.display import quantity_text, shown_unit, speed_text, speed_unit
 from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force, require_drag
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -72,7 +73,7 @@ class AbstractJam(Result):
     - `amplitude` (nd,), m (rad for tilts), zero to peak; typical: 0.5 to 10 mm
     - `foundation_force`, N, zero to peak; for two directions of the force it is the root of the sum of the squares of their
       peaks (sqrt 2 times the force of a circular whirl)
-    - `coordinates` (nd,): names of the coordinates
+    - `coordinates` (nd,): names of the coordinates, and `units` (nd,), "m" or "rad"
     """
 
     mode: Array = eqx.field(metadata=in_unit("", "*"))
@@ -85,6 +86,7 @@ class AbstractJam(Result):
     amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
     foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))
     coordinates: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    units: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
 
 
 class Jam(AbstractJam):
@@ -177,15 +179,15 @@ class JamModes(AbstractJam):
         return _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), np.asarray(row, np.uint32))
 
     def summary(self) -> str:
-        """Return a table in text; amplitudes zero to peak."""
-        rotor, resonances = (speed_text(speed, 6) for speed in (np.asarray(self.rotor_speed)[0], self.resonances))
-        return "\n".join(
-            [
-                f"rotor speed {rotor}, resonances {resonances}",
-                *(f"  {self.select(k).summary()}" for k in self.mode_numbers()),
-                f"stable: {STABILITY_CRITERION}",
-            ]
-        )
+        """Return the table of `jaxvib modes` in text; amplitudes and foundation force are zero to peak.
+
+        The command also computes if the loads stay together, which needs the scene.
+        """
+        rotor, resonances = (speed_text(speed) for speed in (np.asarray(self.rotor_speed)[0], self.resonances))
+        lines = modes_table(self, {})
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        rows = ("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in lines)
+        return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, f"stays: {STABILITY_CRITERION}"])
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
@@ -195,6 +197,45 @@ class JamModes(AbstractJam):
         axes.
         """
         return _modes_chart(self, self.resonances, unit, ax)
+
+
+def modes_table(jams: JamModes, growth: Mapping[int, float]) -> list[list[str]]:
+    """Return the heads and the rows of the table of all jam modes that exist.
+
+    **Arguments**: `growth`: growth rates of disturbances that separate the loads, 1/s, by the mode; a missing one is unknown.
+    """
+    unit, scale = speed_unit()
+    known = [jams.select(k) for k in jams.mode_numbers()]
+    shown = [shown_unit(each, _largest(jams, k)) for k, each in enumerate(jams.units)]
+    heads = [f"{name}, {length}" for name, (length, _) in zip(jams.coordinates, shown, strict=True)]
+    rows = [
+        [
+            f"{int(jam.mode)}",
+            f"{scale * float(jam.omega):.5g}",
+            stays_text(jam, growth.get(int(jam.mode), math.nan)),
+            *(f"{factor * float(a):.4g}" for a, (_, factor) in zip(np.asarray(jam.amplitude), shown, strict=True)),
+            f"{float(jam.foundation_force):.4g}",
+        ]
+        for jam in known
+    ]
+    return [["mode", unit, "stays", *heads, "force, N"], *rows]
+
+
+def _largest(jams: JamModes, coordinate: int) -> float:
+    """Return the largest amplitude of the coordinates that have the unit of this one, m or rad."""
+    same = np.asarray([unit == jams.units[coordinate] for unit in jams.units])
+    values = np.asarray(jams.amplitude)[:, same]
+    return float(np.max(values, initial=0.0, where=np.isfinite(values)))
+
+
+def stays_text(jam: Jam, growth: float) -> str:
+    """Return a text about the stability of a jam, from its slope and from the growth rate of disturbances that separate the
+    loads, NaN if it is unknown."""
+    if jam.judgement == "loads cannot stay together":
+        return "no: the loads differ too much"
+    if not bool(jam.stable):
+        return "no"
+    return "yes, if they stay together" if math.isnan(growth) else "yes" if growth < 0.0 else "no: the loads spread"
 
 
 @cached
@@ -207,7 +248,7 @@ def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit | 
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))
     among = None if resonances is None else np.asarray(resonances)
-    return modes_chart(mode, omega, stable, amplitude, among, names=jams.coordinates, unit=unit, ax=ax)
+    return modes_chart(mode, omega, stable, amplitude, among, names=jams.coordinates, units=jams.units, unit=unit, ax=ax)
 
 
 @validated
@@ -342,6 +383,7 @@ def jam_at(
         amplitude=magnitude(displacement),
         foundation_force=peak_force(model.carrier.foundation_force(displacement, 1j * omega * displacement)),
         coordinates=model.carrier.coordinates,
+        units=model.carrier.units,
     )
 
 

@@ -80,7 +80,7 @@ class Orbit(Result):
       c_k. Loads that have equal parameters have one deviation (G = 1), otherwise each has its own (G = count)
     - `deviation_orders` and `orders`: the k of these harmonics
     - `offsets` (count,), rad: the angle by which each load is ahead of phi
-    - `units` (nd,) of the amplitudes, "m" or "rad"
+    - `units` (nd,) of the amplitudes, "m" or "rad", and names of the `coordinates` (nd,)
     """
 
     status: OrbitStatus
@@ -103,6 +103,7 @@ class Orbit(Result):
     deviation_orders: tuple[int, ...] = eqx.field(static=True, metadata=in_unit("", "deviation_orders"))
     orders: tuple[int, ...] = eqx.field(static=True, metadata=in_unit("", "orders"))
     units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
+    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="coordinate"))
 
     @property
     def harmonics(self) -> int:
@@ -168,7 +169,8 @@ class Orbit(Result):
         **Returns** a matplotlib figure, or the given `ax`, which has three axes.
         """
         deviation = self.deviation_orders, self.deviation_harmonics, "load angle - Ωt, degrees", "load", "all loads"
-        return plot_period(self.orders, self.displacement_harmonics, self.units, deviation, self.force_harmonics, ax)
+        named = (self.coordinates, self.units)
+        return plot_period(self.orders, self.displacement_harmonics, named, deviation, self.force_harmonics, ax)
 
 
 def judgement_of(multiplier: Array, stable: Array) -> str:
@@ -181,17 +183,18 @@ def judgement_of(multiplier: Array, stable: Array) -> str:
 def plot_period(
     orders: tuple[int, ...],
     displacement: Array,
-    units: tuple[str, ...],
+    named: tuple[tuple[str, ...], tuple[str, ...]],
     deviation: tuple[tuple[int, ...], Array, str, str, str],
     force: Array,
     ax: Onto,
 ) -> Drawn:
     """Plot a period of a motion over the angle Omega t from its harmonics.
 
-    `deviation`: orders and harmonics of the bodies' deviations, the title of their panel, and the labels of one of several
-    bodies and of a single body.
+    `named`: names and units of the coordinates; `deviation`: orders and harmonics of the bodies' deviations, the title of their
+    panel, and the labels of one of several bodies and of a single body.
     """
-    from jaxvib.draw.results import signals_chart  # slow import
+    from jaxvib.draw.results import signals_chart  # slow imports
+    from jaxvib.draw.style import length_unit
 
     theta = np.linspace(0.0, 2.0 * np.pi, 721)
 
@@ -200,10 +203,17 @@ def plot_period(
 
     deviation_orders, angles, title, one, alone = deviation
     motion, turned, forces = signal(displacement, orders), np.rad2deg(signal(angles, deviation_orders)), signal(force, orders)
-    shown = " or ".join(f"m{unit}" for unit in dict.fromkeys(units))
+    names, units = named
+    length, factor = length_unit(motion[:, np.asarray(units) == "m"])
+    shown, factors = {"m": length, "rad": "mrad"}, {"m": factor, "rad": 1e3}
+    labels = [f"{name}, {shown[unit]}" if len(set(units)) > 1 else name for name, unit in zip(names, units, strict=True)]
     several = [f"{one} {k + 1}" for k in range(turned.shape[1])]
     panels = [
-        (f"displacement, {shown}", 1e3 * motion, [f"coordinate {k + 1}" for k in range(motion.shape[1])]),
+        (
+            f"displacement, {' or '.join(shown[unit] for unit in dict.fromkeys(units))}",
+            motion * [factors[unit] for unit in units],
+            labels,
+        ),
         (title, turned, several if len(several) > 1 else [alone]),
         ("foundation force, N", forces, ["across", "up"][-forces.shape[1] :]),
     ]
@@ -300,6 +310,7 @@ def orbits(
         deviation_orders=tuple(map(int, grid.deviation_orders)),
         orders=tuple(map(int, grid.orders)),
         units=model.linear.carrier.units,
+        coordinates=model.linear.carrier.coordinates,
         offsets=jnp.broadcast_to(model.offsets, (value.shape[0], model.loads.count)),
     )
     return orbit, growth

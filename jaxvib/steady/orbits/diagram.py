@@ -102,13 +102,14 @@ class ExactBranches(Result):
         unit: SpeedUnit | None = None,
         most: float | None = None,
         show: Sequence[str] = ("speed", "amplitude", "force"),
+        linear: bool = False,
         ax: Onto = None,
     ) -> Drawn:
         """Plot the diagram: stable solid, unstable dashed, special points by their kind.
 
-        **Arguments**: `unit`, `most`, `show`, `ax` as `Branches.plot`.
+        **Arguments**: `unit`, `most`, `show`, `linear`, `ax` as `Branches.plot`.
         """
-        return plot_branch(self, list(self.special), unit, most, _STABILITY_CRITERION, show, ax)
+        return plot_branch(self, list(self.special), unit, most, _STABILITY_CRITERION, show, linear, ax)
 
 
 def exact_branches(

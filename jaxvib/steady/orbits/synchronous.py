@@ -163,8 +163,9 @@ class SynchronousOrbit(PathsOfPoints, Result):
         """
         orders = tuple(range(self.displacement_harmonics.shape[-1]))
         deviation = orders, self.deviation_harmonics, "angle - Ωt, degrees", "body", "the body"
-        units = self.scene.machine.structure().units
-        return plot_period(orders, self.displacement_harmonics, units, deviation, self.force_harmonics, ax)
+        structure = self.scene.machine.structure()
+        named = (structure.coordinates, structure.units)
+        return plot_period(orders, self.displacement_harmonics, named, deviation, self.force_harmonics, ax)
 
 
 @cached

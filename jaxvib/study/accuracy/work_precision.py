@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import call_user, validated
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
@@ -33,6 +34,7 @@ from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, ExactJam, colloc
 from jaxvib.study.accuracy.gradient_precision import gradient_precision
 from jaxvib.units import Number, count, number
 
+T = TypeVar("T")
 Tree = TypeVar("Tree")
 Quantity = Literal["amplitude", "foundation_force", "final_state", "gradient"]
 QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
@@ -62,6 +64,7 @@ def work_precision(
     tolerances: Sequence[float] = _TOLERANCES,
     solvers: Sequence[str] = tuple(SOLVERS),
     repeats: int = 3,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Cost:
     """Compute a quantity of a scene by every tier, method, tolerance and dtype, with its error and computing time.
 
@@ -90,6 +93,8 @@ def work_precision(
     - `solvers`: names of methods from `SOLVERS`
     - `repeats`: number of timings of each method, fewer if a call takes seconds; the shortest time is reported; typical: 3 (the
       default)
+    - `progress`: a function that is called with the name of each method and the finished share of all of them (0 to 1); not
+      for the "gradient"
 
     **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, no tolerance, a scene in single precision, a
     gradient of a scene without an exact jam; and the errors of `jam_modes` and `simulate`.
@@ -117,7 +122,7 @@ def work_precision(
         problem = "is in single precision; errors are measured against double: switch JAX to float64 before it is made"
         raise InputError("scene", problem)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
-    request = _Request(scene, tuple(tolerances), tuple(solvers), repeats)
+    request = _Request(scene, tuple(tolerances), tuple(solvers), repeats, progress)
     if quantity == "final_state":
         return _final_state(request, end)
     if quantity == "gradient":
@@ -131,11 +136,32 @@ def work_precision(
     return _steady(request, quantity, jam, end)
 
 
-class _Request(NamedTuple):
+@dataclasses.dataclass
+class _Request:
     scene: Scene
     tolerances: tuple[float, ...]
     solvers: tuple[str, ...]
     repeats: int
+    progress: Callable[[str, float], None] | None
+    finished: int = 0
+
+    def row(
+        self,
+        tier: str,
+        method: str,
+        setting: str,
+        call: Callable[[], T],
+        error: Callable[[T], float],
+        dtype: str = "float64",
+    ) -> CostRow:
+        """Return the row of a method, and report it to `progress`."""
+        if self.progress is not None:
+            single = len(self.tolerances) if "default" in self.solvers else 0
+            most = 2 + len(_ORBIT_POINTS) + len(_ENVELOPE_TOLERANCES) + len(self.tolerances) * len(self.solvers) + single
+            name = ", ".join(filter(None, (tier, method, setting)))
+            call_user(self.progress, "progress", name, min(self.finished / most, 1.0))
+        self.finished += 1
+        return row_of(tier, method, setting, call, error, self.repeats, dtype)
 
 
 def _single(tree: Tree) -> Tree:
@@ -156,7 +182,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
 
     def leading(scene: Scene, dtype: str) -> CostRow:
         call = _compiled(lambda s: read(jam_modes(s).select(mode)), scene)
-        return row_of("leading order", "", "", call, error, request.repeats, dtype)
+        return request.row("leading order", "", "", call, error, dtype)
 
     rows, left_out = [], []
     light = jam_modes(scene).select(mode, throw=False)
@@ -171,7 +197,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
     for few in _ORBIT_POINTS:
         points = collocation_points(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points)), scene)
-        rows.append(row_of("exact orbit", "", f"{points} points", call, error, request.repeats))
+        rows.append(request.row("exact orbit", "", f"{points} points", call, error))
     if not bool(jam.fine.stable):
         left_out.append(unstable("envelope, full", jam))
     else:
@@ -221,7 +247,7 @@ def _integrated(
             return read(envelope(request.scene, end, start=start, save="window", stepsize_controller=chosen, throw=False))
 
         try:
-            rows.append(row_of("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error, request.repeats))
+            rows.append(request.row("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error))
         except InputError as problem:
             left_out.append(f"envelope: {problem}")
             break
@@ -251,7 +277,7 @@ def _full(request: _Request, start: State, length: Callable[[float], float], err
             )
 
         return [
-            row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, request.repeats, dtype)
+            request.row("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, dtype)
             for tolerance in request.tolerances
             if tolerance >= least
         ]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
 import numpy as np
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import call_user, validated
 from jaxvib.display import speed_text
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
@@ -29,7 +29,13 @@ from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
+    from matplotlib.axes import Axes
+
+    from jaxvib.draw.style import Drawn
+
+
+_TIER_STEPS = 3
+"""Time of the comparison of all tiers, in times of one effect, for the share that `progress` reports."""
 
 
 class AuditStatus(eqx.Enumeration):
@@ -91,8 +97,8 @@ class Audit(Result):
         return "\n".join(lines)
 
     @validated
-    def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the change by each effect, relative to the requested accuracy, and its cost, on two axes.
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """Plot the change by each effect, with the requested accuracy.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -102,8 +108,7 @@ class Audit(Result):
         changes = {plain_names[name]: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}
         labels = [f"{row.effect.replace('_', ' ')}{'' if row.present else ' (added)'}: {row.advice}" for row in self.effects]
         uncertainty = np.array([row.uncertainty for row in self.effects])
-        added = np.array([row.operations for row in self.effects], float) / self.operations
-        return audit_chart(labels, changes, uncertainty, self.accuracy, added, ax=ax)
+        return audit_chart(labels, changes, uncertainty, self.accuracy, ax=ax)
 
 
 @validated
@@ -117,6 +122,7 @@ def audit(
     possible: Sequence[Effect] | None = None,
     tiers: bool = True,
     repeats: int = 3,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Audit:
     """Compute by how much each effect and each tier changes the results of a scene, and their cost.
 
@@ -143,6 +149,7 @@ def audit(
     - `tiers`: True to compute every tier as well
     - `repeats`: number of timings of a run of 100 turns, of which the shortest is reported; typical: 3 (the default); 0 for no
       timings, which saves a compilation for each effect
+    - `progress`: a function that is called with the name of each step and the finished share of all steps (0 to 1)
 
     **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1, `ComputationError` (status
     "absent") for a mode that does not exist, and the errors of `jam_modes` and `simulate`.
@@ -165,8 +172,14 @@ def audit(
     scene = validate_scene(scene)
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
+
+    def report(what: str, share: float) -> None:
+        if progress is not None:
+            call_user(progress, "progress", what, share)
+
     comparison, description = _comparison(scene, mode, end, start)
     repeated = RepeatedComparison(comparison, repeats)
+    report("the scene", 0.0)
     own = repeated.values(scene, repeated.tier(scene))
     until = comparison.until if isinstance(comparison, RunComparison) else None
     # The scale of a machine that almost does not move is the unbalance radius of its loads.
@@ -178,7 +191,13 @@ def audit(
     elif not own.uncertainty <= 0.5 * accuracy:
         status = "unsettled"
     seconds, compiling = repeated.times(scene)
-    effects = [effect_row(repeated, scene, variant, float(accuracy)) for variant in variants]
+    steps = 1 + len(variants) + (_TIER_STEPS if tiers else 0)
+    effects = []
+    for k, variant in enumerate(variants, 1):
+        report(variant.name.replace("_", " "), k / steps)
+        effects.append(effect_row(repeated, scene, variant, float(accuracy)))
+    if tiers:
+        report("tiers", 1.0 - _TIER_STEPS / steps)
     return Audit(
         status=member(AuditStatus, status),
         accuracy=float(accuracy),

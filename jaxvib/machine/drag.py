@@ -1,0 +1,144 @@
+"""Drag of a load from the oil, the rolling friction or the bearing that brakes it against the rotor."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal, get_args
+
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, require_one_of
+from jaxvib.units import Number, number
+from jaxvib.units.known import when_known
+
+Cause = Literal["oil", "rolling", "bearing"]
+
+_NEEDED = {
+    "oil": {"ball_radius": "m", "viscosity": "Pa s", "density": "kg/m^3"},
+    "rolling": {"ball_radius": "m", "mass": "kg", "rolling_lever": "m"},
+    "bearing": {"mass": "kg", "friction": "", "diameter": "m"},
+}
+"""Arguments and SI units of each cause."""
+
+_MAX_REYNOLDS = 3e5
+"""Reynolds number above which the flow at a sphere changes suddenly, and the formula does not apply."""
+
+
+@validated
+def drag_of(
+    cause: Cause,
+    *,
+    radius: Number,
+    load_speed: Number,
+    rotor_speed: Number,
+    ball_radius: Number | None = None,
+    viscosity: Number | None = None,
+    density: Number | None = None,
+    mass: Number | None = None,
+    rolling_lever: Number | None = None,
+    friction: Number | None = None,
+    diameter: Number | None = None,
+) -> Array:
+    """Return the drag b_W of a load, N s/m, from its cause: the viscous drag with the same force at the given two speeds.
+
+        b_W = F / v,    v = R (n - Omega)
+        "oil":      F = C_D rho pi r^2 v^2 / 2,    C_D = 24/Re (1 + 0.15 Re^0.687) + 0.42 / (1 + 42500 Re^-1.16)
+        "rolling":  F = m R Omega^2 f / r
+        "bearing":  F = mu m R Omega^2 d / (2 R)
+
+    with the Reynolds number Re = 2 rho r v / eta. Only a slow ball in thick oil (Re < 1) has a drag 6 pi eta r that does not
+    depend on the speed. In all other cases the drag holds for the given speeds: compute it again for the load speed of a jam.
+    Rolling and bearing friction can also be simulated as they are, by `RollingFriction` and `DryFriction`.
+
+    **Arguments** (SI, or strings with a unit)
+
+    - `cause`: "oil" for a ball in an oil bath, "rolling" for a roller or a ball on a dry track, "bearing" for a pendulum
+    - `radius` R of the circle of the loads' centres, m; typical: 0.05 to 0.3
+    - `load_speed` Omega, less than `rotor_speed` n, rad/s; typical: "800 rpm" and "1500 rpm"
+    - `ball_radius` r of a ball or roller, m; typical: 0.01 to 0.03
+    - `viscosity` eta of the oil at its working temperature, Pa s; typical: 0.05 to 0.5; `density` rho, kg/m^3; typical: 870
+    - `mass` m of the load, kg; typical: 0.1 to 1
+    - `rolling_lever` f of the rolling friction, m; typical: 1e-5 to 5e-5 for steel on steel
+    - `friction` mu of the bearing; typical: 0.001 to 0.002 for ball and roller bearings, 0.01 to 0.02 for plain bearings;
+      `diameter` d of its bore, m; typical: 0.005 to 0.05
+
+    **Returns** an array with one number, with derivatives.
+
+    **Raises** `InputError` for arguments that the cause needs or does not have, and outside the range of validity:
+
+    - oil: Re up to 3e5. The ball is far from walls: in a channel narrower than about five balls the drag is larger
+    - rolling: f up to r/10
+    - bearing: open rolling bearings with good lubrication, at about a tenth of their dynamic load rating; d up to R. Seals add
+      their own friction
+
+    >>> import jaxvib as jv
+    >>> speeds = dict(radius="120 mm", load_speed="780 rpm", rotor_speed="1500 rpm")
+    >>> round(float(jv.drag_of("oil", ball_radius="20 mm", viscosity="0.1 Pa s", density=870.0, **speeds)), 2)
+    1.95
+    >>> round(float(jv.drag_of("bearing", mass="0.8 kg", friction=0.0015, diameter="12 mm", **speeds)), 4)
+    0.0053
+
+    Source: R. Clift, W. H. Gauvin, The motion of particles in turbulent gas streams, 1970 (C_D of a sphere, Re up to 3e5);
+    Coulomb's law of rolling friction; SKF, Rolling bearings, 2018 (moment mu P d / 2, mu 0.0015 for deep groove ball bearings).
+    """
+    require_one_of(cause, get_args(Cause), "cause")
+    given = {
+        "ball_radius": ball_radius,
+        "viscosity": viscosity,
+        "density": density,
+        "mass": mass,
+        "rolling_lever": rolling_lever,
+        "friction": friction,
+        "diameter": diameter,
+    }
+    read, needed = partial(number, low=0.0, open_low=True), _NEEDED[cause]
+    value = {}
+    for name, each in given.items():
+        if name in needed and each is None:
+            raise InputError(name, f"is missing; the drag by {cause} needs {', '.join(needed)}")
+        if name not in needed and each is not None:
+            raise InputError(name, f"is not used for the drag by {cause}, which needs {', '.join(needed)}; leave it out")
+        if each is not None:
+            value[name] = read(each, needed[name], name)
+    speeds = {"load_speed": load_speed, "rotor_speed": rotor_speed}
+    arm, (slow, fast) = read(radius, "m", "radius"), (read(speed, "rad/s", name) for name, speed in speeds.items())
+    when_known(_require_slip, slow, fast)
+    slip, press = arm * (fast - slow), arm * slow**2
+    if cause == "oil":
+        return _oil_drag(slip, value["ball_radius"], value["viscosity"], value["density"])
+    if cause == "rolling":
+        when_known(_require_small_lever, value["rolling_lever"], value["ball_radius"])
+        return value["mass"] * press * value["rolling_lever"] / (value["ball_radius"] * slip)
+    when_known(_require_small_bearing, value["diameter"], arm)
+    return 0.5 * value["friction"] * value["mass"] * press * value["diameter"] / (arm * slip)
+
+
+def _oil_drag(slip: Array, r: Array, viscosity: Array, density: Array) -> Array:
+    reynolds = 2.0 * density * r * slip / viscosity
+    when_known(_require_reynolds, reynolds)
+    # C_D rho pi r^2 v / 2 with the factor Re of C_D taken out, because Re can be very small.
+    inertial = 0.42 * reynolds / (1.0 + 42500.0 * reynolds**-1.16)
+    return np.pi / 4.0 * viscosity * r * (24.0 * (1.0 + 0.15 * reynolds**0.687) + inertial)
+
+
+def _require_slip(slow: float, fast: float) -> None:
+    if not slow < fast:
+        raise InputError("load_speed", f"is {slow:.6g} rad/s; it must be less than the rotor_speed of {fast:.6g} rad/s")
+
+
+def _require_reynolds(reynolds: float) -> None:
+    if not reynolds <= _MAX_REYNOLDS:
+        problem = f"the formula holds up to {_MAX_REYNOLDS:g}; give a thicker oil or speeds that are closer together"
+        raise InputError("viscosity", f"gives a Reynolds number of {reynolds:.3g}; {problem}")
+
+
+def _require_small_lever(lever: float, r: float) -> None:
+    if not lever <= 0.1 * r:
+        raise InputError("rolling_lever", f"is {lever:g} m; it must be at most a tenth of the ball_radius of {r:g} m")
+
+
+def _require_small_bearing(diameter: float, arm: float) -> None:
+    if not diameter <= arm:
+        raise InputError("diameter", f"is {diameter:g} m; it must be at most the radius of {arm:g} m")

@@ -1,0 +1,81 @@
+"""Damping given as a ratio or as a loss factor, as the constants of viscous dampers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError, quoted
+from jaxvib.units import Number, Numbers, number
+from jaxvib.units.known import when_known
+
+_NUMBER_PATTERN = r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
+_RATIO = re.compile(_NUMBER_PATTERN + r"\s*%(?:\s*of\s+(.+))?")
+_LOSS = re.compile(r"loss(?:\s+factor)?\s+" + _NUMBER_PATTERN + r"\s+at\s+(.+)")
+
+
+def damping_constants(damping: Numbers, field: str, stiffness: Array, mass: Callable[[], Array] | None = None) -> Numbers:
+    """Return dampings in which texts with a ratio or a loss factor are replaced by constants, N s/m.
+
+        "5 %", "5 % of 250 kg":       c = 2 (0.05) sqrt(k m)
+        "loss factor 0.1 at 16 Hz":   c = 0.1 k / (2 pi 16 Hz)
+
+    A ratio is relative to the critical damping of the mass on this spring alone. Other values are returned unchanged.
+
+    **Arguments**: `damping` of n springs, as a user gives it; `field` for messages; `stiffness` (n,) N/m; `mass`: function that
+    returns the mass (n,) kg that each spring carries, None if a ratio must name it.
+
+    **Raises** `InputError` for a negative ratio, for one without a mass, and for a spring without stiffness.
+
+    >>> import jax.numpy as jnp
+    >>> damping_constants(["5 %", 7.0, "loss factor 0.1 at 100 rad/s"], "damping", jnp.full(3, 1e4), lambda: jnp.array(100.0))
+    [100.0, 7.0, 10.0]
+    """
+    if isinstance(damping, (list, tuple)):
+        k = jnp.broadcast_to(stiffness, (len(damping),)) if np.ndim(stiffness) == 0 else stiffness
+        if not any(map(_is_relative, damping)) or len(damping) != np.size(k):
+            return damping
+        m = [None] * len(damping) if mass is None else jnp.broadcast_to(mass(), np.shape(k))
+        return [_constant(value, f"{field}[{i}]", k[i], m[i]) for i, value in enumerate(damping)]
+    if not isinstance(damping, str) or not _is_relative(damping):
+        return damping
+    if np.ndim(stiffness) == 0:
+        return _constant(damping, field, stiffness, None if mass is None else mass())
+    return damping_constants([damping] * np.size(stiffness), field, stiffness, mass)
+
+
+def _is_relative(value: object) -> bool:
+    return isinstance(value, str) and ("%" in value or value.strip().startswith("loss"))
+
+
+def _constant(value: Number, field: str, stiffness: Array, mass: Array | None) -> Number:
+    if not isinstance(value, str) or not _is_relative(value):
+        return value
+    ratio, loss = _RATIO.fullmatch(value.strip()), _LOSS.fullmatch(value.strip())
+    if ratio is None and loss is None:
+        forms = "'5 %', '5 % of 250 kg', 'loss factor 0.1 at 16 Hz' or '40 N s/m'"
+        raise InputError(field, f"is {quoted(value)}; write a damping as {forms}")
+    size = float((ratio or loss)[1])  # pyright: ignore[reportOptionalSubscript]
+    if not size >= 0.0:
+        raise InputError(field, f"is {quoted(value)}; a damping must be at least 0")
+    when_known(lambda k: _require_spring(k, field, value), stiffness)
+    if loss is not None:
+        found = size * stiffness / number(loss[2], "rad/s", field, low=0.0, open_low=True)
+    else:
+        assert ratio is not None
+        carried = mass if ratio[2] is None else number(ratio[2], "kg", field, low=0.0, open_low=True)
+        if carried is None:
+            problem = "the ratio of the critical damping 2 sqrt(k m), which needs the mass m that this spring carries"
+            raise InputError(field, f"is {quoted(value)}, {problem}; write for example {quoted(value.strip() + ' of 250 kg')}")
+        found = 0.02 * size * jnp.sqrt(stiffness * carried)
+    known = when_known(float, found)
+    return found if known is None else known
+
+
+def _require_spring(stiffness: float, field: str, value: str) -> None:
+    if stiffness == 0.0:
+        raise InputError(field, f"is {quoted(value)} of a spring without stiffness; write a number in N s/m")

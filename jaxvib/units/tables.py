@@ -1,0 +1,79 @@
+"""Columns of CSV files, such as catalogues of springs and curves of motors."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted, read_text
+from jaxvib.units.columns import split_head, unit_factor
+
+
+@validated
+def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.ndarray:
+    """Return a column of a CSV file in SI units.
+
+    The first row has the names of the columns with their units: `rate (N/mm)`, `rate [N/mm]` or `rate / N/mm`. Columns are
+    separated by commas, semicolons or tabs. If they are separated by semicolons or tabs, numbers may have a decimal comma.
+
+    **Arguments**
+
+    - `path` of the file, at most 16 MB
+    - `unit`: SI unit of the returned numbers, such as "N/m", "rad/s", "N m"
+    - `column`: name of the column; default: the only column with a unit of this dimension; typical: "rate"
+
+    **Returns** an array with a number for each row that has one. It can be used as `choices` of a design or as an argument of
+    `TorqueTable`. **Raises** `InputError` for a file that cannot be read, a column that is missing or not unique, a unit of
+    another dimension, and a cell that is not a number.
+
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "springs.csv"
+    >>> _ = path.write_text("part;rate (N/mm);length (mm)\\nA1;12,5;80\\nA2;20,0;80\\n")
+    >>> jv.csv_column(path, "N/m").tolist()
+    [12500.0, 20000.0]
+    """
+    head, *rows = _rows(path)
+    names = [split_head(each, unit) for each in head]
+    found = [k for k, (name, own) in enumerate(names) if _matches(head[k], name, own, unit, column)]
+    if len(found) != 1:
+        wanted = f"with a unit such as {unit}" if column is None else f"{quoted(column)}"
+        there = f"has {len(found) or 'no'} columns {wanted}"
+        raise InputError(str(path), f"{there}; name one as column, the columns are: {', '.join(map(quoted, head))}")
+    (k,) = found
+    factor = unit_factor(names[k][1], unit) if names[k][1] else None
+    if factor is None:
+        raise InputError(str(path), f"has the column {quoted(head[k])} without a unit of {unit}; write {names[k][0]} ({unit})")
+    cells = [(line, row[k].strip()) for line, row in enumerate(rows, 2) if len(row) > k and row[k].strip()]
+    if not cells:
+        raise InputError(str(path), f"has no number in the column {quoted(head[k])}")
+    return np.asarray([factor * _number(cell, f"{path}, row {line}") for line, cell in cells])
+
+
+def _matches(head: str, name: str, own: str, unit: str, column: str | None) -> bool:
+    if column is not None:
+        return column.strip().lower() in (head.lower(), name.lower())
+    return bool(own) and unit_factor(own, unit) is not None
+
+
+def _rows(path: str | Path) -> list[list[str]]:
+    """Return the rows of a CSV file, whose cells have a decimal point."""
+    text = read_text(path, "a CSV file")
+    first = text.split("\n", 1)[0]
+    separator = max(";\t,", key=lambda each: (first.count(each) > 0, each != ","))
+    rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if any(row)]
+    if len(rows) < 2:
+        raise InputError(str(path), "has no rows; the first row has the names of the columns, the others numbers")
+    return rows if separator == "," else [rows[0], *([cell.replace(",", ".") for cell in row] for row in rows[1:])]
+
+
+def _number(cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError as error:
+        raise InputError(where, f"has {quoted(cell)}, which is not a number") from error
+    if not np.isfinite(value):
+        raise InputError(where, f"has {quoted(cell)}; a finite number is needed")
+    return value

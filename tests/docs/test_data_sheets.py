@@ -1,0 +1,47 @@
+"""The four machines of the guide: files of at most ten lines, equal to the same in Python, that meet their data sheets."""
+
+import pathlib
+import re
+
+import jax
+import numpy as np
+import pytest
+
+import jaxvib as jv
+
+PAGE = (pathlib.Path(__file__).parents[2] / "docs" / "data_sheets.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r"```toml\n# (\w+)\.toml\n(.*?)```", PAGE, flags=re.S))
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """The scenes of the blocks of Python, whose computations are left out."""
+    blocks = "\n".join(re.findall(r"```python\n(.*?)```", PAGE, flags=re.S))
+    lines = [line for line in blocks.splitlines() if not re.match(r"print|run =|throw =|regime =", line)]
+    made = {}
+    exec(compile("\n".join(lines), "data_sheets", "exec"), made)
+    return {f"my_{name}": made[name] for name in ("screen", "feeder", "table", "rotor")}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_of_ten_lines_equals_the_python(name, scenes):
+    assert len(FILES[name].strip().splitlines()) <= 10
+    from_file = jv.scene_from_toml(FILES[name])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), from_file, scenes[name])
+    assert len(FILES) == 4 and len(re.findall(rf"^    jaxvib \w+ {name}\.toml", PAGE, flags=re.M)) == 2
+
+
+@pytest.mark.parametrize(("name", "stroke", "angle"), [("my_screen", 7.0, 45.0), ("my_feeder", 4.0, 25.0)])
+def test_the_deck_has_the_stroke_of_the_data_sheet(name, stroke, angle, scenes):
+    regime = jv.synchronous_regimes(scenes[name]).select(0)
+    assert bool(regime.stable)
+    path = regime.ellipse((0.0, 0.1))
+    assert 2e3 * float(path.semi_major) == pytest.approx(stroke, rel=0.12)
+    assert np.degrees(float(path.direction)) == pytest.approx(angle, abs=4.0)
+
+
+def test_the_table_has_its_amplitude(scenes):
+    jam = jv.jam_modes(scenes["my_table"]).select(1)
+    assert bool(jam.stable)
+    assert 1e3 * float(jam.amplitude[0]) == pytest.approx(8.0, rel=0.05)
+    assert float(jam.omega) * 30.0 / np.pi == pytest.approx(780.0, rel=0.02)

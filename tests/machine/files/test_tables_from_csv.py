@@ -1,0 +1,99 @@
+"""Columns of CSV files: catalogues of springs in designs, torques of motors in scene files."""
+
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from optimize import load_design
+
+SCENE = """[machine]
+kind = "one_mass"
+mass = 50.0
+stiffness = "40 N/mm"
+damping = 30.0
+[loads]
+kind = "ball"
+count = 2
+mass = 0.5
+radius = 0.1
+drag = 1.0
+[drive]
+kind = "torque_table"
+file = "curves/motor.csv"
+inertia = 0.02
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "part,rate (N/mm),free length (mm)\nA,12.5,80\nB,20,90\n",
+        "part;rate [N/mm];free length [mm]\nA;12,5;80\nB;20,0;90\n",
+        "part\trate / N/mm\tfree length / mm\nA\t12.5\t80\n\t\t\nB\t20\t90\n",
+        "\ufeffpart;rate (kN/m);free length (mm)\r\nA;12,5;80\r\nC;;95\r\nB;2,0e1;90\r\n",
+    ],
+)
+def test_a_column_is_read_in_si(text, tmp_path):
+    path = tmp_path / "springs.csv"
+    path.write_bytes(text.encode())
+    np.testing.assert_allclose(jv.csv_column(path, "N/m"), [12.5e3, 20e3], rtol=1e-14)
+    np.testing.assert_allclose(jv.csv_column(path, "N/m", "rate"), [12.5e3, 20e3], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "words"),
+    [
+        ("rate (N/mm)\n", None, "has no rows"),
+        ("a (N/mm),b (N/m)\n1,2\n", None, "has 2 columns with a unit such as N/m; name one as column"),
+        ("a (N/mm),b (N/m)\n1,2\n", "c", "has no columns 'c'; name one as column, the columns are: 'a .N/mm.', 'b .N/m.'"),
+        ("a (mm)\n1\n", "a", "without a unit of N/m; write a .N/m."),
+        ("a (N/mm)\n1\ntwo\n", None, "row 3 has 'two', which is not a number"),
+        ("a (N/mm)\nnan\n", None, "a finite number is needed"),
+        ("a (N/mm);b\n;3\n", None, "has no number in the column"),
+    ],
+)
+def test_wrong_tables_are_refused(text, column, words, tmp_path):
+    path = tmp_path / "springs.csv"
+    path.write_text(text)
+    with pytest.raises(jv.InputError, match=words):
+        jv.csv_column(path, "N/m", column)
+
+
+def test_a_torque_table_is_read_beside_its_scene(tmp_path):
+    (tmp_path / "curves").mkdir()
+    (tmp_path / "curves" / "motor.csv").write_text("speed (rpm);torque (Nm)\n0;15\n1000;22,5\n1500;0\n")
+    (tmp_path / "machine.toml").write_text(SCENE)
+    drive = jv.load_scene(tmp_path / "machine.toml").drive
+    same = jv.TorqueTable(["0 rpm", "1000 rpm", "1500 rpm"], [15.0, 22.5, 0.0], inertia=0.02)
+    np.testing.assert_allclose(drive.torques, same.torques, rtol=1e-14)
+    np.testing.assert_allclose(drive.speeds, same.speeds, rtol=1e-14)
+    with pytest.raises(jv.InputError, match=r"drive\.file is not a field here"):
+        jv.scene_from_toml(SCENE)
+
+
+def test_choices_of_a_design_come_from_a_catalogue(tmp_path):
+    (tmp_path / "springs.csv").write_text("rate (N/mm)\n30\n40\n55\n")
+    motor = 'kind = "torque_table"\nfile = "curves/motor.csv"\ninertia = 0.02\n'
+    (tmp_path / "machine.toml").write_text(SCENE.replace(motor, 'kind = "constant_speed"\nspeed = "1500 rpm"\n'))
+    design = 'scene = "machine.toml"\n[choices]\n"machine.stiffness" = { file = "springs.csv", column = "rate" }\n'
+    objective = '[objective]\nquantity = "foundation_force"\nmode = 1\n'
+    (tmp_path / "design.toml").write_text(design + objective)
+    space = load_design(tmp_path / "design.toml").space
+    assert [list(choice.values) for choice in space.choices] == [[30e3, 40e3, 55e3]]
+    (tmp_path / "design.toml").write_text(design.replace("file =", "path =") + objective)
+    with pytest.raises(jv.InputError, match=r"write a list, or file = 'springs.csv', column = 'rate'"):
+        load_design(tmp_path / "design.toml")
+
+
+def test_a_csv_file_with_decimal_commas_is_read_back(tmp_path):
+    scene = jv.Scene(
+        jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
+        jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5),
+        jv.ConstantSpeed(60.0),
+    )
+    from jaxvib.results.csv import write_csv
+
+    path = write_csv(jv.whirl(scene, [10.0, 20.5]), "rotor_speed", tmp_path / "whirl.csv", decimal_comma=True)
+    lines = path.read_text().splitlines()
+    assert lines[0].startswith("rotor_speed (rad/s);speed 1 (rad/s)") and lines[2].startswith("20,5;")
+    np.testing.assert_allclose(jv.csv_column(path, "rad/s", "rotor_speed"), [10.0, 20.5], rtol=1e-9)
