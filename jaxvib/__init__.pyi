@@ -132,7 +132,9 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 from jaxvib.identification.checks import FitStatus
 from jaxvib.identification.directions import Direction
 from jaxvib.identification.identify import MachineFit, identify
-from jaxvib.identification.plan import PlannedRun, RunPlan, plan_runs
+from jaxvib.identification.further_runs.plan import RunPlan, plan_runs
+from jaxvib.identification.further_runs.planned import PlannedRun
+from jaxvib.identification.further_runs.predict import PredictionStatus, RunPrediction, predict_run
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.exchange.recordings.read import read_recording, read_run
@@ -357,6 +359,9 @@ __all__ = [
     "PlannedRun",
     "RunPlan",
     "plan_runs",
+    "PredictionStatus",
+    "RunPrediction",
+    "predict_run",
     "MeasuredRun",
     "read_run",
     "read_recording",

@@ -120,11 +120,14 @@ def cached(make):
     return one
 
 
+def measured_run():
+    t, frame = np.arange(0.0, 10.0, 0.005), jv.Channel("frame", "acceleration", at=1)
+    return jv.MeasuredRun.from_arrays([frame], t, {"frame": np.random.default_rng(0).normal(size=t.size)})
+
+
 def machine_fit():
     scene = jv.Scene(MACHINE, exciters=[jv.Exciter(drive=jv.RunUp(60.0, acceleration=6.0), unbalance=0.05)])
-    t, frame = np.arange(0.0, 10.0, 0.005), jv.Channel("frame", "acceleration", at=1)
-    run = jv.MeasuredRun.from_arrays([frame], t, {"frame": np.random.default_rng(0).normal(size=t.size)})
-    return jv.identify(scene, run, unknown=["machine.stiffness", "machine.damping"], throw=False)
+    return jv.identify(scene, measured_run(), unknown=["machine.stiffness", "machine.damping"], throw=False)
 
 
 RESULTS = {
@@ -168,6 +171,7 @@ RESULTS = {
             )
         ],
     ),
+    "RunPrediction": lambda: jv.predict_run(RESULTS["MachineFit"](), measured_run()),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "RunUps": run_ups,
     "Capture": lambda: _summarize_captures(
@@ -194,8 +198,8 @@ RESULTS = {
 
 # fmt: off
 SEVERAL_PANELS = ["Run", "Envelope", "MotorRunUp", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-                  "BalancedStates", "Swing", "Identified", "MachineFit", "RunUps", "Audit", "SynchronousRegimes",
-                  "SynchronousOrbit"]
+                  "BalancedStates", "Swing", "Identified", "MachineFit", "RunPrediction", "RunUps", "Audit",
+                  "SynchronousRegimes", "SynchronousOrbit"]
 # fmt: on
 
 

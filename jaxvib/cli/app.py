@@ -152,6 +152,7 @@ _GROUPS = {
         "show": "study.sweep",
         "record": "study.record",
         "identify": "study.identify",
+        "plan": "study.plan",
     },
     "Accuracy": {"cost": "study.cost", "audit": "study.audit"},
     "Other tools": {"export": "export"},
@@ -164,6 +165,7 @@ _ARGUMENTS = {
     "scene": "a scene file, such as `jaxvib new two-mass > machine.toml` makes",
     "design": "a design file, such as `jaxvib new design > design.toml` makes",
     "study": "a study file, such as `jaxvib new sweep > study.toml` makes",
+    "identification": "an identification file, such as `jaxvib new identification > fit.toml` makes",
     "recording": "a file of a recorder, such as run_up.csv",
     "source": "a scene file, or a run.npz that `jaxvib simulate` saved",
 }

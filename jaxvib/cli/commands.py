@@ -25,11 +25,11 @@ _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "r
 @click.argument("kind", metavar="KIND", type=click.Choice([*_MACHINES, "design", "identification", "measurement", "sweep"]))
 @shared
 def new(kind: str, output: Output) -> None:
-    """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep` or `identify`.
+    """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep`, `identify` or `plan`.
 
     KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus, linear-screen, circular-screen or feeder for a
-    machine; design for `optimize`; sweep (a study) for `sweep`; identification (recorded runs of a machine) or measurement (a
-    recorded swing) for `identify`."""
+    machine; design for `optimize`; sweep (a study) for `sweep`; identification (recorded runs of a machine) for `identify` and
+    `plan`; measurement (a recorded swing) for `identify`."""
     from jaxvib.exchange.recordings.fit_file import TEMPLATE as IDENTIFICATION
     from jaxvib.machine.files import TEMPLATES
     from jaxvib.machine.structures.screens import SCREENS

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
-from jaxvib.identification.directions import Information
-from jaxvib.identification.fit import Fitted
+from jaxvib.identification.directions import Information, eliminate, elimination, polar_unbalances
+from jaxvib.identification.fit import Fitted, prior_equations, run_equations
 
-_CHANCE = 1e-5
+CHANCE = 1e-5
 """Share of records with pure noise about the fit that get the status `patterned`."""
 
 _WINDOWS, _ORDERS = 16, 3
@@ -38,7 +39,9 @@ class FitStatus(eqx.Enumeration):
         "start from better values"
     )
     undetermined = "the records do not determine all unknowns: see `undetermined` for the directions and how to determine them"
-    contradicted = "the records contradict a known value or the calibration of a sensor: see the notes, and check that value"
+    contradicted = (
+        "the records contradict one another, a known value or the calibration of a sensor: see the notes, and check that value"
+    )
     not_converged = (
         "no fit was found: the model does not resemble the records; check places and directions of the channels and the "
         "rotor's angle, or start from better values"
@@ -47,7 +50,7 @@ class FitStatus(eqx.Enumeration):
 
 def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, list[str]]:
     """Return the status of a fit, the smallest chance of its residuals under pure noise, and notes."""
-    chance, notes = 1.0, list(_contradictions(fitted))
+    chance, notes = 1.0, [*_contradictions(fitted), *_disagreements(fitted)]
     contradicted = bool(notes)
     explained, is_inaccurate = [], False
     for k, (samples, left, raw, mask) in enumerate(
@@ -66,14 +69,14 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
                 )
             explained.append(np.std(left[valid, c]) / max(float(np.std(raw[valid, c])), 1e-300))
             one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], fitted.problem.angles[k][:, 0], fitted.x.size)
-            if one < _CHANCE:
+            if one < CHANCE:
                 notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with the rotor's angle")
             chance = min(chance, one)
     if not fitted.converged or min(explained) > _UNEXPLAINED:
         return FitStatus.not_converged, chance, notes
     if contradicted:
         return FitStatus.contradicted, chance, notes
-    if chance < _CHANCE or is_inaccurate:
+    if chance < CHANCE or is_inaccurate:
         return FitStatus.patterned, chance, notes
     return FitStatus.undetermined if found.undetermined.size else FitStatus.found, chance, notes
 
@@ -130,3 +133,77 @@ def _contradictions(fitted: Fitted) -> Iterator[str]:
             away = abs(float(np.hypot(*fitted.linear[2 * k : 2 * k + 2])) - known.value) / known.error
             if away > _CONTRADICTION:
                 yield f"exciters[{k}].unbalance is {away:.1f} standard errors away from its known value"
+
+
+class Disagreement(NamedTuple):
+    """Deviation of a run from other runs: its `chance` if the machine is the same; `name` of the number whose change explains
+    most of it, that relative `change` and its standard `error`."""
+
+    chance: float
+    name: str
+    change: float
+    error: float
+
+    def sentence(self, run: str) -> str:
+        """Return the deviation of a run as a sentence."""
+        return (
+            f"{run} deviates from the others by more than their errors (chance {self.chance:.1g}); a change of {self.name} by "
+            f"{self.change:+.3g} +- {1.96 * self.error:.1g} explains most of it"
+        )
+
+
+def disagreement(held: np.ndarray, run: np.ndarray, gradient: np.ndarray, names: Sequence[str]) -> Disagreement:
+    """Return the deviation of a run by the ratio of likelihoods of "own numbers" to "the numbers of the others".
+
+    **Arguments**: information (k, k) of the others, `held`, and of the run, about relative changes of k numbers; `gradient` of
+    the run, J^T residuals/noise^2, at the numbers that fit the others and the run together; `names` (k,).
+
+    >>> held, run = np.array([[400.0]]), np.array([[100.0]])    # 0 +- 0.05 and 0.6 +- 0.1, together 0.12
+    >>> found = disagreement(held, run, 100.0 * np.array([0.6 - 0.12]), ["mass"])
+    >>> bool(abs(found.change - 0.6) < 1e-12), bool(abs(found.error**2 - 0.1**2 - 0.05**2) < 1e-12), found.chance < 1e-7
+    (True, True, True)
+    """
+    from scipy.special import chdtrc  # slow to import
+
+    (alone, ranks), (others, more), (together, both) = pseudoinverse(run), pseudoinverse(held), pseudoinverse(held + run)
+    freedom, size = ranks + more - both, np.diagonal(held + run)
+    shared = np.diagonal(held @ together @ run)  # information about the difference between the run and the others
+    known = np.where(shared > 1e-9 * size, shared, np.inf)
+    most = int(np.argmax(gradient**2 / known))
+    if freedom < 1 or not np.isfinite(known[most]):
+        return Disagreement(1.0, names[most], 0.0, math.inf)
+    statistic = float(gradient @ (alone + others) @ gradient)
+    change, error = gradient[most] / known[most], 1.0 / math.sqrt(known[most])
+    return Disagreement(float(chdtrc(freedom, statistic)), names[most], float(change), float(error))
+
+
+def pseudoinverse(matrix: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the pseudoinverse of an information matrix, on the scale of its diagonal, and its rank."""
+    size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(size, size))
+    kept = values > 1e-10 * max(float(values[-1]), 1e-300)
+    root = vectors[:, kept] / size[:, None]
+    return (root / values[kept]) @ root.T, int(np.count_nonzero(kept))
+
+
+def _disagreements(fitted: Fitted) -> Iterator[str]:
+    """Yield sentences about runs that contradict the other runs."""
+    problem, unknowns, p = fitted.problem, fitted.problem.unknowns, fitted.x.size
+    if len(problem.runs) < 2:
+        return
+    exciters = range(len(problem.unbalances))
+    own = np.array([*range(p - unknowns.turns), *range(p, p + 2 * len(exciters))])
+    names = [*(number.name for number in unknowns.numbers), *(f"the gain of channel {name!r}" for name in unknowns.gains)]
+    names += [f"{what} exciters[{k}].unbalance" for k in exciters for what in ("the size of", "the angle (rad) of")]
+    turn, _ = polar_unbalances(problem, fitted.linear)
+    parts = []
+    equations = [(each[:-1, :-1], each[:-1, -1]) for each in run_equations(problem, fitted.x, fitted.linear)]
+    for matrix, gradient in (*equations, prior_equations(problem, fitted.x, fitted.linear)):
+        polar = turn.T @ matrix @ turn
+        parts.append((eliminate(polar, own), elimination(polar, own).T @ (turn.T @ gradient)))
+    total, left = (np.sum(each, axis=0) for each in zip(*parts, strict=True))
+    step = pseudoinverse(total)[0] @ left  # to the exact minimum, which matters for a run with much less information
+    for k, (part, gradient) in enumerate(parts[:-1]):
+        found = disagreement(total - part, part, gradient - part @ step, names)
+        if found.chance < CHANCE:
+            yield found.sentence(f"run {k + 1}")

@@ -133,27 +133,49 @@ def free_unbalances(problem: Problem) -> list[int]:
 
 def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the information of data and of known values, with (logarithm of the size, angle) of each unbalance; the sizes."""
-    p, exciters = fitted.x.size, len(fitted.problem.unbalances)
-    turn, sizes = np.eye(p + fitted.linear.size), np.zeros(exciters)
+    turn, sizes = polar_unbalances(fitted.problem, fitted.linear)
+    return turn.T @ fitted.information @ turn, turn.T @ fitted.prior @ turn, sizes
+
+
+def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of all unknowns by those with (logarithm of the size, angle) of each unbalance; the sizes."""
+    p, exciters = problem.unknowns.count, len(problem.unbalances)
+    turn, sizes = np.eye(p + linear.size), np.zeros(exciters)
     for k in range(exciters):
-        a, b = fitted.linear[2 * k : 2 * k + 2]
+        a, b = linear[2 * k : 2 * k + 2]
         sizes[k] = float(np.hypot(a, b))
         turn[p + 2 * k : p + 2 * k + 2, p + 2 * k : p + 2 * k + 2] = [[a, -b], [b, a]]
-    return turn.T @ fitted.information @ turn, turn.T @ fitted.prior @ turn, sizes
+    return turn, sizes
 
 
 def eliminate(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
     """Return the information about the unknowns `own` if all others are free."""
-    rest = np.setdiff1d(np.arange(matrix.shape[0]), own)
-    rest = rest[np.diagonal(matrix)[rest] > 0.0]
-    if not rest.size:
-        return matrix[np.ix_(own, own)]
-    size = np.sqrt(np.diagonal(matrix)[rest])
-    inner = matrix[np.ix_(rest, rest)] / np.outer(size, size)
-    values, vectors = np.linalg.eigh(inner)
-    kept = values > 1e-12 * values[-1]
-    coupling = (matrix[np.ix_(own, rest)] / size) @ vectors[:, kept] / np.sqrt(values[kept])
+    free, size, vectors, values = _free(matrix, own)
+    coupling = (matrix[np.ix_(own, free)] / size) @ vectors / np.sqrt(values)
     return matrix[np.ix_(own, own)] - coupling @ coupling.T
+
+
+def elimination(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Return L with the changes of all unknowns per change of the unknowns `own`, if all others are free.
+
+    `eliminate` is L^T matrix L, and for a change of the matrix L^T change L.
+    """
+    free, size, vectors, values = _free(matrix, own)
+    found = np.zeros((matrix.shape[0], own.size))
+    found[own, np.arange(own.size)] = 1.0
+    found[free] = -((vectors / values) @ vectors.T @ (matrix[np.ix_(free, own)] / size[:, None])) / size[:, None]
+    return found
+
+
+def _free(matrix: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the unknowns other than `own` (r,), their scales (r,), and the eigenvectors (r, s) and eigenvalues (s,) > 0 of
+    their scaled information."""
+    free = np.setdiff1d(np.arange(matrix.shape[0]), own)
+    free = free[np.diagonal(matrix)[free] > 0.0]
+    size = np.sqrt(np.diagonal(matrix)[free])
+    values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / np.outer(size, size))
+    kept = values > 1e-12 * np.max(values, initial=0.0)
+    return free, size, vectors[:, kept], values[kept]
 
 
 def _errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

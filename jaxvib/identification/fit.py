@@ -61,7 +61,7 @@ class _Trial(NamedTuple):
     cost: float
 
 
-def _places(problem: Problem) -> list[np.ndarray]:
+def linear_places(problem: Problem) -> list[np.ndarray]:
     """Return, for each run, the places of its linear unknowns (state, unbalances, offsets) among all linear unknowns."""
     exciters = len(problem.unbalances)
     places, after = [], 2 * exciters
@@ -75,7 +75,7 @@ def _places(problem: Problem) -> list[np.ndarray]:
 
 
 def _linear_count(problem: Problem) -> int:
-    return int(max(place.max() for place in _places(problem))) + 1
+    return int(max(place.max() for place in linear_places(problem))) + 1
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -104,11 +104,7 @@ def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, n
 
 def _project(problem: Problem, x: np.ndarray) -> _Trial:
     """Return the best linear unknowns at `x`, and their cost."""
-    total = np.zeros((_linear_count(problem) + 1,) * 2)
-    for samples, place in zip(problem.runs, _places(problem), strict=True):
-        part = np.asarray(linear_equations(problem.unknowns, samples, problem.scene, jnp.asarray(x)))
-        where = np.append(place, total.shape[0] - 1)
-        total[np.ix_(where, where)] += part
+    total = _linear_equations(problem, x)
     matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
     if not np.all(np.isfinite(total)):
         return _Trial(x, np.zeros(len(right)), np.inf)
@@ -128,22 +124,52 @@ def _project(problem: Problem, x: np.ndarray) -> _Trial:
     return _Trial(x, linear, max(float(data), 0.0) + away + prior_cost)
 
 
+def _linear_equations(problem: Problem, x: np.ndarray) -> np.ndarray:
+    """Return the normal equations (L + 1, L + 1) of the linear unknowns and the readings at `x`."""
+    total = np.zeros((_linear_count(problem) + 1,) * 2)
+    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
+        part = np.asarray(linear_equations(problem.unknowns, samples, problem.scene, jnp.asarray(x)))
+        where = np.append(place, total.shape[0] - 1)
+        total[np.ix_(where, where)] += part
+    return total
+
+
+def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> np.ndarray:
+    """Return the best linear unknowns at `x`, with the components (a, b) of each unbalance if they are not None."""
+    if unbalance is None:
+        return _project(problem, x).linear
+    total, n = _linear_equations(problem, x), unbalance.size
+    return np.concatenate([unbalance, _solve(total[n:-1, n:-1], total[n:-1, -1] - total[n:-1, :n] @ unbalance)])
+
+
+def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
+    """Return the normal equations (p + L + 1, p + L + 1) of each run: of all unknowns and the residuals."""
+    p, size, found = x.size, x.size + linear.size, []
+    for samples, place in zip(problem.runs, linear_places(problem), strict=True):
+        own = jnp.asarray(linear[place])
+        where, total = np.concatenate([np.arange(p), p + place, [size]]), np.zeros((size + 1, size + 1))
+        total[np.ix_(where, where)] = np.asarray(
+            normal_equations(problem.unknowns, samples, problem.scene, jnp.asarray(x), own)
+        )
+        found.append(total)
+    return found
+
+
+def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the information (p + L, p + L) and the gradient (p + L,) of the known values."""
+    p, size = x.size, x.size + linear.size
+    prior, gradient = np.zeros((size, size)), np.zeros(size)
+    prior[np.arange(p), np.arange(p)] = problem.precisions
+    gradient[:p] = -problem.precisions * (x - problem.means)
+    prior[p:, p:], gradient[p:], _ = unbalance_prior(problem, linear)
+    return prior, gradient
+
+
 def _equations(problem: Problem, trial: _Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the information of the data, that of known values, both (p + L, p + L), and the gradient (p + L,)."""
-    p, size = trial.x.size, trial.x.size + trial.linear.size
-    total = np.zeros((size + 1, size + 1))
-    for samples, place in zip(problem.runs, _places(problem), strict=True):
-        linear = jnp.asarray(trial.linear[place])
-        part = np.asarray(normal_equations(problem.unknowns, samples, problem.scene, jnp.asarray(trial.x), linear))
-        where = np.concatenate([np.arange(p), p + place, [size]])
-        total[np.ix_(where, where)] += part
-    prior, gradient = np.zeros((size, size)), total[:-1, -1].copy()
-    prior[np.arange(p), np.arange(p)] = problem.precisions
-    gradient[:p] -= problem.precisions * (trial.x - problem.means)
-    information, slope, _ = unbalance_prior(problem, trial.linear)
-    prior[p:, p:] += information
-    gradient[p:] += slope
-    return total[:-1, :-1], prior, gradient
+    total = np.sum(run_equations(problem, trial.x, trial.linear), axis=0)
+    prior, gradient = prior_equations(problem, trial.x, trial.linear)
+    return total[:-1, :-1], prior, total[:-1, -1] + gradient
 
 
 def _minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
@@ -175,7 +201,7 @@ def _minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.n
 def residuals_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
     """Return readings minus model (n, C) of each run, NaN for samples that do not count."""
     found = []
-    for samples, place, raw, mask in zip(problem.runs, _places(problem), problem.raw, problem.masks, strict=True):
+    for samples, place, raw, mask in zip(problem.runs, linear_places(problem), problem.raw, problem.masks, strict=True):
         model = model_readings(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
         shown = np.stack(
             [

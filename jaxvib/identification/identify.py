@@ -18,6 +18,7 @@ from jaxvib.identification.directions import (
     combined_information,
     directions_of,
     eliminate,
+    free_unbalances,
     in_polar_unbalances,
     information_of,
 )
@@ -42,6 +43,9 @@ if TYPE_CHECKING:
 
 QUANTILE = 1.959964
 """97.5 % quantile of the normal distribution."""
+
+_RETURNS = 2
+"""Number of times that undetermined combinations of numbers are moved back to their first values."""
 
 _STEP = 1e-4
 """Relative change of a number in a difference quotient."""
@@ -217,10 +221,31 @@ def identify(
     scene = validate_scene(subject)
     problem = build_problem(scene, runs, unknown, known or {})
     fitted = fit_from(problem, [np.zeros(problem.unknowns.count), track_orders(problem)])
-    found = _interpret(scene, fitted)
+    found = _interpret(scene, _near_first_values(scene, problem, fitted))
     if throw and bool(found.status == FitStatus.not_converged):
         raise ComputationError("not_converged", found.message)
     return found
+
+
+def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted:
+    """Return a fit in which undetermined combinations of numbers have nearly their first values.
+
+    The fit leaves them anywhere along a curved valley of equal residuals. Plans of further runs depend on them.
+    """
+    first = [float(np.asarray(scene.exciters[k].unbalance, float)) for k in free_unbalances(problem)]
+    for _ in range(_RETURNS):
+        known = information_of(fitted)
+        axes, moved = known.undetermined, len(problem.unknowns.numbers)
+        if not axes.size or not fitted.converged:
+            break
+        away = np.concatenate([fitted.x[:moved], np.log(known.values[moved:] / first)])
+        start = fitted.x.copy()
+        start[:moved] -= (axes @ (axes.T @ away))[:moved]
+        back = fit_from(problem, [start])
+        if not back.converged:
+            break
+        fitted = back
+    return fitted
 
 
 def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:

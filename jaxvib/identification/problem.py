@@ -14,7 +14,7 @@ import numpy as np
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
-from jaxvib.identification.response import GAUSS_POINTS, STRETCH, Samples, Unknowns, rows_of_channel, state_count
+from jaxvib.identification.response import GAUSS_POINTS, STRETCH, Samples, Unknowns, rotor_force, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import GravityField
@@ -31,7 +31,7 @@ UNUSED = ("torque", "current")
 _UNEVEN = 0.02
 """Largest deviation of a sample from the even grid, in steps."""
 
-_EXACT = 1e-4
+EXACT = 1e-4
 """Relative standard deviation of an unbalance that counts as known exactly."""
 
 _FILTER_LENGTHS = (1, 9, 49, 129, 513)
@@ -49,8 +49,8 @@ class Known(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """True for a number without an error; for an unbalance the error `_EXACT` stands for 0."""
-        return self.error <= 1.001 * _EXACT * abs(self.value)
+        """True for a number without an error; for an unbalance the error `EXACT` stands for 0."""
+        return self.error <= 1.001 * EXACT * abs(self.value)
 
 
 class Problem(NamedTuple):
@@ -216,7 +216,7 @@ def _known_unbalance(
     if number.name in found and found[number.name][1].error > 0.0:
         return found[number.name][1]
     value = float(number.read(scene)[0])
-    return None if number.name in free else Known(value, _EXACT * value)
+    return None if number.name in free else Known(value, EXACT * value)
 
 
 def _changes(scene: Scene, run: MeasuredRun) -> tuple[list[NamedNumber], list[str], list[float]]:
@@ -278,8 +278,7 @@ def _samples(
     nodes[-1] = np.minimum(nodes[-1], nodes[-1, 0])  # the last step begins at the last sample, and its force is not used
     for k, (angle, exciter) in enumerate(zip(angles, scene.exciters, strict=True)):
         theta, rate, acceleration = angle.at(nodes)
-        rotating = (rate**2 - 1j * exciter.direction * acceleration) * np.exp(1j * exciter.direction * theta)
-        force[:count, :, 2 * k], force[:count, :, 2 * k + 1] = rotating.real, rotating.imag
+        force[:count, :, 2 * k : 2 * k + 2] = rotor_force(theta, rate, acceleration, exciter.direction)
         turned[:count, k] = theta[:, 0]
     numbers, actions, amounts = _changes(scene, run)
     samples = Samples(

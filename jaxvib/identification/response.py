@@ -16,7 +16,7 @@ same steps. The normal equations of a whole record are summed over stretches, wh
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -120,6 +120,14 @@ class _Steps(NamedTuple):
     inputs: Array
     outputs: Array
     through: Array
+
+
+def rotor_force(angle: Any, speed: Any, acceleration: Any, direction: int) -> Any:
+    """Return F = -p'' (..., 2), (across, up), per unit of the unbalance, of NumPy or JAX arrays (...) of a rotor's motion."""
+    xp = np if isinstance(angle, np.ndarray) else jnp
+    cos, sin = xp.cos(direction * angle), xp.sin(direction * angle)
+    turned = direction * acceleration
+    return xp.stack([speed**2 * cos + turned * sin, speed**2 * sin - turned * cos], axis=-1)
 
 
 def state_count(scene: Scene, channels: tuple[Channel, ...]) -> int:
@@ -327,7 +335,9 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
     count, size = x.shape[0], x.shape[0] + linear.shape[0] + 1
     before = jnp.zeros((samples.taps.shape[0] - 1, len(samples.channels), count))
     start = (first, (state, jnp.zeros((count, state.shape[0])), before), jnp.zeros((size, size)))
-    (_, _, total), _ = jax.lax.scan(stretch, start, (samples.force, samples.readings, samples.weights))
+    # Reverse derivatives compute each stretch again and keep only the states between the stretches.
+    parts = samples.force, samples.readings, samples.weights
+    (_, _, total), _ = jax.lax.scan(jax.checkpoint(stretch), start, parts)
     return total
 
 

@@ -312,6 +312,11 @@ def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -
     return build_part(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
 
+def build_drive(table: object, section: str) -> Drive:
+    """Return the drive of a table with its `kind`. **Raises** `InputError` for an unknown or missing name."""
+    return _built(table, section, DRIVES)
+
+
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
     """Return `build(**values)`. **Raises** `InputError` for an unknown or missing name, as `section.name`."""
     parameters = inspect.signature(build).parameters

@@ -111,3 +111,58 @@ def test_wrong_identification_files(typed, tmp_path, old, new, says):
 def test_options_of_a_pendulum_are_refused_for_a_machine(typed):
     code, out, err = typed("identify", "fit.toml", "--mass", "3 kg")
     assert (code, out) == (2, "") and "--mass is for the swing of a pendulum; leave it out for a machine" in err
+
+
+CANDIDATES = """
+[[candidate]]
+name = "again"
+drive = { kind = "run_up", speed = "100 rad/s", acceleration = "8 rad/s^2" }
+duration = "12 s"
+
+[[candidate]]
+name = "heavier"
+drive = { kind = "speed_profile", times = [0.0, 12.0], speeds = [100.0, 0.0] }
+duration = "12 s"
+at = { frame = 2, deck = 1 }
+change = { "machine.mass[0]" = "+10 kg" }
+
+[limits]
+speed = "100 rad/s"
+acceleration = "12 rad/s^2"
+"""
+
+
+@pytest.mark.slow
+def test_candidate_runs_are_ranked_from_the_command_line(typed, tmp_path):
+    (tmp_path / "fit.toml").write_text(FIT + CANDIDATES)
+    assert typed("identify", "fit.toml", "--out", "o")[0] == 0
+    code, out, err = typed("plan", "fit.toml", "--fit", "o/fit.npz", "--json", "--out", "o")
+    document = json.loads(out)
+    assert (code, err) == (0, "")
+    assert {"again", "heavier"} < set(document["candidates"]) and len(document["candidates"]) == 3
+    assert document["gain"] == sorted(document["gain"], reverse=True) and document["minutes"] == [0.2] * 3
+    assert len(document["profile"]["speeds"]) == 9 and max(document["profile"]["speeds"]) <= 100.0
+    assert len(document["errors"]) == 3 and all(0.0 < error < 0.05 for row in document["errors"] for error in row)
+    assert (tmp_path / "o" / "plan.png").stat().st_size > 5_000
+    code, out, _ = typed("plan", "fit.toml", "--fit", "o/fit.npz")
+    assert code == 0 and "improved speed" in out and "(1) machine.stiffness[0]" in out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (CANDIDATES, "", "candidate is missing; write [[candidate]] for each run"),
+        ('name = "again"', "", "candidate[0].name is missing"),
+        ('name = "again"', 'name = "again"\nspeed = 3', "candidate[0].speed is not a field here"),
+        ("frame = 2", "frme = 2", "candidate[1].at.frme is not a channel; the channels are: frame, deck, tacho"),
+        ('kind = "run_up"', 'kind = "ramp"', "candidate[0].drive.kind is 'ramp'"),
+        ('kind = "run_up", speed = "100 rad/s", acceleration = "8 rad/s^2"', 'kind = "dc_motor", speed = 100.0, '
+         "stall_torque = 5.0, inertia = 0.1", "candidate[0].drive is 'dc_motor', whose speed depends on the machine"),
+        ('"12 s"', '"12 kg"', "candidate[0].duration"),
+        ('[limits]\nspeed = "100 rad/s"', "[limits]", "limits.speed is missing"),
+    ],
+)  # fmt: skip
+def test_wrong_candidates_end_in_one_sentence(typed, tmp_path, old, new, says):
+    (tmp_path / "fit.toml").write_text((FIT + CANDIDATES).replace(old, new, 1))
+    code, out, err = typed("plan", "fit.toml")
+    assert (code, out) == (2, "") and says in err and err.count("\n") == 1, err

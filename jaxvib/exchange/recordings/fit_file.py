@@ -1,4 +1,4 @@
-"""Identification files: a machine, recorded runs, their channels, and the unknown numbers."""
+"""Identification files: a machine, recorded runs, their channels, the unknown numbers, and runs to plan."""
 
 from __future__ import annotations
 
@@ -8,31 +8,38 @@ from typing import NamedTuple
 
 from jaxvib.errors import InputError, quoted, within
 from jaxvib.exchange.recordings.read import read_run
+from jaxvib.identification.further_runs.planned import PlannedRun
+from jaxvib.identification.problem import MOTIONS
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.machine.files import Tables, build_part, load_scene, suggest_name
+from jaxvib.machine.files import Tables, build_drive, build_part, load_scene, suggest_name
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number
 
-FIT_TABLES = ["machine", "run", "channel", "identify"]
+FIT_TABLES = ["machine", "run", "channel", "identify", "candidate", "limits"]
 
 _RUN_FIELDS = {"file": "file", "from": "start", "until": "until", "rate": "rate", "change": "change"}
 """Names of fields of a run in a file, and in Python, in which `from` is a keyword."""
 
 
+_CANDIDATE_FIELDS = ["name", "drive", "duration", "rate", "at", "noise", "change", "channel"]
+
+
 class FitInput(NamedTuple):
-    """Arguments of `identify`: `scene`, `runs`, names of `unknown` numbers, `known` numbers with their errors; and the path of
-    the `scene_file`."""
+    """Arguments of `identify`: `scene`, `runs`, names of `unknown` numbers, `known` numbers with their errors; those of
+    `plan_runs`: `candidates` and `limits`; and the path of the `scene_file`."""
 
     scene_file: Path
     scene: Scene
     runs: tuple[MeasuredRun, ...]
     unknown: tuple[str, ...]
     known: dict[str, Number]
+    candidates: tuple[PlannedRun, ...]
+    limits: dict[str, Number] | None
 
 
 def fit_from_tables(tables: Tables, folder: Path) -> FitInput:
-    """Return the arguments of `identify` from the tables of an identification file in `folder`, see `TEMPLATE`.
+    """Return the arguments of `identify` and `plan_runs` from the tables of an identification file in `folder`, see `TEMPLATE`.
 
     **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not allowed.
 
@@ -48,10 +55,15 @@ def fit_from_tables(tables: Tables, folder: Path) -> FitInput:
     if not isinstance(machine, Mapping) or set(machine) != {"file"} or not isinstance(machine["file"], str):
         raise InputError("machine", 'is not the name of a scene file; write [machine] and below it file = "machine.toml"')
     options = build_part(_options, _table(tables.get("identify", {}), "identify"), "identify")
-    channels = [build_part(Channel, each, f"channel[{k}]") for k, each in enumerate(_entries(tables, "channel"))]
+    entries = _entries(tables, "channel")
+    channels = [build_part(Channel, each, f"channel[{k}]") for k, each in enumerate(entries)]
     runs = [_run(each, k, channels, folder) for k, each in enumerate(_entries(tables, "run"))]
+    planned = _entries(tables, "candidate") if "candidate" in tables else []
+    candidates = [_candidate(each, k, entries, runs[0]) for k, each in enumerate(planned)]
+    limits = dict(_table(tables["limits"], "limits")) if "limits" in tables else None
     scene_file = folder / machine["file"]
-    return FitInput(scene_file, load_scene(scene_file), tuple(runs), *options)
+    scene = load_scene(scene_file)
+    return FitInput(scene_file, scene, tuple(runs), *options, tuple(candidates), limits)  # pyright: ignore[reportArgumentType]
 
 
 def _table(value: object, name: str) -> Mapping[str, object]:
@@ -60,7 +72,7 @@ def _table(value: object, name: str) -> Mapping[str, object]:
     return value
 
 
-def _entries(tables: Tables, name: str) -> list[Mapping[str, object]]:
+def _entries(tables: Mapping[str, object], name: str) -> list[Mapping[str, object]]:
     entries = tables.get(name)
     if not isinstance(entries, list) or not entries or not all(isinstance(each, Mapping) for each in entries):
         raise InputError(name, f"is {'missing' if entries is None else quoted(entries)}; write [[{name}]] for each {name}")
@@ -80,6 +92,37 @@ def _run(table: Mapping[str, object], k: int, channels: list[Channel], folder: P
     rest = {_RUN_FIELDS[name]: value for name, value in table.items() if name != "file"}
     with within(f"run[{k}]: "):
         return read_run(folder / file, channels, **rest)  # pyright: ignore[reportArgumentType]
+
+
+def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, object]], first: MeasuredRun) -> PlannedRun:
+    """Return a planned run with the channels of the file at their own places or at others, and new ones."""
+    where = f"candidate[{k}]"
+    for name in table:
+        if name not in _CANDIDATE_FIELDS:
+            raise InputError(f"{where}.{name}", f"is not a field here; {suggest_name(name, _CANDIDATE_FIELDS)}")
+    for name in ("name", "drive", "duration"):
+        if name not in table:
+            raise InputError(f"{where}.{name}", "is missing; a candidate needs a name, a drive and a duration")
+    places, names = _table(table.get("at", {}), f"{where}.at"), [str(each["name"]) for each in channels]
+    for name in places:
+        if name not in names:
+            raise InputError(f"{where}.at.{name}", f"is not a channel; the channels are: {', '.join(names)}")
+    moved = [{**each, "at": places[name]} if name in places else each for name, each in zip(names, channels, strict=True)]
+    new = _entries(table, "channel") if "channel" in table else []
+    measured = [channel.name for channel in first.of_kind(*MOTIONS)]
+    if "rate" not in table and not measured:
+        raise InputError(f"{where}.rate", "is missing; write for example rate = '500 Hz'")
+    values: dict[str, object] = {
+        "name": table["name"],
+        "drive": build_drive(table["drive"], f"{where}.drive"),
+        "duration": table["duration"],
+        "channels": [build_part(Channel, each, f"{where}.channel") for each in (*moved, *new)],
+        "rate": table["rate"] if "rate" in table else first.rate(measured[0]),
+        "noise": table.get("noise"),
+        "change": table.get("change"),
+    }
+    with within(f"{where}."):
+        return build_part(PlannedRun, values, "")
 
 
 def _options(unknown: object = (), known: object = None) -> tuple[tuple[str, ...], dict[str, Number]]:
@@ -123,5 +166,24 @@ per_turn = 1
 [identify]
 unknown = ["machine.stiffness", "machine.damping"]
 # known = { "machine.mass[1]" = "95 kg +- 1 %" }
+
+# [[candidate]]             # for jaxvib plan: a run that could be recorded next
+# name = "slow, heavier"
+# drive = { kind = "run_up", speed = "1200 rpm", acceleration = "2 rad/s^2" }   # or constant_speed (dwell), speed_profile
+# duration = "60 s"
+# rate = "500 Hz"           # default: that of the first run
+# at = { frame = 1 }        # another place of a sensor; two names and places: sensors swapped
+# change = { "machine.mass[0]" = "+10 kg" }
+
+# [[candidate.channel]]     # one more sensor in this candidate
+# name = "deck"
+# kind = "acceleration"
+# at = 2
+# [candidate.noise]
+# deck = "0.05 m/s^2"
+
+# [limits]                  # of an improved speed of the best candidate
+# speed = "1200 rpm"
+# acceleration = "5 rad/s^2"
 """
 """Commented example of an identification file."""

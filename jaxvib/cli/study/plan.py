@@ -1,0 +1,60 @@
+"""jaxvib plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.output import fields_of
+from jaxvib.display import speed_text
+from jaxvib.errors import InputError
+
+
+@app.command("plan")
+@click.argument("identification", type=click.Path(path_type=Path))
+@click.option("--fit", type=click.Path(path_type=Path), help="A fit.npz of `jaxvib identify`, in place of a new fit.")
+@shared
+def plan(identification: Path, fit: Path | None, output: Output) -> None:
+    """Rank the candidate runs of an IDENTIFICATION file by the expected errors of its unknown numbers, per minute of test.
+
+    The file names the runs so far, as for `identify`, and each [[candidate]]: a ramp, a dwell or a coast-down, other places of
+    sensors, numbers that are changed. With the table [limits], the speed of the best candidate is improved."""
+    import numpy as np  # slow imports, which --help does not need
+
+    from jaxvib.exchange.recordings.fit_file import fit_from_tables
+    from jaxvib.machine.files import read_toml
+
+    given = fit_from_tables(read_toml(identification), identification.parent)
+    if not given.candidates:
+        raise InputError("candidate", "is missing; write [[candidate]] for each run that could be recorded next")
+    found = jv.load(fit) if fit else jv.identify(given.scene, given.runs, unknown=given.unknown, known=given.known)
+    if not isinstance(found, jv.MachineFit):
+        raise InputError("--fit", f"is a file of {type(found).__name__}; it must be a fit.npz of jaxvib identify")
+    plan = jv.plan_runs(found, given.candidates, given.limits)
+    output.picture("plan.png", plan.plot)
+    output.keep("plan.npz", plan)
+    profile = plan.profile
+    document = {"status": plan.status_name, "message": plan.message}
+    document |= fields_of(plan, "candidates", "numbers", "errors", "now", "minutes", "gain")
+    document["profile"] = None if profile is None else fields_of(profile, "times", "speeds")
+
+    def text() -> str:
+        def shown(error: float) -> str:
+            return f"{error:.2g}" if np.isfinite(error) else "none"
+
+        rows = [["so far", "", "", *map(shown, plan.now)]]
+        for name, minutes, gain, errors in zip(plan.candidates, plan.minutes, plan.gain, plan.errors, strict=True):
+            rows.append([name, f"{minutes:.3g}", f"{gain:.3g}", *map(shown, errors)])
+        heads = ["run", "minutes", "gain per minute", *(f"({k + 1})" for k in range(len(plan.numbers)))]
+        lines = [f"({k + 1}) {name}" for k, name in enumerate(plan.numbers)]
+        lines.append(table("expected relative standard errors; none: not determined", heads, rows))
+        if profile is not None:
+            points = zip(np.asarray(profile.times), np.asarray(profile.speeds), strict=True)
+            parts = [[f"{t:.4g}", speed_text(float(n), 4)] for t, n in points]
+            lines.append(table("improved speed, linear between these times", ["time, s", "speed"], parts))
+        return "\n".join(lines)
+
+    output.done(document, text, "plan", plan)

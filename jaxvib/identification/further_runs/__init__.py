@@ -1,0 +1,1 @@
+"""Runs after a fit: plans of runs to record."""

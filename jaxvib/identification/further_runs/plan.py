@@ -1,0 +1,154 @@
+"""Choice of the next run: errors of the numbers that candidate runs would leave, by the Fisher information."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.display import speed_text
+from jaxvib.errors import InputError
+from jaxvib.identification.further_runs.planned import PlannedRun, expected_errors, expected_information, expected_run
+from jaxvib.identification.further_runs.profile import improved_profile, read_limits, require_within
+from jaxvib.identification.identify import MachineFit
+from jaxvib.machine.drives.controlled import SpeedProfile
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
+from jaxvib.units import Number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxvib.draw.style import Drawn
+
+
+class RunPlan(Result):
+    """Expected errors after candidate runs. Returned by `plan_runs`.
+
+    **Attributes** (c candidates, k numbers)
+
+    - `candidates` (c,): names of the runs, the best one first; `numbers` (k,): names of the numbers
+    - `errors` (c, k): expected relative standard errors with the runs so far and this one, infinite if not determined
+    - `now` (k,): relative standard errors with the runs so far
+    - `minutes` (c,): durations
+    - `gain` (c,): sum over the numbers of the logarithm of the ratio of errors before and after, per minute of test. An
+      undetermined number counts as an error of 1
+    - `profile`: the `SpeedProfile` of the run with the improved speed; None without limits, and if none is better
+    """
+
+    status = Computed.done
+
+    candidates: tuple[str, ...]
+    numbers: tuple[str, ...]
+    errors: np.ndarray = eqx.field(metadata=in_unit("", "candidate", "number"))
+    now: np.ndarray = eqx.field(metadata=in_unit("", "number"))
+    minutes: np.ndarray = eqx.field(metadata=in_unit("min", "candidate"))
+    gain: np.ndarray = eqx.field(metadata=in_unit("1/min", "candidate"))
+    profile: SpeedProfile | None
+
+    def summary(self) -> str:
+        """Return the candidates with their expected errors as text, the best one first."""
+        lines = [f"errors now: {self._row(self.now)}"]
+        for name, row, minutes, gain in zip(self.candidates, self.errors, self.minutes, self.gain, strict=True):
+            lines.append(f"{name} ({minutes:.3g} min, {gain:.3g} per minute): {self._row(row)}")
+        if self.profile is not None:
+            points = zip(np.asarray(self.profile.times), np.asarray(self.profile.speeds), strict=True)
+            lines.append("improved speed: " + ", ".join(f"{speed_text(float(n), 4)} at {t:.4g} s" for t, n in points))
+        return "\n".join(lines)
+
+    def _row(self, errors: np.ndarray) -> str:
+        pairs = zip(self.numbers, errors, strict=True)
+        return ", ".join(f"{name} {f'{each:.2g}' if np.isfinite(each) else 'not determined'}" for name, each in pairs)
+
+    @validated
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """Plot the largest error of a number after each candidate run.
+
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
+        from jaxvib.draw.results import points_chart  # slow import
+
+        largest = np.max(np.where(np.isfinite(self.errors), self.errors, 1.0), axis=1)
+        return points_chart(largest[:, None], x_label="candidate run", y_label="largest relative error", ax=ax)
+
+
+@validated
+def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping[str, Number] | None = None) -> RunPlan:
+    """Return the errors that the fitted numbers would have after each of some candidate runs, without making them.
+
+        errors^2 = diagonal of (F_so_far + F_candidate)^-1,       F = J^T J / noise^2
+
+    - F is the Fisher information about the unknown numbers and the gains of the sensors; the state at the first sample and the
+      offsets of the candidate are free, and so is the zero of the rotor's angle, unless a channel of kind pulses or angle has
+      the mark of the runs so far
+    - The model of the fit gives the expected readings. An added mass, other places of sensors, and sensors that change places
+      are `change` and `channels` of a candidate
+    - With `limits`, the speed of the best candidate is varied at 9 evenly spaced times so that the errors become small, by
+      gradients and sequential quadratic programming. The result is one more candidate, of the same duration, if it is better
+
+    **Arguments**
+
+    - `fit` from `identify`
+    - `candidates`: a `PlannedRun` each
+    - `limits`: {"speed": largest rotor speed, rad/s, "acceleration": largest absolute angular acceleration, rad/s^2}; typical:
+      {"speed": "1500 rpm", "acceleration": "10 rad/s^2"}; default: no run with an improved speed
+
+    **Returns** `RunPlan`, the candidates in the order of their gain per minute of test. **Raises** `InputError` for a channel
+    whose noise is unknown, and for a candidate beyond the limits.
+
+    >>> import numpy as np, jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
+    >>> drive = jv.RunUp(60.0, acceleration=6.0)
+    >>> scene = jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)])
+    >>> t, frame = np.arange(0.0, 10.0, 0.005), jv.Channel("frame", "acceleration", at=1, gain_error=0.0)
+    >>> motion = 0.01 * np.random.default_rng(0).normal(size=t.size)    # a record that shows nothing
+    >>> run = jv.MeasuredRun.from_arrays([frame], t, {"frame": motion})
+    >>> fit = jv.identify(scene, run, unknown=["machine.stiffness", "machine.damping"], throw=False)
+    >>> plan = jv.plan_runs(fit, [jv.PlannedRun("slow", drive, "10 s", [frame], rate=200.0)])
+    >>> plan.candidates, plan.errors.shape
+    (('slow',), (1, 2))
+
+    Source: this package.
+    """
+    if not candidates:
+        raise InputError("candidates", "is empty; give at least one PlannedRun")
+    bounds = None if limits is None else read_limits(limits)
+    if bounds is not None:
+        for each in candidates:
+            require_within(each, bounds)
+    k = len(fit.names)
+    runs = [expected_run(fit, each) for each in candidates]
+    errors = [expected_errors(fit.information + expected_information(fit, each), k) for each in runs]
+    now, minutes = expected_errors(fit.information, k), [each.duration / 60.0 for each in candidates]
+    gain = [_gain(now, *each) for each in zip(errors, minutes, strict=True)]
+    names, profile = [each.name for each in candidates], None
+    if bounds is not None:
+        best = int(np.argmax(gain))
+        profile = improved_profile(fit, candidates[best], runs[best], bounds)
+        planned = eqx.tree_at(lambda run: run.drive, candidates[best], profile)
+        better = expected_errors(fit.information + expected_information(fit, expected_run(fit, planned)), k)
+        if _gain(now, better, minutes[best]) > gain[best]:
+            names.append(f"{names[best]}, improved speed")
+            errors.append(better)
+            gain.append(_gain(now, better, minutes[best]))
+            minutes.append(minutes[best])
+        else:
+            profile = None
+    order = np.argsort(-np.array(gain), kind="stable")
+    return RunPlan(
+        tuple(names[i] for i in order),
+        fit.names,
+        np.array(errors)[order],
+        now,
+        np.array(minutes)[order],
+        np.array(gain)[order],
+        profile,
+    )
+
+
+def _gain(now: np.ndarray, errors: np.ndarray, minutes: float) -> float:
+    return float(np.sum(np.log(np.minimum(now, 1.0) / np.minimum(errors, 1.0)))) / minutes

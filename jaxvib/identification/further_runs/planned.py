@@ -1,0 +1,163 @@
+"""Run that is not recorded yet, and the information that it would give about the numbers of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
+from jaxvib.identification.directions import covariance_of, eliminate, in_polar_unbalances
+from jaxvib.identification.fit import Fitted, information_at
+from jaxvib.identification.identify import MachineFit
+from jaxvib.identification.problem import MOTIONS, Problem, build_problem, with_noise
+from jaxvib.identification.records.channel import UNITS, Channel
+from jaxvib.identification.run import MeasuredRun
+from jaxvib.machine.drives.drive import Drive
+from jaxvib.units import Number, number
+
+
+class PlannedRun(eqx.Module):
+    """Run that is not recorded yet.
+
+    **Arguments**
+
+    - `name` for tables
+    - `drive` of prescribed speed: a ramp (`RunUp`, `SpinUp`), a dwell (`ConstantSpeed`), or a coast-down (`SpeedProfile`)
+    - `duration`, s; typical: 10 to 60
+    - `channels` of the run; their places and the numbers of the scene may differ from those of the runs so far. A sensor keeps
+      its name, and thereby its gain, at another place
+    - `rate`, Hz, of the samples; typical: 200 to 2000
+    - `noise`: standard deviation of the readings by the name of the channel, for channels that no run so far has, in SI units
+      or as strings; typical: "0.05 m/s^2"
+    - `change`: numbers of the scene that differ in this run, as in `MeasuredRun.from_arrays`
+
+    **Raises** `InputError` for a drive whose speed depends on the machine, and for values that are not positive.
+
+    >>> import jaxvib as jv
+    >>> frame = jv.Channel("frame", "acceleration", at=1)
+    >>> jv.PlannedRun("slow", jv.SpinUp("900 rpm", "30 s"), "30 s", [frame], rate="500 Hz").duration
+    30.0
+    """
+
+    name: str
+    drive: Drive
+    duration: float
+    channels: tuple[Channel, ...]
+    rate: float
+    noise: dict[str, float]
+    change: dict[str, Number]
+
+    @validated
+    def __init__(
+        self,
+        name: str,
+        drive: Drive,
+        duration: Number,
+        channels: Sequence[Channel],
+        *,
+        rate: Number,
+        noise: Mapping[str, Number] | None = None,
+        change: Mapping[str, Number] | None = None,
+    ):
+        if not drive.ideal:
+            raise InputError("drive", f"is {drive.kind!r}, whose speed depends on the machine; give a drive such as SpinUp")
+        self.name, self.drive, self.channels = name, drive, tuple(channels)
+        self.duration = float(number(duration, "s", "duration", low=0.0, open_low=True))
+        self.rate = float(number(rate, "Hz", "rate", low=0.0, open_low=True))
+        self.change = dict(change or {})
+        units, self.noise = {each.name: UNITS[each.kind] for each in channels}, {}
+        for channel, value in (noise or {}).items():
+            field = f"noise[{quoted(channel)}]"
+            if channel not in units:
+                raise InputError(field, f"is not of a channel of the run; its channels are: {', '.join(units)}")
+            self.noise[channel] = float(number(value, units[channel], field, low=0.0, open_low=True))
+
+
+class Expected(NamedTuple):
+    """Planned run at the numbers of a fit.
+
+    **Attributes**: `fitted` without iterations; `own`: places of the unknowns that the run shares with the fit, among those of
+    the run; `place` of them in the information of the fit.
+    """
+
+    fitted: Fitted
+    own: np.ndarray
+    place: np.ndarray
+
+    def shared(self, information: np.ndarray, size: int) -> np.ndarray:
+        """Return the information (size, size) of the run about the unknowns of the fit, from that about its own unknowns."""
+        total = np.zeros((size, size))
+        total[np.ix_(self.place, self.place)] = eliminate(information, self.own)
+        return total
+
+
+def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
+    """Return a planned run at the numbers of a fit.
+
+    **Raises** `InputError` for a channel whose noise is unknown, and for a scene with several exciters.
+    """
+    deviations: dict[str, float] = {}
+    for names, noise in reversed(list(zip(fit.channels, fit.noise, strict=True))):
+        deviations |= dict(zip(names, noise, strict=True))
+    deviations |= planned.noise
+    moving = [channel for channel in planned.channels if channel.kind in MOTIONS]
+    for channel in moving:
+        if channel.name not in deviations:
+            there = f"channel {quoted(channel.name)}"
+            raise InputError(f"candidates: {planned.name}: {there}", "is new; give its noise, noise={name: standard deviation}")
+    time = np.arange(0.0, planned.duration, 1.0 / planned.rate)
+    readings = {channel.name: np.zeros(time.size) for channel in moving}
+    run = MeasuredRun.from_arrays(moving, time, readings, planned.change, planned.name)
+    exciter, count = fit.scene.exciters[0], len(fit.scene.exciters)
+    if count > 1:
+        raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
+    scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(None, planned.drive))
+    problem = build_problem(scene, [run], fit.names, {})
+    problem = with_noise(problem, [[np.ones(1) for _ in moving]], [np.array([deviations[c.name] for c in moving])])
+    problem = problem._replace(precisions=own_precisions(fit, problem))
+    size = float(np.asarray(exciter.unbalance, float))
+    fitted = information_at(problem, size * np.array([np.cos(fit.phase[0]), np.sin(fit.phase[0])]))
+    has_mark = any(channel.kind in ("pulses", "angle") for channel in planned.channels)
+    return Expected(fitted, *shared_places(fit, problem, has_mark))
+
+
+def own_precisions(fit: MachineFit, problem: Problem) -> np.ndarray:
+    """Return 1/error^2 (p,) of the known unknowns of a run, without those that the information of `fit` contains."""
+    precisions = problem.precisions.copy()
+    for k, name in enumerate(problem.unknowns.gains):
+        if name in fit.gain_names:
+            precisions[len(problem.unknowns.numbers) + k] = 0.0
+    return precisions
+
+
+def shared_places(fit: MachineFit, problem: Problem, has_mark: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places of the unknowns that a run shares with a fit: among those of the run, and in `fit.information`.
+
+    **Arguments**: `has_mark`: True if the zero of the rotor's angle in the run is that of the fit.
+    """
+    unknowns, p, count = problem.unknowns, problem.unknowns.count, len(fit.names)
+    names, moved = [number.name for number in unknowns.numbers], len(unknowns.numbers)
+    pairs = [(at, fit.names.index(name)) for at, name in enumerate(names)]
+    unbalances = {f"exciters[{k}].unbalance": p + 2 * k for k in range(len(problem.unbalances))}
+    pairs += [(at, fit.names.index(name)) for name, at in unbalances.items() if name in fit.names]
+    gains = enumerate(unknowns.gains)
+    pairs += [(moved + at, count + fit.gain_names.index(name)) for at, name in gains if name in fit.gain_names]
+    pairs += [(p + 1, count + len(fit.gain_names))] * has_mark
+    own, place = np.array(pairs, int).T
+    return own, place
+
+
+def expected_information(fit: MachineFit, expected: Expected) -> np.ndarray:
+    """Return the information of a planned run about the unknowns of a fit."""
+    data, known, _ = in_polar_unbalances(expected.fitted)
+    return expected.shared(data + known, len(fit.information))
+
+
+def expected_errors(information: np.ndarray, count: int) -> np.ndarray:
+    """Return the relative standard errors (count,) of the numbers, infinite for those that are not determined."""
+    found = covariance_of(eliminate(information, np.arange(count)))
+    return np.where(found.determined, np.sqrt(np.diagonal(found.covariance)), np.inf)

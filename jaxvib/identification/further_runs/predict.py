@@ -1,0 +1,199 @@
+"""Prediction of a held-out run by a fit, and its comparison with the readings."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
+from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
+from jaxvib.identification.fit import linear_at, residuals_of, run_equations
+from jaxvib.identification.further_runs.planned import own_precisions, shared_places
+from jaxvib.identification.identify import MachineFit
+from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, with_noise
+from jaxvib.identification.run import MeasuredRun
+from jaxvib.numerics.noise import autoregression
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+
+if TYPE_CHECKING:
+    from jaxvib.draw.style import Drawn, Onto
+
+_NOISE_RATIO = 1.5
+"""Ratio of the residuals to the noise of the fit above which the model is said to lack a part."""
+
+
+class PredictionStatus(eqx.Enumeration):
+    """Outcomes of a prediction. The value of each member is the message shown to the user."""
+
+    predicted = "the fit predicts the run within its errors and the noise"
+    patterned = (
+        "the fit predicts the run, but the residuals are larger than the noise of the fit or repeat with the rotor's angle: "
+        "the model lacks a part; see the notes"
+    )
+    contradicted = (
+        "the run contradicts the fit: it is of another machine, the machine has changed, or a stated change of it is wrong; "
+        "see the notes, and do not fit both runs together"
+    )
+
+
+class RunPrediction(Result):
+    """Prediction of a run that a fit did not use. Returned by `predict_run`.
+
+    **Attributes** (C channels, n samples)
+
+    - `status`: a `PredictionStatus`; `notes`: sentences for the reader
+    - `chance` of a deviation as large as this one, if the machine is the same
+    - `channels` (C,): names; `noise` (C,), SI: standard deviation of the residuals; `ratio` (C,) of `noise` to that of the fit,
+      NaN for a channel that the fit does not have
+    - `time` (n,) s, `readings` and `predicted` (n, C), SI, NaN for samples that do not count
+    """
+
+    status: PredictionStatus
+    notes: tuple[str, ...]
+    chance: float = eqx.field(metadata=in_unit(""))
+    channels: tuple[str, ...]
+    noise: np.ndarray = eqx.field(metadata=in_unit("", "channel"))
+    ratio: np.ndarray = eqx.field(metadata=in_unit("", "channel"))
+    time: np.ndarray = eqx.field(metadata=in_unit("s", "time"))
+    readings: np.ndarray = eqx.field(metadata=in_unit("", "time", "channel"))
+    predicted: np.ndarray = eqx.field(metadata=in_unit("", "time", "channel"))
+
+    def summary(self) -> str:
+        """Return the outcome and the residuals as text."""
+        parts = [
+            f"{name} {each:.3g}" + (f" ({ratio:.2f} times the noise of the fit)" if math.isfinite(ratio) else "")
+            for name, each, ratio in zip(self.channels, self.noise, self.ratio, strict=True)
+        ]
+        return "\n".join([self.message, f"residuals: {', '.join(parts)}", *self.notes])
+
+    @validated
+    def plot(self, *, ax: Onto = None) -> Drawn:
+        """Plot the readings with the prediction, and the residuals, onto two axes `ax` if given.
+
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
+        from jaxvib.draw.record import fit_chart  # slow import
+
+        return fit_chart(self.time, self.readings, self.predicted, self.noise, self.channels, ax=ax)
+
+
+@validated
+def predict_run(fit: MachineFit, run: MeasuredRun) -> RunPrediction:
+    """Return the prediction of a run that the fit did not use, and compare it with the readings.
+
+    - The numbers and the gains are those of the fit. The motion at the first sample and the offsets are free, and so is the
+      zero of the rotor's angle, unless both have the mark of a tachometer
+    - The deviation is compared with the errors of the fit and the noise of the run by the ratio of likelihoods of "other
+      numbers" to "the same numbers"; below a chance of 1e-5 the run contradicts the fit, and a note names the number whose
+      change explains most of the deviation
+
+    **Arguments**: `fit` from `identify`; `run`: a `MeasuredRun`, with its own `change` of numbers.
+
+    **Returns** `RunPrediction`. **Raises** `InputError` for a run that cannot be used.
+
+    >>> import numpy as np, jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
+    >>> drive = jv.RunUp(60.0, acceleration=6.0)
+    >>> scene = jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)])
+    >>> motion = jv.simulate(scene, "10 s", samples=2001, estimate=False).trajectory
+    >>> frame, rng = jv.Channel("frame", "velocity", at=1), np.random.default_rng(0)
+    >>> runs = [jv.MeasuredRun.from_arrays([frame], np.linspace(0.0, 10.0, 2001),
+    ...         {"frame": np.asarray(motion.state.velocity)[:, 0] + 1e-3 * rng.normal(size=2001)}) for _ in range(2)]
+    >>> fit = jv.identify(scene, runs[0], unknown=["machine.stiffness", "machine.damping"])
+    >>> jv.predict_run(fit, runs[1]).status_name
+    'predicted'
+
+    Source: this package.
+    """
+    at = _at_the_fit(fit, run)
+    names, noise = [channel.name for channel in at.problem.runs[0].channels], np.nanstd(at.residuals, axis=0)
+    known: dict[str, float] = {}
+    for of_run, noises in zip(fit.channels, fit.noise, strict=True):
+        known |= dict(zip(of_run, noises, strict=True))
+    ratio = noise / np.array([known.get(name, math.nan) for name in names])
+    found, notes = _deviation(fit, at), []
+    for k, name in enumerate(names):
+        if ratio[k] > _NOISE_RATIO:
+            notes.append(f"the residuals of channel {name!r} are {ratio[k]:.3g} times the noise of the fit")
+        if residual_chance(at.residuals[:, k], at.taps[k], at.problem.angles[0][:, 0], 0) < CHANCE:
+            notes.append(f"the residuals of channel {name!r} repeat with the rotor's angle")
+    status = PredictionStatus.patterned if notes else PredictionStatus.predicted
+    if found.chance < CHANCE:
+        status = PredictionStatus.contradicted
+        notes.append(found.sentence("the run"))
+    mask, raw = at.problem.masks[0], at.problem.raw[0]
+    return RunPrediction(
+        status=status,
+        notes=(*at.problem.notes, *notes),
+        chance=found.chance,
+        channels=tuple(names),
+        noise=noise,
+        ratio=ratio,
+        time=at.problem.times[0],
+        readings=np.where(mask, raw, np.nan),
+        predicted=raw - at.residuals,
+    )
+
+
+class _Predicted(NamedTuple):
+    """Run at the numbers of a fit.
+
+    **Attributes**: its `problem`; unknowns `x`; `linear` unknowns, with the best state at the first sample and the best
+    offsets; `residuals` (n, C); `taps` of the filters to white noise (C,); `has_mark`: True if the zero of the rotor's angle is
+    that of the fit.
+    """
+
+    problem: Problem
+    x: np.ndarray
+    linear: np.ndarray
+    residuals: np.ndarray
+    taps: list[np.ndarray]
+    has_mark: bool
+
+
+def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
+    problem = build_problem(fit.scene, [run], fit.names, {})
+    sizes = np.array([float(np.asarray(exciter.unbalance, float)) for exciter in fit.scene.exciters])
+    problem = problem._replace(unbalances=tuple(Known(size, EXACT * size) for size in sizes))
+    has_mark = len(sizes) == 1 and problem.marked and bool(fit.information[-1, -1] > 0.0)
+    pairs = np.stack([sizes * np.cos(fit.phase), sizes * np.sin(fit.phase)], axis=1).ravel()
+    x, first = np.zeros(problem.unknowns.count), len(problem.unknowns.numbers)
+    for k, name in enumerate(problem.unknowns.gains):
+        if name in fit.gain_names:
+            x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
+    fixed = pairs if has_mark or len(sizes) > 1 else None
+
+    def with_filters(taps: list[np.ndarray], noise: np.ndarray) -> tuple[Problem, np.ndarray, np.ndarray]:
+        filtered = with_noise(problem, [taps], [np.where(noise > 0.0, noise, 1.0)])
+        linear = linear_at(filtered, x, fixed)
+        return filtered, linear, residuals_of(filtered, x, linear)[0]
+
+    _, _, left = with_filters([np.ones(1)] * problem.raw[0].shape[1], np.std(problem.raw[0], axis=0))
+    models = [autoregression(each) for each in left.T]
+    taps = [each for each, _ in models]
+    filtered, linear, left = with_filters(taps, np.array([each for _, each in models]))
+    return _Predicted(filtered, x, linear, left, taps, has_mark)
+
+
+def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
+    """Return the deviation of a run from the fit."""
+    problem, p, size = at.problem, at.x.size, len(fit.information)
+    equations, turn = run_equations(problem, at.x, at.linear)[0], polar_unbalances(problem, at.linear)[0]
+    matrix, slope = turn.T @ equations[:-1, :-1] @ turn, turn.T @ equations[:-1, -1]
+    matrix[np.arange(p), np.arange(p)] += own_precisions(fit, problem)
+    for k in range(len(fit.scene.exciters)):
+        if f"exciters[{k}].unbalance" not in fit.names:  # known exactly
+            matrix[p + 2 * k, p + 2 * k] += 1.0 / EXACT**2
+    own, place = shared_places(fit, problem, at.has_mark)
+    part, gradient = np.zeros((size, size)), np.zeros(size)
+    part[np.ix_(place, place)] = eliminate(matrix, own)
+    gradient[place] = elimination(matrix, own).T @ slope
+    names = [*fit.names, *(f"the gain of channel {name!r}" for name in fit.gain_names), "the angle (rad) of the unbalance"]
+    # The gradient at the numbers that fit the run and the records of the fit together.
+    gradient = fit.information @ pseudoinverse(fit.information + part)[0] @ gradient
+    return disagreement(fit.information, part, gradient, names)
