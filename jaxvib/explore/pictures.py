@@ -145,8 +145,8 @@ def diagram(scene: Scene, most: float) -> str:
 
     **Arguments**: `most`, the highest rotor speed in the diagram, rad/s; it is at least 1.15 times the scene's rotor speed.
 
-    **Returns** the text of an SVG file. **Raises** `InputError` for scenes that the diagram does not include; the message
-    names the part.
+    **Returns** the text of an SVG file. **Raises** `InputError` for a scene without such a diagram; the message names the part
+    of the scene that prevents it.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
@@ -172,7 +172,7 @@ def modes_of(scene: Scene) -> list[int]:
     """Return the jam modes in which `machine` can show the machine moving: those that are stable by slope.
 
     Modes that exist at the scene's rotor speed come first. Among modes that exist, and among the others, the one at the highest
-    resonance is first and the one beyond all resonances last. The list is empty for a machine that moves across and up.
+    resonance is first and the one beyond all resonances last. The list is empty for a machine that moves in two directions.
     """
     if not has_branches(scene):
         return []

@@ -287,8 +287,8 @@ def _svd_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[tuple
     return jax.lax.map(svd_in_turn, matrix), (True, True, True)
 
 
-def refine_solution(product: Callable[[Array], Array], nearly: Callable[[Array], Array], b: Array, norm: Array) -> Array:
-    """x of A x = b, with A x = `product`(x), its approximate inverse `nearly` and its row-sum `norm`.
+def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array], Array], b: Array, norm: Array) -> Array:
+    """x of A x = b, with A x = `product`(x), an approximate `inverse` of A and the row-sum `norm` of A.
 
     The solution is corrected by its residual until only rounding errors are left: usually not at all, at most 4 times.
     """
@@ -304,10 +304,10 @@ def refine_solution(product: Callable[[Array], Array], nearly: Callable[[Array],
 
     def correct(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         steps, x, rest, error, _ = carry
-        x = x + nearly(rest)
+        x = x + inverse(rest)
         return steps + 1, x, *left(x), error
 
-    x = nearly(b)
+    x = inverse(b)
     rest, error = left(x)
     start = (jnp.asarray(0), x, rest, error, jnp.full_like(error, jnp.inf))
     return jax.lax.while_loop(improves, correct, start)[1]

@@ -73,13 +73,13 @@ def transition(slopes: Array, h: float | Array) -> Array:
     return jnp.tensordot(forms[:, -1], whole, 1).reshape(2 * m, 2 * m)
 
 
-def flow(slopes: Callable[[Array], Array], size: int, turn: float, steps: int | Array, dtype: jnp.dtype) -> Array:
-    """Transition matrix (2 m, 2 m) of (x, x') over the time `turn` of x'' = P(t) x + R(t) x', in equal steps of `transition`.
+def flow(slopes: Callable[[Array], Array], size: int, duration: float, steps: int | Array, dtype: jnp.dtype) -> Array:
+    """Transition matrix (2 m, 2 m) of (x, x') over a `duration` of x'' = P(t) x + R(t) x', in equal steps of `transition`.
 
     **Arguments**: `slopes(t)`: [P, R] (m, 2 m); `size` m; `steps`, a Python number (then reverse derivatives exist) or a scalar
     array.
     """
-    h = jnp.asarray(turn / steps, dtype)
+    h = jnp.asarray(duration / steps, dtype)
 
     def step(k: Array, over: Array) -> Array:
         return transition(jax.vmap(slopes)((k + jnp.asarray(NODES, dtype)) * h), h) @ over

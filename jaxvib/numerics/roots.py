@@ -23,12 +23,12 @@ def bracketed_root(
     fast: Callable[[Array], Array] | None = None,
     polish: Array | None = None,
 ) -> Array:
-    """Return the root of `f` between `low` and `high` (scalars) to rounding error; f must change sign once between them.
+    """Return the root of `f` between `low` and `high` (scalars) up to rounding; f must change sign once between them.
 
     **Arguments**: `ends`: f(low) and f(high) if they are known; `fast`: the same function at lower cost, for the search. `f`
     is then used only for derivatives and, if `polish` is True (scalar), for final steps of Newton's method.
 
-    The method is inverse quadratic interpolation if it is safe, otherwise bisection (Chandrupatla, Adv. Eng. Software 28,
+    Each step is inverse quadratic interpolation where that is safe, otherwise bisection (Chandrupatla, Adv. Eng. Software 28,
     1997). Derivatives of any order follow from the implicit function theorem.
     """
 

@@ -59,7 +59,7 @@ def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents],
 
 
 def batch_last(function: Callable[[X], Out], batched: Callable[[X, Batched], Out]) -> Callable[[X], Out]:
-    """`function`, which under `vmap` is computed by `batched`. It has derivatives of every kind; JAX maps them in its own way.
+    """`function`, which under `vmap` is computed by `batched`; its derivatives of any kind are batched by JAX as usual.
 
     JAX puts the batch before all other axes of the state of a loop. `batched` may keep it as the last axis: every number of the
     program is then a vector over the batch, contiguous in memory.

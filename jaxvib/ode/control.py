@@ -29,7 +29,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
         e = max |error| / (tolerance (unit + relative |y|)),    h_next = s e_before^(1/16) / e^(3/32) h
 
-    The maximum is taken over all entries of the state y.
+    The maximum is taken over all entries of the state y; e_before is e of the last accepted step, s a safety factor.
 
     - A step with e > 1 is rejected and repeated with h_next = s / e^(1/8) h
     - The powers are products of square roots, which cost less than a general power

@@ -151,7 +151,7 @@ class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
 
 
 class UnrolledDopri8(AbstractDopri8):
-    """Dormand and Prince's pair of order 8(7), its 13 stages written out one after another.
+    """Dormand and Prince's pair of order 8(7), its 13 stages and the rates at the end of a step written out one after another.
 
     The results are those of `diffrax.Dopri8`. There is no loop over stages and no array of stages, so that a small time loop
     compiles into one piece of code. Each stage is fenced; otherwise XLA's fusion recomputes each stage for each use, and a

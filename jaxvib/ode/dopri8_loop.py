@@ -56,8 +56,8 @@ class LoopDopri8(AbstractDopri8):
     **Arguments**: `tangents`: True if only forward derivatives are needed. The derivatives of a step are then computed along
     all tangents at once; eight tangents cost little more than one. `reuse`: True to use the last stage of a step as the first
     one of the next step, which saves one of fourteen evaluations. The start of the loop is then known at run time only;
-    therefore diffrax's adjoints have no reverse derivatives. The derivatives of `jaxvib.ode.replay` are not affected. `wrap`
-    as in `UnrolledDopri8`.
+    therefore diffrax's adjoints cannot compute reverse derivatives. The derivatives of `jaxvib.ode.replay` are not affected.
+    `wrap` as in `UnrolledDopri8`.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)

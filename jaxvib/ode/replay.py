@@ -46,8 +46,9 @@ def solve(
 
         (y_i+1, dense_i) = step(y_i, t_i, t_i+1, numbers),    saved(t) = within(dense_i, t_i, t_i+1, t)
 
-    The ends of steps are constants, with two exceptions: the last step ends at `end`, and constant steps depend on `end` and
-    `first_step`. A run without derivatives is computed once, and records nothing.
+    Here dense_i interpolates step i, and numbers are the arrays in the arguments and in the equations. The ends of steps are
+    constants, with two exceptions: the last step ends at `end`, and constant steps depend on `end` and `first_step`. A run
+    without derivatives is computed once, and records nothing.
 
     **Arguments**: `adjoint`: an adjoint of diffrax in place of the replay, such as `diffrax.ForwardMode()` for forward
     derivatives. Functions among the arguments must not contain traced arrays; pass these in `args`. `saveat` saves states at

@@ -260,7 +260,7 @@ def view_of(scene: Scene) -> View:
     if not_drawn or machine.places not in views or machine.body_count > 1:
         problem = (
             f"is {machine.kind!r}; sketches are available for machines with platforms, a shaft or one body in a plane, and for "
-            "machines that move across and up"
+            "machines that move horizontally and vertically"
         )
         raise InputError("machine.kind", problem)
     return views[machine.places](scene)

@@ -70,8 +70,8 @@ def _span(values: np.ndarray, unit: str) -> str:
 
 
 def places_of(loads: Loads, angle: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the loads' positions relative to the rotor's centre, m: across, up, and along the axis for loads that move along
-    it."""
+    """Return the loads' positions relative to the rotor's centre, m: horizontal, vertical, and along the axis for loads that
+    move along it."""
     return [np.asarray(x, float) for x in loads.position(*map(jnp.asarray, angle))]
 
 

@@ -54,12 +54,12 @@ class AbstractResponse(eqx.Module):
 
     - `speed` w, rad/s
     - `displacement` (nd,): complex amplitudes, m or rad; at w t = 0 an unbalance with the phase 0 points in the direction x, or
-      is at the angle 0 for machines that move only up
+      is at the angle 0 for machines that move only up and down
     - `amplitude` (nd,), zero to peak, and `phase` (nd,) rad: moduli and arguments of `displacement`
     - `acceleration` (nt,), in g, and `velocity` (nt,), m/s root mean square, of the coordinates in m
     - `exciter_force` and `foundation_force`, N zero to peak: resultant of the centrifugal forces, and force on the foundation;
-      for two directions the root of the sum of the squares of their peaks (sqrt 2 times the force that turns)
-    - `transmissibility`: their ratio; inf if the centrifugal forces cancel
+      in two directions: the root of the sum of the squares of their peaks (for a rotating force sqrt 2 times its magnitude)
+    - `transmissibility`: `foundation_force` divided by `exciter_force`; inf if the centrifugal forces cancel
     - `torque` (exciter,), N m: mean torque that each rotor needs to sustain the vibration; `power` (exciter,), W
     - `motor_torque` (exciter,), N m: torque of each motor at this speed; that of an ideal drive is equal to `torque`
     - `torque_share`: the sum of `torque` divided by that of `motor_torque`
@@ -225,7 +225,7 @@ def response(
     """Return the response of a machine to the unbalances of its exciters over their speed, and the torque that it needs.
 
         Y = w^2 D(w)^-1 f,    f = sum_k S_k exp(i alpha_k) B_k^T e_k,    D = K - w^2 M + i w (C + w G)
-        torque of exciter k = (S_k/2) Im(exp(-i alpha_k) e_k^H B_k w^2 Y)
+        torque of exciter k = -(S_k/2) Im(exp(-i alpha_k) e_k^H B_k w^2 Y)
 
     S, alpha, e, B: see `synchronous_regimes`. The curve of the torque over the speed has a peak at each resonance (Sommerfeld
     effect). A motor turns at the speeds at which its torque equals that of the curve, `operating`. If the torque of the motor

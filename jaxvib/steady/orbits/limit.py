@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 __all__ = ["LimitStatus", "SynchronizationLimit", "synchronization_limit"]
 
 _STEP = 0.1
-"""Change of the phase between two points of a branch, rad."""
+"""Distance between two points of a branch: change of the phase, rad, or of the speed in units of `_SPEED_PER_STEP`."""
 
 _SPEED_PER_STEP = 0.1
 """Relative change of the speed that counts as a phase of 1 rad, if no phase is free."""
@@ -52,7 +52,7 @@ _MAX_BRANCH_POINTS = 70
 class LimitStatus(eqx.Enumeration):
     """Outcomes of a search for the limit of synchronization. The value of each member is the message shown to the user."""
 
-    found = "the motion ends at this fold: beyond it the exciters cannot turn together in this way"
+    found = "the motion ends at this fold and does not exist beyond it"
     not_found = "no fold was found in this direction: the motion could not be followed to one"
 
 
