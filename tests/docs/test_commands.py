@@ -58,6 +58,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("commands")
     for name in ("two-mass", "rotor", "torus", "linear-screen", "design", "sweep", "measurement"):
         (folder / f"{CALLED.get(name, name)}.toml").write_text(template(name))
+    page = (ROOT / "docs" / "data_sheets.md").read_text(encoding="utf-8")
+    for name, text in re.findall(r"```toml\n# (\w+\.toml)\n(.*?)```", page, flags=re.S):
+        (folder / name).write_text(text)
     shutil.copytree(ROOT / "examples", folder / "examples")
     return folder
 

@@ -8,7 +8,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
-from jaxvib.cli.output import CSV
+from jaxvib.cli.output import csv_options
 
 
 @app.command("response")
@@ -16,7 +16,7 @@ from jaxvib.cli.output import CSV
 @click.option("--most", type=SPEED_TYPE, help="Highest speed, such as '2000 rpm' [4/3 of the working speed].")
 @click.option("--points", type=int, default=500, show_default=True, help="Number of speeds.")
 @WITHOUT
-@CSV
+@csv_options
 @shared
 def response(scene: Path, most: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """Compute the vibration of SCENE under the unbalances of its exciters over their speed, and the torque that it needs; --out
