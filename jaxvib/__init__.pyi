@@ -83,6 +83,7 @@ from jaxvib.steady.regimes.synchronous import (
     SynchronousRegimes,
     synchronous_regimes,
 )
+from jaxvib.steady.regimes.working import working_regime
 
 # Exact jams
 from jaxvib.steady.orbits.diagram import ExactBranches
@@ -276,6 +277,7 @@ __all__ = [
     "ResponseStatus",
     # Synchronous regimes
     "synchronous_regimes",
+    "working_regime",
     "SynchronousRegimes",
     "SynchronousRegime",
     "RegimeStatus",

@@ -7,9 +7,22 @@ from jaxvib.code_changes import watch
 
 watch(sys.modules[__name__])  # first, because only later imports are watched
 
-from optimize.files import Design, load_design
+from optimize.design import Design
+from optimize.files import load_design
 from optimize.pareto import Front, pareto
 from optimize.quantities.cases import expected, quantile, under, worst
+from optimize.quantities.exciters import (
+    amplitude_spread,
+    force_per_throw,
+    least_torque,
+    motion_spread,
+    resonance_distance,
+    roundness,
+    synchronization_margin,
+    throw_angle,
+    throw_number,
+    throw_stroke,
+)
 from optimize.quantities.jams import (
     amplitude,
     fold_margin,
@@ -40,22 +53,28 @@ __all__ = [
     "ToleranceRange",
     "acceleration",
     "amplitude",
+    "amplitude_spread",
     "expected",
     "fold_margin",
     "force_per_amplitude",
+    "force_per_throw",
     "foundation_force",
     "hold",
     "jam_frequency",
     "largest",
     "largest_multiplier",
     "least",
+    "least_torque",
     "load_design",
+    "motion_spread",
     "pareto",
     "peak_force",
     "phase",
     "power",
     "product",
     "quantile",
+    "resonance_distance",
+    "roundness",
     "settling_time",
     "shaft_torque",
     "spring_cost",
@@ -63,7 +82,11 @@ __all__ = [
     "stroke",
     "support_frequency_squared",
     "support_load",
+    "synchronization_margin",
     "synthesize",
+    "throw_angle",
+    "throw_number",
+    "throw_stroke",
     "tolerance_ranges",
     "total",
     "total_mass",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,39 +14,26 @@ from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
 from jaxvib.units import count, number
 from jaxvib.units.tables import csv_column
-from optimize.quantities import jams, machine, motion, severity
+from optimize import recipes
+from optimize.design import Design
+from optimize.quantities import exciters, jams, machine, motion, severity
 from optimize.quantities.cases import expected, worst
 from optimize.quantities.quantity import Demand, Quantity
-from optimize.result import Synthesis
 from optimize.search.find import require_searcher
 from optimize.space import DesignSpace, hold
-from optimize.synthesize import synthesize
 
 _QUANTITIES = {
-    name: getattr(module, name) for module in (jams, machine, motion, severity) for name in module.__all__ if name != "between"
+    name: getattr(module, name)
+    for module in (exciters, jams, machine, motion, severity)
+    for name in module.__all__
+    if name != "between"
 }
 """Quantities of design files by name."""
 
 _STATISTICS = {"expected": expected, "worst": worst}
-_SECTIONS = ["scene", "free", "ties", "choices", "hold", "demand", "objective", "search"]
-
-
-@dataclass(frozen=True)
-class Design:
-    """Content of a design file: `space`, `objective`, the arguments of `synthesize` in `search`, and the demands
-    `subject_to`.
-
-    Returned by `load_design`.
-    """
-
-    space: DesignSpace
-    objective: Quantity
-    search: Tables = field(default_factory=dict)
-    subject_to: tuple[Demand, ...] = ()
-
-    def run(self, **more: Any) -> Synthesis:
-        """Search for the best machine by `synthesize`, with arguments `more` in place of those in `search`."""
-        return synthesize(self.space, self.objective, subject_to=self.subject_to, **{**self.search, **more})
+_SECTIONS = ["scene", "recipe", "free", "ties", "choices", "hold", "demand", "objective", "search"]
+_RECIPES = {name: getattr(recipes, name) for name in recipes.__all__ if name != "retune"}
+"""Recipes of design files by name."""
 
 
 @validated
@@ -56,6 +43,8 @@ def load_design(path: str | Path) -> Design:
     **Arguments**: `path` of a TOML file with
 
     - `scene`: the scene file, relative to the design file
+    - `[recipe]`: the `name` of a function of `optimize.recipes`, and its arguments, in place of the next four tables and of
+      the objective
     - `[free]`: bounds for each parameter that may change
     - `[ties]`: parameters that follow others
     - `[choices]`: parameters whose values are chosen from a list, or from a catalogue: `file`, a CSV file relative to the
@@ -83,31 +72,56 @@ def load_design(path: str | Path) -> Design:
     for name in tables:
         if name not in _SECTIONS:
             raise misplaced_name(name, tables, "design", _SECTIONS)
-    for name in ("scene", "free", "objective"):
+    has_recipe = "recipe" in tables
+    for name in ("scene",) if has_recipe else ("scene", "free", "objective"):
         if name not in tables and not (name == "free" and "choices" in tables):
-            raise InputError(name, "is missing; a design file needs scene, [free] and [objective]")
+            raise InputError(name, "is missing; a design file needs scene, and either [recipe] or [free] and [objective]")
     if not isinstance(tables["scene"], str):
         raise InputError("scene", f"is {quoted(tables['scene'])}; give the path of a scene file, in quotes")
-    for name in ("free", "ties", "choices", "objective", "search"):
+    for name in ("recipe", "free", "ties", "choices", "objective", "search"):
         if not isinstance(tables.get(name, {}), Mapping):
             raise InputError(name, f"is not a table; write [{name}]")
     for name in ("hold", "demand"):
         if not isinstance(tables.get(name, []), list):
             raise InputError(name, f"is not a list of tables; write [[{name}]] for each quantity")
     scene = load_scene(Path(path).parent / tables["scene"])
+    design = _of_recipe(scene, tables) if has_recipe else _of_tables(scene, tables, Path(path).parent)
+    demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
+    search = {**design.search, **_search_options(tables.get("search", {}))}
+    return Design(design.space, design.objective, search, (*design.subject_to, *demands))
+
+
+def _of_recipe(scene: Scene, tables: Tables) -> Design:
+    """Return the design task of a file with a table [recipe]."""
+    for name in ("free", "ties", "choices", "hold", "objective"):
+        if name in tables:
+            raise InputError(name, "is given together with [recipe], which defines it; leave one of them out")
+    table = dict(tables["recipe"])
+    name = table.pop("name", None)
+    if not isinstance(name, str) or name not in _RECIPES:
+        problem = "is missing" if name is None else f"is {quoted(name)}"
+        raise InputError("recipe.name", f"{problem}; {suggest_name(str(name), list(_RECIPES))}")
+    return build_part(partial(_RECIPES[name], scene), table, "recipe")
+
+
+def _of_tables(scene: Scene, tables: Tables, folder: Path) -> Design:
+    """Return the design task of a file in a `folder` with the tables [free] and [objective]."""
     values = [quantity_from_table(table, f"hold[{k}]", ("value",)) for k, table in enumerate(tables.get("hold", []))]
     held = [hold(q, more.get("value")) for q, more in values]
     ties = {name: tuple(v) if isinstance(v, list) else v for name, v in tables.get("ties", {}).items()}
     free, choices = dict(tables.get("free", {})), dict(tables.get("choices", {}))
-    choices = {name: _from_catalogue(scene, name, values, Path(path).parent) for name, values in choices.items()}
-    space = DesignSpace(scene, free, held, ties=ties, choices=choices)
-    demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
+    choices = {name: _from_catalogue(scene, name, values, folder) for name, values in choices.items()}
     objective, more = quantity_from_table(tables["objective"], "objective", ("maximize",))
     if not isinstance(more.get("maximize", False), bool):
         raise InputError("objective.maximize", f"is {quoted(more['maximize'])}; write true or false, without quotes")
     if more.get("maximize", False):
         objective = -objective
-    search = dict(tables.get("search", {}))
+    return Design(DesignSpace(scene, free, held, ties=ties, choices=choices), objective)
+
+
+def _search_options(table: Tables) -> Tables:
+    """Return the validated arguments of `synthesize` in a table [search]."""
+    search = dict(table)
     allowed = ["starts", "seed", "iterations", "rate", "polishing", "searcher"]
     for name, value in search.items():
         if name not in allowed:
@@ -121,7 +135,7 @@ def load_design(path: str | Path) -> Design:
                 raise InputError("search.rate", f"is {search[name]:g}; it must be less than 1")
             continue
         count(value, f"search.{name}", low=0 if name in ("seed", "polishing") else 1)
-    return Design(space, objective, search, demands)
+    return search
 
 
 def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
@@ -218,3 +232,34 @@ seed = 0
 # polishing = 12                  # steps of Newton's method at the end
 """
 """Commented example of a design file."""
+
+SCREEN_TEMPLATES = {
+    "linear-screen-design": """# A linear screen: all points of the deck move in the same way, along a line.
+scene = "screen.toml"
+
+[recipe]
+name = "linear_screen"
+points = [[-1.5, 0.1], [1.5, 0.1]]   # feed end and discharge end, m from the centre of mass
+angle = "45 deg"
+stroke = "7 mm"                      # peak to peak
+""",
+    "circular-screen-design": """# A circular screen: all points of the deck move in the same way, on a circle.
+scene = "circular_screen.toml"
+
+[recipe]
+name = "circular_screen"
+points = [[-1.3, 0.1], [1.3, 0.1]]   # feed end and discharge end, m from the centre of mass
+stroke = "8 mm"                      # peak to peak
+""",
+    "feeder-design": """# A feeder: least foundation force per throw.
+scene = "feeder.toml"
+
+[recipe]
+name = "feeder"
+points = [[-0.8, 0.1], [0.8, 0.1]]   # rear end and front end, m from the centre of mass
+angle = "25 deg"
+stroke = "4 mm"                      # peak to peak
+spread = 0.1                         # largest spread of the motions over these points
+""",
+}
+"""Design files of screens and feeders by their names in `jaxvib new`."""

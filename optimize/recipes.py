@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.units import Number, count
-from optimize.files import Design
+from optimize.design import Design
+from optimize.quantities.exciters import force_per_throw, motion_spread, roundness, throw_angle, throw_stroke
 from optimize.quantities.jams import amplitude, fold_margin, force_per_amplitude, jam_frequency
 from optimize.quantities.machine import support_frequency_squared, total_mass
 from optimize.quantities.quantity import Quantity
+from optimize.quantities.user_inputs import number_in
 from optimize.result import Synthesis
-from optimize.space import DesignSpace, hold
+from optimize.space import Bounds, DesignSpace, Source, hold
 from optimize.synthesize import synthesize
+
+__all__ = [
+    "anti_resonance",
+    "antiphase",
+    "circular_screen",
+    "feeder",
+    "lightest_exciter",
+    "linear_screen",
+    "retune",
+    "widest_range",
+]
+
+_STARTS = 32
+"""Number of starts of designs of screens and feeders, which have few minima."""
+
+_LEAST_ROUNDNESS = 0.9
+"""Least roundness of the middle of the deck of a circular screen."""
 
 
 def _platforms(scene: Scene, least: int) -> Platforms:
@@ -129,3 +150,121 @@ def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[
     space = DesignSpace(scene, _springs(machine, 3.0, ("stiffness", "link_stiffness")))
     amplitude_of_mode = amplitude(mode=mode, of=of)
     return Design(space, -fold_margin(mode=mode), subject_to=(amplitude_of_mode > keep * float(amplitude_of_mode(scene)),))
+
+
+def linear_screen(
+    scene: Scene,
+    *,
+    points: Sequence[Sequence[Number]],
+    angle: Number = "45 deg",
+    stroke: Number | None = None,
+    reach: Number = 0.3,
+) -> Design:
+    """Return the design task for a linear screen: all points of the deck have the same motion, along a line of given angle.
+
+    The objective is the spread of the motions over the deck (`motion_spread`). The mean of the `points` keeps the throw angle
+    and the stroke. The positions of the exciters and their unbalances are free; the unbalances keep their ratios.
+
+    **Arguments**
+
+    - `scene`: a body in a plane with at least two exciters; typical: two equal motors that turn in opposite directions
+    - `points` of the deck, (x, y), m or text, from the centre of mass; typical: feed end and discharge end
+    - `angle` of throw, rad or text; typical: "40 deg" to "50 deg" (default 45)
+    - `stroke`, m peak to peak; typical: 6 to 12 mm; default: that of the scene
+    - `reach`: distance by which each coordinate of an exciter may change, m; typical: 0.1 to 0.5 (default 0.3)
+
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
+
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.structures.screens import SCREENS
+    >>> from optimize.recipes import linear_screen
+    >>> linear_screen(jv.scene_from_toml(SCREENS["linear_screen"]), points=[(-1.5, 0.1), (1.5, 0.1)]).space.size
+    5
+    """
+    free, ties = _exciters(scene, 2, reach)
+    middle = _middle(points)
+    held = [hold(throw_angle(at=middle), angle), hold(throw_stroke(at=middle), stroke)]
+    return Design(DesignSpace(scene, free, held, ties=ties), motion_spread(points), {"starts": _STARTS})
+
+
+def circular_screen(
+    scene: Scene, *, points: Sequence[Sequence[Number]], stroke: Number | None = None, reach: Number = 0.3
+) -> Design:
+    """Return the design task for a circular screen: all points of the deck have the same motion, on a circle.
+
+    The objective is the spread of the motions over the deck (`motion_spread`). The mean of the `points` keeps its stroke, and
+    its roundness must be at least 0.9. The positions of the exciters and their unbalances are free; the unbalances keep their
+    ratios.
+
+    **Arguments**: `scene`: a body in a plane, typical: with one exciter; `points`, `stroke`, `reach` as for `linear_screen`.
+
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
+    """
+    free, ties = _exciters(scene, 1, reach)
+    middle = _middle(points)
+    space = DesignSpace(scene, free, [hold(throw_stroke(at=middle), stroke)], ties=ties)
+    return Design(space, motion_spread(points), {"starts": _STARTS}, (roundness(at=middle) > _LEAST_ROUNDNESS,))
+
+
+def feeder(
+    scene: Scene,
+    *,
+    points: Sequence[Sequence[Number]],
+    angle: Number = "25 deg",
+    stroke: Number | None = None,
+    reach: Number = 0.2,
+    range_: float = 1.5,
+    spread: float = 0.1,
+) -> Design:
+    """Return the design task for a feeder: least foundation force per throw, with a throw of given angle and stroke.
+
+    The mean of the `points` keeps the throw angle and the stroke. The positions of the exciters, their unbalances and the
+    stiffness of the supports are free; the unbalances keep their ratios.
+
+    **Arguments**
+
+    - `scene`, `points`, `stroke`, `reach` as for `linear_screen`
+    - `angle` of throw, rad or text; typical: "20 deg" to "35 deg" (default 25)
+    - `range_`: factor by which the stiffness of a support may differ; typical: 1.2 to 2 (default 1.5)
+    - `spread`: largest spread of the motions over the points (`motion_spread`); typical: 0.05 to 0.2 (default 0.1)
+
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
+    """
+    free, ties = _exciters(scene, 2, reach)
+    for k, support in enumerate(scene.machine.supports):  # pyright: ignore[reportAttributeAccessIssue]
+        for j, value in enumerate(np.asarray(support.stiffness).tolist()):
+            if value > 0.0:
+                free[f"machine.supports[{k}].stiffness[{j}]"] = (value / range_, value * range_)
+    middle = _middle(points)
+    held = [hold(throw_angle(at=middle), angle), hold(throw_stroke(at=middle), stroke)]
+    space = DesignSpace(scene, free, held, ties=ties)
+    return Design(space, force_per_throw(at=middle), {"starts": _STARTS}, (motion_spread(points) < spread,))
+
+
+def _exciters(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds], dict[str, Source]]:
+    """Return bounds of the positions of all exciters and of the first unbalance, and ties of the other unbalances to it."""
+    if not isinstance(scene, Scene) or scene.machine.places != "plane":
+        raise InputError("scene", "needs a body in a plane for this recipe, for example plane_body(...)")
+    if len(scene.exciters) < least:
+        raise InputError("scene", f"has {len(scene.exciters)} exciter; this recipe needs {least}")
+    free: dict[str, Bounds] = {}
+    distance = number_in(reach, "m", "reach")
+    for k, exciter in enumerate(scene.exciters):
+        if exciter.unbalance is None or exciter.position is None:
+            raise InputError(f"scene.exciters[{k}]", "needs an unbalance and a position `at` for this recipe")
+        for j, value in enumerate(np.asarray(exciter.position).tolist()):
+            free[f"exciters[{k}].position[{j}]"] = (value - distance, value + distance)
+    first = float(np.asarray(scene.exciters[0].unbalance))
+    free["exciters[0].unbalance"] = (first / 3.0, 3.0 * first)
+    ties: dict[str, Source] = {
+        f"exciters[{k}].unbalance": ("exciters[0].unbalance", "keep") for k in range(1, len(scene.exciters))
+    }
+    return free, ties
+
+
+def _middle(points: Sequence[Sequence[Number]]) -> tuple[float, float]:
+    """Return the mean of the points of a deck."""
+    if not isinstance(points, (list, tuple)) or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in points):
+        raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
+    x, y = np.mean([[number_in(v, "m", f"points[{k}]") for v in p] for k, p in enumerate(points)], axis=0).tolist()
+    return x, y

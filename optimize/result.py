@@ -49,17 +49,17 @@ class SynthesisStatus(eqx.Enumeration):
 
 @dataclass(frozen=True)
 class Outcome:
-    """Quantities of a machine in one jam mode, NaN if the mode does not exist.
+    """Quantities of a machine in one jam mode, or in the working regime of its exciters; NaN if there is no such motion.
 
     Returned by `Synthesis.before`, `after` and `verified`.
 
     **Attributes**
 
     - `parameters`: the free parameters by name, SI
-    - `exists`: True if the mode exists
-    - `omega`: load speed, rad/s
-    - `amplitude` of each coordinate, platform 1 (y1) first, m, and `foundation_force`, N, zero to peak
-    - `force_per_amplitude`, N/m
+    - `exists`: True if the motion exists
+    - `omega`: speed of the loads or of the exciters, rad/s
+    - `amplitude` of each coordinate, platform 1 (y1) first, m or rad, and `foundation_force`, N, zero to peak
+    - `force_per_amplitude`, N/m, of a jam mode
     """
 
     parameters: dict[str, float | list[float]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -24,8 +25,11 @@ from jaxvib.results.status import failure
 from jaxvib.runtime.devices import on_device
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.synchronous import synchronous_orbit
+from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.exciters import RegimeQuantity, working_amplitude, working_speed
 from optimize.quantities.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
 from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, require_quantity, walk
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
@@ -44,7 +48,10 @@ _SAME_DESIGN_DISTANCE = 1e-3
 """Distance of two designs, relative to the ranges of the free parameters, below which they count as the same machine."""
 
 _INITIAL_SPREAD = 1e-3
-"""Largest deviation of the initial angles of the loads from the exact motion, rad."""
+"""Largest deviation of the initial angles of the loads from the exact motion, rad, or of displacements, relative."""
+
+_SAME_MOTION = 1e-2
+"""Difference of amplitudes, relative to the largest, below which a run has settled in the working regime."""
 
 Progress = Callable[[str, float], None]
 
@@ -139,8 +146,8 @@ def synthesize(
     else:
         status = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged
 
-    mode = _mode_of(objective, demands)
-    named = _named_quantities(space, scene, objective, demands, mode)
+    motion = _motion_of(space, objective, demands)
+    named = _named_quantities(space, scene, objective, demands, motion)
     sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
     reports = evaluate_quantities((*(q for _, q in named), objective, *sides), batch, problem)
@@ -153,12 +160,12 @@ def synthesize(
     report("checking", 0.9)
     verify = verify and bool(kept[best]) and not found.interrupted
     unfinished = "the search was interrupted" if found.interrupted else "the machine does not meet all demands"
-    run, unverified = _run(scene, mode, verify) if kept[best] and not found.interrupted else (None, unfinished)
-    other = _other_tiers(scene, [q for _, q in named], verify, run, mode)
+    run, unverified = _run(scene, motion, verify) if kept[best] and not found.interrupted else (None, unfinished)
+    other = _other_tiers(scene, [q for _, q in named], verify, run, motion)
     rows = _table(space, scene, named, reports[:2, : len(named)], other)
-    n = len(_standard_rows(scene, mode, objective.of))
+    n = len(_standard_rows(scene, motion, objective.of))
     before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((space.scene, scene)))
-    verified = None if run is None else _by_run(space, run, mode or 1, objective.of)
+    verified = None if run is None else _by_run(space, run, motion, objective.of)
     report("done", 1.0)
     return Synthesis(
         status=status,
@@ -207,9 +214,9 @@ def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Deman
             raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'")
     validate_scene(space.scene)
     between(space.scene, objective.of)
-    if not space.scene.drive.constant:
+    if space.scene.is_plain and not space.scene.drive.constant:
         raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a search needs a constant speed, use ConstantSpeed")
-    if space.scene.drive.speed.dtype != jnp.float64:
+    if space.scene.top_speed.dtype != jnp.float64:
         raise InputError(
             "scene",
             'is in float32; a search needs double precision: call jax.config.update("jax_enable_x64", '
@@ -232,8 +239,8 @@ def _search(
     """Return the best result over all allowed numbers of loads."""
     best: tuple[DesignSpace, Problem, SearchResult] | None = None
     existing = drawn = 0
-    for loads in space.counts or (space.scene.loads.count,):
-        here = space if loads == space.scene.loads.count else _with_loads(space, loads)
+    for loads in space.counts or (None,):
+        here = space if loads is None or loads == space.scene.loads.count else _with_loads(space, loads)
         problem = problem_of(here, objective, demands, options.starts)
         if problem.keys:
             require_drag(jammed_loads(space.scene))
@@ -280,29 +287,55 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
     return eqx.tree_at(lambda s: s.scene, space, validate_scene(scene))
 
 
-def _mode_of(objective: Quantity, demands: Sequence[Demand]) -> int | None:
-    """Return the jam mode of a search: that of its objective, otherwise that of the first demand with a jam mode."""
-    return next((q.mode for q in (objective, *(d.quantity for d in demands)) if q.mode is not None), None)
+_Motion = int | Literal["working"] | None
+"""Motion of the machine on which the quantities of a search depend: a jam mode, or the working regime of exciters."""
 
 
-def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
-    """Integrate the full equations until the motion has settled in a jam mode.
+def _motion_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> _Motion:
+    """Return the motion of a search: the jam mode of its objective, otherwise that of the first demand with a jam mode."""
+    quantities = objective, *(d.quantity for d in demands)
+    modes = [q.mode for q in quantities if q.mode is not None]
+    every = *quantities, *(h.quantity for h in space.held)
+    is_working = any(isinstance(part, RegimeQuantity) for q in every for part in walk(q))
+    return modes[0] if modes else "working" if is_working else None
+
+
+def _run(scene: Scene, motion: _Motion, verify: bool) -> tuple[Run | None, str]:
+    """Integrate the full equations until the motion has settled in a jam mode, or in the working regime.
 
     **Returns** the run and an empty text, or None and the reason.
     """
-    if mode is None:
-        return None, "neither the objective nor the demands have a jam mode to integrate"
+    if motion is None:
+        return None, "neither the objective nor the demands have a motion to integrate"
     if not verify:
         return None, "not requested"
     try:  # a failed verification must not lose the machine
-        orbit = _exact_motion(scene, mode)
-        if orbit is None:
-            return settle(scene, mode=mode), ""
-        if not bool(orbit.stable):
-            return None, f"mode {mode} is unstable: the largest multiplier of its exact motion is {float(orbit.multiplier):.4g}"
-        run = settle(scene, start=_deviating_start(orbit))
+        return _working_run(scene) if motion == "working" else _jam_run(scene, motion)
     except ComputationError as error:
         return None, str(error)
+
+
+def _working_run(scene: Scene) -> tuple[Run | None, str]:
+    try:
+        orbit = synchronous_orbit(scene, working_regime(scene))
+    except InputError as error:  # exact motions include fewer drives and effects
+        return None, str(error)
+    if not bool(orbit.stable):
+        return None, f"the working regime is unstable: the largest multiplier of its motion is {float(orbit.multiplier):.4g}"
+    start = orbit.at(0.0)
+    run = settle(scene, start=eqx.tree_at(lambda s: s.displacement, start, (1.0 + _INITIAL_SPREAD) * start.displacement))
+    if not np.allclose(run.amplitude, orbit.amplitude, rtol=0.0, atol=_SAME_MOTION * float(jnp.max(orbit.amplitude))):
+        return None, f"the motion left the working regime and settled at {speed_text(run.omega, 6)}"
+    return run, ""
+
+
+def _jam_run(scene: Scene, mode: int) -> tuple[Run | None, str]:
+    orbit = _exact_motion(scene, mode)
+    if orbit is None:
+        return settle(scene, mode=mode), ""
+    if not bool(orbit.stable):
+        return None, f"mode {mode} is unstable: the largest multiplier of its exact motion is {float(orbit.multiplier):.4g}"
+    run = settle(scene, start=_deviating_start(orbit))
     if not abs(float(run.omega / orbit.omega) - 1.0) < _SAME_DESIGN_DISTANCE:
         return None, f"the motion left mode {mode} and settled at {speed_text(run.omega, 6)}"
     return run, ""
@@ -328,10 +361,14 @@ def _deviating_start(orbit: Orbit) -> State:
     return State(displacement, velocity, (angle + spread,), rate)
 
 
-def _standard_rows(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quantity]]:
-    """Return the standard rows of the table of a machine in a jam mode."""
-    if mode is None:
+def _standard_rows(scene: Scene, motion: _Motion, of: Pair) -> list[tuple[str, Quantity]]:
+    """Return the standard rows of the table of a machine in a jam mode, or in the working regime."""
+    if motion is None:
         return []
+    if motion == "working":
+        amplitudes = [(name, working_amplitude(scene, k)) for k, name in enumerate(amplitude_names(scene))]
+        return [("speed", working_speed()), *amplitudes, ("foundation force", foundation_force())]
+    mode = motion
     rows = [("jam frequency", jam_frequency(mode=mode))]
     rows += [(name, amplitude(mode=mode, of=k + 1)) for k, name in enumerate(amplitude_names(scene))]
     rows += [("foundation force", foundation_force(mode=mode))]
@@ -339,10 +376,10 @@ def _standard_rows(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, 
 
 
 def _named_quantities(
-    space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand], mode: int | None
+    space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand], motion: _Motion
 ) -> list[tuple[str, Quantity]]:
-    """Return the quantities of the table: the standard ones of a jam, then the objective, held quantities and demands."""
-    standard = _standard_rows(scene, mode, objective.of)
+    """Return the quantities of the table: the standard ones, then the objective, held quantities and demands."""
+    standard = _standard_rows(scene, motion, objective.of)
     sought = objective.parts[0] if objective.name.startswith("negative ") and objective.parts else objective
     own = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
     known = {q for _, q in standard}
@@ -372,7 +409,7 @@ def _table(
 
 
 def _other_tiers(
-    scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, mode: int | None
+    scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, motion: _Motion
 ) -> tuple[list[float], list[float]]:
     """Return the quantities by the exact motion and by the run of the verification, NaN for a quantity that this tier cannot
     compute."""
@@ -390,27 +427,22 @@ def _other_tiers(
 
     evaluation = Evaluation(scene)
     exact = [value(q, evaluation, "exact") if verify else math.nan for q in quantities]
-    if run is None or mode is None:
+    if run is None or motion is None:
         return exact, [math.nan] * len(exact)
     measured = Evaluation(scene)
-    measured.keep_run(mode, run)
+    measured.keep_run(motion, run)
     return exact, [value(q, measured, "time") for q in quantities]
 
 
 def _outcome(space: DesignSpace, scene: Scene, values: np.ndarray) -> Outcome:
-    numbers = [float(v) for v in values] or [math.nan] * (3 + len(scene.machine.structure().coordinates))
-    omega, *amplitudes, force, ratio = numbers
-    return Outcome(space.parameters(scene), math.isfinite(omega), omega, tuple(amplitudes), force, ratio)
+    nd = len(scene.machine.structure().coordinates)
+    omega, *rest = [*values.tolist(), *[math.nan] * (3 + nd)][: 3 + nd]
+    return Outcome(space.parameters(scene), math.isfinite(omega), omega, tuple(rest[:nd]), *rest[nd:])
 
 
-def _by_run(space: DesignSpace, run: Run, mode: int, of: Pair) -> Outcome:
+def _by_run(space: DesignSpace, run: Run, motion: _Motion, of: Pair) -> Outcome:
     evaluation = Evaluation(run.scene)
-    evaluation.keep_run(mode, run)
-    return Outcome(
-        parameters=space.parameters(run.scene),
-        exists=True,
-        omega=float(run.omega),
-        amplitude=tuple(float(a) for a in run.amplitude),
-        foundation_force=float(run.foundation_force),
-        force_per_amplitude=float(force_per_amplitude(mode=mode, of=of, tier="time").read(evaluation)),
-    )
+    assert motion is not None
+    evaluation.keep_run(motion, run)
+    rows = _standard_rows(run.scene, motion, of)
+    return _outcome(space, run.scene, np.array([float(q.at_tier("time").read(evaluation)) for _, q in rows]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -10,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.units import number, random_numbers
@@ -95,7 +96,7 @@ def tolerance_ranges(
     found = []
     for each in quantities:
         quantity = (each.quantity if isinstance(each, Demand) else each).simplified
-        values = np.array([float(quantity(machine)) for machine in machines])
+        values = np.array([_value(quantity, machine) for machine in machines])
         there = values[np.isfinite(values)]
         kept = np.isfinite(values)
         at_least = isinstance(each, Demand) and each.sense == "at least"
@@ -109,6 +110,14 @@ def tolerance_ranges(
             ToleranceRange(each.words, quantity.unit, design, float(low), float(high), float(worst), float(np.mean(kept)))
         )
     return found
+
+
+def _value(quantity: Quantity, scene: Scene) -> float:
+    """Return the value of a quantity, NaN if it does not exist."""
+    try:
+        return float(quantity(scene))
+    except ComputationError:  # there is no stable synchronous regime
+        return math.nan
 
 
 def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) -> Iterator[Scene]:

@@ -17,27 +17,29 @@ from jaxvib.errors import InputError
 _START_HELP = "Initial state: rest (machine at rest, drive at its speed), jam (with --mode), or spin_up (smooth, from rest)."
 
 _SCREENS = ("linear-screen", "circular-screen", "feeder")
+_FILES = ("design", *(f"{kind}-design" for kind in _SCREENS), "identification", "measurement", "sweep")
 _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus", *_SCREENS)
 """Names of `TEMPLATES` and `SCREENS` in `jaxvib.machine`, repeated here because their import is slow."""
 
 
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
-@click.argument("kind", metavar="KIND", type=click.Choice([*_MACHINES, "design", "identification", "measurement", "sweep"]))
+@click.argument("kind", metavar="KIND", type=click.Choice([*_MACHINES, *_FILES]))
 @shared
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep`, `identify` or `plan`.
 
     KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus, linear-screen, circular-screen or feeder for a
-    machine; design for `optimize`; sweep (a study) for `sweep`; identification (recorded runs of a machine) for `identify` and
-    `plan`; measurement (a recorded swing) for `identify`."""
+    machine; design, linear-screen-design, circular-screen-design or feeder-design for `optimize`; sweep (a study) for `sweep`;
+    identification (recorded runs of a machine) for `identify` and `plan`; measurement (a recorded swing) for `identify`."""
     from jaxvib.exchange.recordings.fit_file import TEMPLATE as IDENTIFICATION
     from jaxvib.machine.files import TEMPLATES
     from jaxvib.machine.structures.screens import SCREENS
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
+    from optimize.files import SCREEN_TEMPLATES
     from optimize.files import TEMPLATE as DESIGN
 
-    files = {"design": DESIGN, "identification": IDENTIFICATION, "measurement": MEASUREMENT, "sweep": STUDY}
+    files = {"design": DESIGN, **SCREEN_TEMPLATES, "identification": IDENTIFICATION, "measurement": MEASUREMENT, "sweep": STUDY}
     text = files[kind] if kind in files else {**TEMPLATES, **SCREENS}[kind.replace("-", "_")]
     name = "study" if kind == "sweep" else kind
     path = output.file(f"{name}.toml" if kind in files else "machine.toml")

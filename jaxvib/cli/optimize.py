@@ -61,6 +61,7 @@ def optimize(
         path.write_text(rewrite_scene(source.read_text(encoding="utf-8"), best.scene), encoding="utf-8")
     output.picture("before_after.png", best.plot)
     output.picture("convergence.png", best.plot_convergence)
+    _draw_working_regime(output, loaded, best)
     if best.run is not None:
         output.picture("history.png", best.run.plot)
         output.keep("run.npz", best.run)
@@ -70,12 +71,32 @@ def optimize(
     output.done(document, lambda: "\n".join([_text(best), *parts]), "optimize", best)
 
 
+def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> None:
+    """Draw the phases of the exciters and the ellipses on the deck of a machine with several exciters."""
+    import jaxvib as jv
+    from optimize.quantities.exciters import deck_points
+
+    sought = (
+        design.objective,
+        *(demand.quantity for demand in design.subject_to),
+        *(held.quantity for held in design.space.held),
+    )
+    points = deck_points(sought)
+    regime = None if points is None else jv.working_regime(best.scene, throw=False)
+    if regime is None or not bool(regime.stable):
+        return
+    output.picture("phases.png", regime.plot)
+    if points:
+        output.picture("deck.png", lambda: jv.sketch(best.scene, deck=regime.deck(points)))
+
+
 def _toleranced(design: Design) -> list[Quantity | Demand]:
     """Return the quantities of a design whose ranges within tolerances are shown: the objective, the force, the demands."""
     from optimize import foundation_force
 
     mode = design.objective.mode
-    return [design.objective, *([] if mode is None else [foundation_force(mode=mode)]), *design.subject_to]
+    force = [foundation_force(mode=mode)] if mode is not None or design.space.scene.machine.places == "plane" else []
+    return [design.objective, *force, *design.subject_to]
 
 
 def _document(best: Synthesis) -> dict:

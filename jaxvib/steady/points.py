@@ -290,8 +290,11 @@ def _deck(motion: Harmonic, points: Array, slope: Array, body: int) -> Deck:
     rows = jnp.stack([rows_in_plane(motion.machine, on_body(point, body), "points") for point in points])
     amplitude, ellipses = jax.vmap(lambda each: _at_rows(motion, each, slope))(rows)
     mean = jnp.mean(amplitude, axis=0, keepdims=True)
-    away = jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1)
-    return Deck(points, amplitude, ellipses, jnp.sqrt(jnp.mean(away) / jnp.sum(jnp.abs(mean) ** 2)))
+    away = jnp.mean(jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1)) / jnp.sum(jnp.abs(mean) ** 2)
+    # The root has no derivative at 0; there it is set to 0.
+    is_straight = away == 0.0
+    spread = jnp.where(is_straight, 0.0, jnp.sqrt(jnp.where(is_straight, 1.0, away)))
+    return Deck(points, amplitude, ellipses, spread)
 
 
 def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellipse]:

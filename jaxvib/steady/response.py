@@ -261,7 +261,7 @@ def response(
     for k, exciter in enumerate(scene.exciters):
         if exciter.loads is not None:
             problem = "turn at a speed of their own; this function needs exciters with an unbalance and no loads, use branches"
-            raise InputError(f"{scene.place_of(k)}loads", problem)
+            raise InputError(f"{scene.prefix_of(k)}loads", problem)
     require_rotating_masses(scene)
     n = len(scene.exciters)
     angles = jnp.zeros(n, scene.top_speed.dtype) if phases is None else numbers(phases, "rad", "phases", n)

@@ -104,7 +104,7 @@ class Study:
             "measure": {name: measure.unit for name, measure in zip(self.names, self.measures, strict=True)},
             "run": None if self.plan is None else {**self.plan._asdict(), "start": self.start, "mode": self.mode},
             "tile": list(self.grid.tile),
-            "precision": str(self.scene.drive.speed.dtype),
+            "precision": str(self.scene.top_speed.dtype),
             "options": options | {"EQX_ON_ERROR": os.environ.get("EQX_ON_ERROR")},
             "program": self.program,
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from functools import cached_property, partial
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,10 @@ from jaxvib.steady.jams.follow import follow_fold, follow_jam
 from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.synchronous import SynchronousOrbit, synchronous_orbit
+from jaxvib.steady.outcome import without_numbers
+from jaxvib.steady.regimes.synchronous import SynchronousRegime
+from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units.known import is_known
 
 _NO_FOLD = 10.0
@@ -154,13 +158,45 @@ class Evaluation:
 
     def jam_run(self, mode: int) -> Run:
         """Integrate the full equations from a jam mode for 60 periods of the lowest natural frequency."""
-        frequencies = known(jax.lax.stop_gradient(natural_frequencies(self.scene)))
-        until = 60.0 * 2.0 * np.pi / frequencies.min()
+        until = self._sixty_periods()
         return self._run(("jam", mode), partial(simulate, self.scene, until, start="jam", mode=mode, save="window"))
 
-    def keep_run(self, mode: int, run: Run) -> None:
-        """Store a run that has settled in a jam mode as the result of `jam_run`."""
-        self._runs["jam", mode] = run
+    @cached_property
+    def regime(self) -> SynchronousRegime:
+        """Working regime of the exciters.
+
+        **Raises** `ComputationError` if there is none and the scene is known; under a JAX transformation its values are NaN.
+        """
+        return working_regime(self.scene)
+
+    @cached_property
+    def synchronous(self) -> SynchronousOrbit:
+        """Exact motion near the working regime, with NaN values if it does not exist or is unstable."""
+        speed, phases = jax.lax.stop_gradient((self.regime.speed, self.regime.phases))
+        orbit = synchronous_orbit(self.scene, speed=speed, phases=phases, throw=False)
+        return without_numbers(orbit.stable, orbit)
+
+    def working(self, tier: Literal["leading", "exact", "time"]) -> SynchronousRegime | SynchronousOrbit | Run:
+        """Return the motion in which the exciters work: averaged, exact, or integrated from the exact motion."""
+        if tier == "leading":
+            return self.regime
+        if tier == "exact":
+            return self.synchronous
+
+        def integrate(**options: Any) -> Run:
+            start = self.synchronous.at(jnp.zeros_like(self.synchronous.speed))
+            return simulate(self.scene, self._sixty_periods(), start=start, save="window", **options)
+
+        return self._run("working", integrate)
+
+    def _sixty_periods(self) -> float:
+        """Return the length of 60 periods of the lowest natural frequency, s."""
+        frequencies = known(jax.lax.stop_gradient(natural_frequencies(self.scene)))
+        return 60.0 * 2.0 * np.pi / float(frequencies.min())
+
+    def keep_run(self, motion: int | Literal["working"], run: Run) -> None:
+        """Store a run that has settled in a jam mode or in the working regime, in place of a new one."""
+        self._runs["working" if motion == "working" else ("jam", motion)] = run
 
     def start_up(self, until: float, spin_up: float) -> Run:
         """Integrate the full equations from rest to the time `until`, s; the rotor speed rises during the time `spin_up`, s."""

@@ -17,6 +17,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.measures import shaft_torque
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.exciters import regime_quantity, working_force, working_power
 from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity, Tier
 
 __all__ = [
@@ -159,23 +160,28 @@ def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -
 
 
 @validated
-def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "leading") -> Quantity:
-    """Return the force of all supports on the foundation in a jam mode, N zero to peak.
+def foundation_force(*, mode: int | None = None, harmonic: int | None = None, tier: Tier = "leading") -> Quantity:
+    """Return the force of all supports on the foundation, N zero to peak, in a jam mode or in the working regime.
 
     **Arguments**
 
-    - `mode`: number of the jam mode; typical: 1, 3, 5
+    - `mode`: number of the jam mode; typical: 1, 3, 5; default: the working regime of exciters, see `throw_stroke`
     - `harmonic`: number k of a harmonic of the exact motion, for the force at k times the load speed only; typical: 1 to 5;
       default: the whole force
     - `tier`: as for `amplitude`
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 1 to 2000 N. A mode that the machine does not have raises
-    `InputError` when the quantity is computed. **Raises** `InputError` for a harmonic with the tier "time".
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 1 to 2000 N for jams, 1 to 20 kN for screens. A mode that
+    the machine does not have raises `InputError` when the quantity is computed. **Raises** `InputError` for a harmonic with the
+    tier "time" or without a mode.
 
     >>> from optimize import foundation_force
     >>> foundation_force(mode=3).unit
     'N'
     """
+    if mode is None:
+        if harmonic is not None:
+            raise InputError("harmonic", f"is {quoted(harmonic)} without a mode; give the jam mode")
+        return regime_quantity("foundation_force", "N", working_force, "foundation force", tier)
     if harmonic is None:
         return jam_quantity(
             "foundation_force", "N", jam_force, mode, tier, "foundation force", settings=(None,), pieces_function=_peaks
@@ -313,19 +319,22 @@ def _multiplier(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 
 
 @validated
-def power(*, mode: int, tier: Tier = "leading") -> Quantity:
-    """Return the mean power that the loads take from the rotor in a jam mode, W.
+def power(*, mode: int | None = None, tier: Tier = "leading") -> Quantity:
+    """Return the mean power, W, that loads take from the rotor in a jam mode, or of all drives in the working regime.
 
-        P = n sum_j b_W R^2 (n - Omega) + power of dry friction
+        P = n sum_j b_W R^2 (n - Omega) + power of dry friction    (jam)
 
-    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier`: "leading" (the default) or "exact".
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; default: the working regime of exciters, see
+    `throw_stroke`; `tier`: "leading" (the default) or "exact".
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 10 to 2000 W.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 10 to 2000 W for jams, 0.1 to 20 kW for screens.
 
     >>> from optimize import power
     >>> power(mode=3).unit
     'W'
     """
+    if mode is None:
+        return regime_quantity("power", "W", working_power, "power of all drives", tier, ("leading", "exact"))
     return jam_quantity("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
 
 

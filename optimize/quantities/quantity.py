@@ -78,7 +78,10 @@ class Quantity:
 
     @validated
     def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
-        """Return the value for a scene, a scalar in `unit`. The jam `modes` of the scene are computed unless they are given."""
+        """Return the value for a scene, a scalar in `unit`. The jam `modes` of the scene are computed unless they are given.
+
+        **Raises** `ComputationError` for a quantity of the working regime of a scene that has none.
+        """
         return self.read(Evaluation(scene, modes=modes))
 
     def read(self, evaluation: Evaluation) -> Array:
@@ -226,7 +229,7 @@ class Combined(Quantity):
         values = [part.read(evaluation) for part in self.parts]
         match self.operation:
             case "constant":
-                return jnp.asarray(self.constant, evaluation.scene.drive.speed.dtype)
+                return jnp.asarray(self.constant, evaluation.scene.top_speed.dtype)
             case "neg":
                 return -values[0]
             case "+":

@@ -62,6 +62,9 @@ def folder(tmp_path_factory):
     for name, text in re.findall(r"```toml\n# (\w+\.toml)\n(.*?)```", page, flags=re.S):
         (folder / name).write_text(text)
     shutil.copytree(ROOT / "examples", folder / "examples")
+    designs = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "screens.md").read_text(encoding="utf-8"), flags=re.S)
+    for name, text in zip(("screen-design", "feeder-design"), designs, strict=True):
+        (folder / f"{name}.toml").write_text(text)
     return folder
 
 

@@ -279,7 +279,7 @@ def test_design_files_mean_what_they_say(tmp_path, monkeypatch):
     assert float(design.space.held[0].value) == 8e4  # what it is in the scene
     np.testing.assert_allclose(design.space.at(jnp.array([0.5, 0.0])).machine.stiffness, [5e4, 2.5e4])
     asked = []
-    monkeypatch.setattr("optimize.files.synthesize", lambda *what, **how: asked.append((what, how)))
+    monkeypatch.setattr("optimize.design.synthesize", lambda *what, **how: asked.append((what, how)))
     design.run(seed=9)
     assert asked == [((design.space, design.objective), {"subject_to": design.subject_to, "starts": 8, "seed": 9})]
     (tmp_path / "design.toml").write_text(DESIGN.replace("maximize = true", "maximize = false").replace("samples = 8", ""))

@@ -16,7 +16,7 @@ from optimize.search.find import SearchResult
 from optimize.search.polish import Optimality
 from optimize.search.problem import Point
 from optimize.synthesize import (
-    _mode_of,
+    _motion_of,
     _named_quantities,
     _options,
     _other_tiers,
@@ -119,7 +119,7 @@ def test_wrong_questions_are_said_in_one_sentence():
     ):
         with pytest.raises(jv.InputError, match=says):
             synthesize(space, wish, subject_to=subject_to, begin=begin)
-    assert _run(SCENE, None, True)[1].startswith("neither the objective nor the demands have a jam mode")
+    assert _run(SCENE, None, True)[1].startswith("neither the objective nor the demands have a motion")
     assert _run(SCENE, 3, False) == (None, "not requested")
 
 
@@ -194,8 +194,10 @@ def test_added_springs_are_marked_new():
 
 def test_the_mode_of_a_search_is_that_of_its_objective():
     force, whose, mass = foundation_force(mode=3), amplitude(mode=4), total_mass()
-    assert _mode_of(force, [whose < 1.0]) == 3 and _mode_of(-force / mass, []) == 3
-    assert _mode_of(mass, [mass < 9.0, whose < 1.0, force < 1.0]) == 4 and _mode_of(mass, [mass < 9.0]) is None
+    assert _motion_of(SPACE, force, [whose < 1.0]) == 3 and _motion_of(SPACE, -force / mass, []) == 3
+    assert (
+        _motion_of(SPACE, mass, [mass < 9.0, whose < 1.0, force < 1.0]) == 4 and _motion_of(SPACE, mass, [mass < 9.0]) is None
+    )
 
 
 def test_searches_of_all_numbers_of_loads_count(monkeypatch):

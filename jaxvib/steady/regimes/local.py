@@ -163,11 +163,14 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
     fold, there, slopes = _fold_near(frozen, at, factor)
     polished = (jnp.abs(there - factor) < 1e-2 * factor) & (jnp.max(jnp.abs(fold - at)) < _LONGEST_STEP)
     at, factor = jnp.where(polished, fold, at), jnp.where(polished, there, factor)
-    # At the fold the left null vector times the residuals is 0 to first order for any unknowns.
-    left = slopes.rows * slopes.left[:, -1]
-    by_factor = left @ jax.jvp(lambda f: balance_residuals(at, frozen, f), (factor,), (one,))[1]
-    moved = factor - (left @ balance_residuals(at, balance, factor) - left @ balance_residuals(at, frozen, factor)) / by_factor
     ends = has_differences & (factor < _LARGEST_FACTOR)
+    # Without a fold the values below are not used; finite ones leave no NaN in derivatives.
+    at, factor = jnp.where(ends, at, start), jnp.where(ends, factor, one)
+    # At the fold the left null vector times the residuals is 0 to first order for any unknowns.
+    left = jnp.where(ends, slopes.rows * slopes.left[:, -1], 1.0)
+    by_factor = left @ jax.jvp(lambda f: balance_residuals(at, frozen, f), (factor,), (one,))[1]
+    by_factor = jnp.where(ends, by_factor, 1.0)
+    moved = factor - (left @ balance_residuals(at, balance, factor) - left @ balance_residuals(at, frozen, factor)) / by_factor
     return jnp.where(ends, jnp.where(polished, moved, factor), jnp.inf)
 
 

@@ -54,7 +54,7 @@ def all_regimes(balance: TorqueBalance) -> tuple[np.ndarray, np.ndarray]:
     if balance.is_prescribed.all():
         return np.asarray(motion_of(balance, jnp.zeros(0, speed.dtype))[0])[None], np.zeros((1, count), speed.dtype)
     exchanges, tolerance = exchanges_in(balance), tolerances(speed.dtype)
-    sets, speeds = _sets_of_phases(balance.is_prescribed, speed.dtype), _speeds(balance)
+    sets, speeds = sets_of_phases(balance.is_prescribed, speed.dtype), _speeds(balance)
     known = np.zeros(0, speed.dtype), np.zeros((0, count), speed.dtype), np.zeros(0, int)
     for _ in range(_MAX_ROUNDS):
         solved = _solutions(balance, *_starts(balance, speeds, sets))
@@ -122,12 +122,15 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
     return speeds[speeds < 1.02 * top].astype(balance.unbalance.dtype)
 
 
-def _sets_of_phases(prescribed: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """Return regular and random sets of phases (n, count); the phases of masses with prescribed speed are 0."""
+def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _PHASES_PER_UNKNOWN) -> np.ndarray:
+    """Return regular sets of phases (n, count), and random ones, `per_unknown` for each squared number of unknown phases.
+
+    The phases of masses with prescribed speed are 0.
+    """
     free = _free_phases(prescribed)
     n = free.size
-    even = np.linspace(-np.pi, np.pi, _PHASES_PER_UNKNOWN, endpoint=False)[:, None] if n == 1 else np.zeros((0, n))
-    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (_PHASES_PER_UNKNOWN * n * n if n > 1 else 0, n))
+    even = np.linspace(-np.pi, np.pi, per_unknown, endpoint=False)[:, None] if n == 1 else np.zeros((0, n))
+    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (per_unknown * n * n if n > 1 else 0, n))
     return _with_fixed(np.concatenate([_regular_sets(n), even, random]), free, prescribed.size, dtype)
 
 

@@ -40,6 +40,7 @@ from jaxvib.steady.jams.phases import degrees
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.steady.regimes.local import (
+    Slopes,
     decays,
     implicit_step,
     margin_of,
@@ -69,6 +70,10 @@ class RegimeStatus(eqx.Enumeration):
         "one of a family: phases can change without a change of torques, so that even the smallest disturbance changes them"
     )
     not_converged = "no regime was found from this start"
+    none_stable = (
+        "no stable synchronous regime was found: the exciters turn at different speeds, or a resonance catches them; "
+        "synchronous_regimes lists the unstable regimes, run_up shows the motion from rest"
+    )
     unbounded = "the masses turn at an undamped resonance: the vibration grows without bounds"
     refused = REFUSED
 
@@ -253,7 +258,7 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = Non
     """
     scene = validate_scene(scene)
     require_rotating_masses(scene)
-    _require_one_speed(scene)
+    require_one_speed(scene)
     count = sum(1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters)
     if near is not None:
         if not isinstance(near, (tuple, list)) or len(near) != 2 or np.shape(near[1]) != (count,):
@@ -286,13 +291,22 @@ def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     balance = assemble_torque_balance(scene)
     frozen = jax.lax.stop_gradient(balance)
     x = jax.lax.stop_gradient(unknowns_of(frozen, omega, phases))
-    if x.size:
-        x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), x, frozen, on_scalars=False)
-        slopes = slopes_of(x, frozen)
-        neutral = slopes.neutral
+    if x.size == 0:
+        return numbers_at(balance, x, None)
+    x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), x, frozen, on_scalars=False)
+    return numbers_at(balance, x, slopes_of(x, frozen))
+
+
+def numbers_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: Array | None = None) -> dict[str, Any]:
+    """Return the fields of a regime, without the scene, with derivatives with respect to the scene.
+
+    **Arguments**: unknowns `x` that solve the balance, and the `slopes` there, both without derivatives (None if there are no
+    unknowns); the `growth` of disturbances if it is known.
+    """
+    frozen = jax.lax.stop_gradient(balance)
+    neutral = jnp.asarray(0) if slopes is None else slopes.neutral
+    if slopes is not None:
         x = implicit_step(x, slopes, balance_residuals(x, balance))
-    else:
-        neutral = jnp.asarray(0)
     w, angles = motion_of(balance, x)
     angles = jnp.concatenate([angles[:1], jnp.arctan2(jnp.sin(angles[1:]), jnp.cos(angles[1:]))])
     influence, response = influence_of(balance, w)
@@ -314,7 +328,7 @@ def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     status = RegimeStatus.where(bounded | ~jnp.isfinite(w), status, RegimeStatus.unbounded)
 
     known, at = jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles))
-    growth = regime_growth(frozen, known, at, neutral)
+    growth = regime_growth(frozen, known, at, neutral) if growth is None else jnp.where(there, growth, jnp.nan)
     numbers = {
         "speed": w,
         "phases": angles,
@@ -331,7 +345,7 @@ def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     }
     kept = {name: jnp.where(there, value, jnp.nan) for name, value in numbers.items()}
     stable = there & decays(growth, w)
-    return {"status": status, "stable": stable, "can_start": can_start(scene), **kept}
+    return {"status": status, "stable": stable, "can_start": can_start(balance.model.scene), **kept}
 
 
 def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
@@ -345,14 +359,14 @@ def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
 def _has_one_speed(balance: TorqueBalance) -> Array:
     """Return True if all prescribed speeds of unbalances are equal.
 
-    `_require_one_speed` has already checked speeds that are known (not traced).
+    `require_one_speed` has already checked speeds that are known (not traced).
     """
     field = balance.averaged
     speeds = [drive.speed for count, drive in zip(field.counts, field.drives, strict=True) if count == 0 and drive.ideal]
     return jnp.all(jnp.stack([speed == speeds[0] for speed in speeds])) if speeds else jnp.asarray(True)
 
 
-def _require_one_speed(scene: Scene) -> None:
+def require_one_speed(scene: Scene) -> None:
     """**Raises** `InputError` if ideal drives turn unbalances at different speeds. Traced speeds are not checked."""
     ideal = [k for k, exciter in enumerate(scene.exciters) if exciter.loads is None and exciter.drive.ideal]
 

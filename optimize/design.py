@@ -1,0 +1,30 @@
+"""Design task: a design space, an objective and demands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from jaxvib.machine.files import Tables
+from optimize.quantities.quantity import Demand, Quantity
+from optimize.result import Synthesis
+from optimize.space import DesignSpace
+from optimize.synthesize import synthesize
+
+
+@dataclass(frozen=True)
+class Design:
+    """Design task: `space`, `objective`, the arguments of `synthesize` in `search`, and the demands
+    `subject_to`.
+
+    Returned by `load_design` and by recipes.
+    """
+
+    space: DesignSpace
+    objective: Quantity
+    search: Tables = field(default_factory=dict)
+    subject_to: tuple[Demand, ...] = ()
+
+    def run(self, **more: Any) -> Synthesis:
+        """Search for the best machine by `synthesize`, with arguments `more` in place of those in `search`."""
+        return synthesize(self.space, self.objective, subject_to=self.subject_to, **{**self.search, **more})

@@ -1,0 +1,393 @@
+"""Quantities of machines whose exciters synchronise: motion of a deck, force, power, margins.
+
+They are those of the working regime, see `jaxvib.working_regime`. A scene that has no stable synchronous regime raises
+`ComputationError` with the status "none_stable"; in a search, its designs do not exist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.torque_balance import TorqueBalance, assemble_torque_balance, influence_of
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.run import Run
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.steady.points import Ellipse
+from jaxvib.units import Number, count
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.quantity import TIERS, BuiltinQuantity, Quantity, Tier, walk
+from optimize.quantities.user_inputs import number_in
+
+__all__ = [
+    "amplitude_spread",
+    "force_per_throw",
+    "least_torque",
+    "motion_spread",
+    "resonance_distance",
+    "roundness",
+    "synchronization_margin",
+    "throw_angle",
+    "throw_number",
+    "throw_stroke",
+]
+
+_LARGEST_MARGIN = 1e3
+"""Value of the margin of equal motors, which is infinite; a search needs a finite one."""
+
+_PEAK_STEPS, _PEAK_REACH = 8, 0.1
+"""Number of steps of the search for the speed of the largest torque at a resonance, and largest distance from the resonance."""
+
+_ON_THE_WAY = 0.95
+"""Largest natural frequency, relative to the working speed, that counts as a resonance on the way up."""
+
+Point = tuple[float, float]
+
+
+class RegimeQuantity(BuiltinQuantity):
+    """Quantity of the working regime of a machine with several exciters."""
+
+
+def regime_quantity(
+    name: str,
+    unit: str,
+    function: Callable[..., Array],
+    text: str,
+    tier: Tier = "leading",
+    tiers: tuple[Tier, ...] = TIERS,
+    settings: tuple[object, ...] = (),
+    pieces_function: Callable[..., Array] | None = None,
+) -> Quantity:
+    return RegimeQuantity(
+        name, unit, function, tier=tier, tiers=tiers, text=text, settings=settings, pieces_function=pieces_function
+    )
+
+
+def _point(at: Sequence[Number], field: str) -> Point:
+    if not isinstance(at, (list, tuple)) or len(at) != 2:
+        raise InputError(field, f"is {quoted(at)}; it must be a point (x, y) of the body")
+    return number_in(at[0], "m", f"{field}[0]"), number_in(at[1], "m", f"{field}[1]")
+
+
+def _of_point(
+    name: str,
+    unit: str,
+    function: Callable[..., Array],
+    text: str,
+    at: Sequence[Number],
+    body: int,
+    tier: Tier,
+    *settings: object,
+) -> Quantity:
+    point = _point(at, "at")
+    text = f"{text} at ({point[0]:g}, {point[1]:g}) m"
+    return regime_quantity(name, unit, function, text, tier, settings=(point, count(body, "body", low=0), *settings))
+
+
+def _ellipse(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float = 0.0) -> Ellipse:
+    return evaluation.working(tier).ellipse(at, body, slope=slope)
+
+
+@validated
+def throw_stroke(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
+    """Return the stroke of a point, m peak to peak: the length of the long axis of its path, "double amplitude" in data sheets.
+
+    **Arguments**
+
+    - `at`: the point (x, y) of the body, m or text, from its centre of mass; default: the centre of mass
+    - `body`: number of the body from 0; typical: 0 (the default)
+    - `tier`: "leading" (averaged theory, the default), "exact" (the exact periodic motion), or "time" (the full equations,
+      integrated from the exact motion)
+
+    **Returns** `Quantity`; typical: 4 to 16 mm. **Raises** `InputError` for a place that is no point.
+
+    >>> from optimize import throw_stroke
+    >>> (throw_stroke(at=(0.5, 0.1)) > "6 mm").words
+    'stroke at (0.5, 0.1) m at least 6 mm'
+    """
+    return _of_point("throw_stroke", "m", _throw_stroke, "stroke", at, body, tier)
+
+
+def _throw_stroke(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
+    return 2.0 * _ellipse(evaluation, tier, at, body).semi_major
+
+
+@validated
+def throw_angle(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
+    """Return the throw angle: direction of the long axis of a point's path, rad from x anticlockwise, -pi/2 to pi/2.
+
+    **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
+
+    **Returns** `Quantity`; typical: 30 to 60 degrees. **Raises** `InputError` for a place that is no point.
+
+    >>> from optimize import throw_angle
+    >>> (throw_angle() > "40 deg").words
+    'throw angle at (0, 0) m at least 40 deg'
+    """
+    return _of_point("throw_angle", "rad", _throw_angle, "throw angle", at, body, tier)
+
+
+def _throw_angle(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
+    return _ellipse(evaluation, tier, at, body).direction
+
+
+@validated
+def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body: int = 0, tier: Tier = "leading") -> Quantity:
+    """Return the throw number of a point of a deck, see `jaxvib.Ellipse`.
+
+    **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; `slope` of the deck, rad or text; typical: "-15 deg" to 0 (the
+    default).
+
+    **Returns** `Quantity`; typical: 2 to 5. **Raises** `InputError` for a place that is no point.
+
+    >>> from optimize import throw_number
+    >>> throw_number(at=(1.5, 0.1), slope="-5 deg").unit
+    ''
+    """
+    along = number_in(slope, "rad", "slope")
+    return _of_point("throw_number", "", _throw_number, "throw number", at, body, tier, along)
+
+
+def _throw_number(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float) -> Array:
+    return _ellipse(evaluation, tier, at, body, slope).throw_number
+
+
+@validated
+def roundness(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
+    """Return the ratio of the semi-axes of the path of a point: 0 for a straight line, 1 for a circle.
+
+    **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
+
+    **Returns** `Quantity`; typical: below 0.05 for a linear screen, above 0.9 for a circular one. **Raises** `InputError` for
+    a place that is no point.
+
+    >>> from optimize import roundness
+    >>> (roundness() > 0.9).words
+    'roundness at (0, 0) m at least 0.9'
+    """
+    return _of_point("roundness", "", _roundness, "roundness", at, body, tier)
+
+
+def _roundness(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
+    path = _ellipse(evaluation, tier, at, body)
+    return jnp.abs(path.semi_minor) / path.semi_major
+
+
+@validated
+def force_per_throw(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = "leading") -> Quantity:
+    """Return the foundation force, N zero to peak, divided by the semi-major axis of the path of a point, N/m.
+
+    **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
+
+    **Returns** `Quantity`; typical: the stiffness of all supports, 1e5 to 2e6 N/m. **Raises** `InputError` for a place that is
+    no point.
+
+    >>> from optimize import force_per_throw
+    >>> force_per_throw().unit
+    'N/m'
+    """
+    return _of_point("force_per_throw", "N/m", _force_per_throw, "foundation force per throw", at, body, tier)
+
+
+def _force_per_throw(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
+    return evaluation.working(tier).foundation_force / _ellipse(evaluation, tier, at, body).semi_major
+
+
+@validated
+def motion_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Tier = "leading") -> Quantity:
+    """Return the spread of the motions over a deck: root mean square over its points of |U_p - mean| / |mean|.
+
+    It is 0 if all points have the same motion; the deck then throws in the same way everywhere.
+
+    **Arguments**: `points`: a list of (x, y), m or text; `body`, `tier` as in `throw_stroke`; typical: 2 to 10 points.
+
+    **Returns** `Quantity`; typical: 0.01 to 0.3. **Raises** `InputError` for places that are no points.
+
+    >>> from optimize import motion_spread
+    >>> (motion_spread([(-1.0, 0.1), (1.0, 0.1)]) < 0.05).words
+    'spread of the motions over the deck at most 0.05'
+    """
+    return _of_deck("motion_spread", _motion_spread, "spread of the motions over the deck", points, body, tier)
+
+
+@validated
+def amplitude_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Tier = "leading") -> Quantity:
+    """Return the range of the amplitudes of points of a deck divided by their mean; 0 if all are equal.
+
+    **Arguments**: `points`: a list of (x, y), m or text; `body`, `tier` as in `throw_stroke`; typical: 2 to 10 points.
+
+    **Returns** `Quantity`; typical: 0.01 to 0.5. **Raises** `InputError` for places that are no points.
+
+    >>> from optimize import amplitude_spread
+    >>> amplitude_spread([(-1.0, 0.1), (1.0, 0.1)]).unit
+    ''
+    """
+    return _of_deck("amplitude_spread", _amplitude_spread, "spread of amplitudes over the deck", points, body, tier)
+
+
+def _of_deck(
+    name: str, function: Callable[..., Array], text: str, points: Sequence[Sequence[Number]], body: int, tier: Tier
+) -> Quantity:
+    if not isinstance(points, (list, tuple)) or len(points) < 2:
+        raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
+    places = tuple(_point(point, f"points[{k}]") for k, point in enumerate(points))
+    return regime_quantity(name, "", function, text, tier, settings=(places, count(body, "body", low=0)))
+
+
+def _motion_spread(evaluation: Evaluation, tier: Tier, points: tuple[Point, ...], body: int) -> Array:
+    return evaluation.working(tier).deck(points, body).motion_spread
+
+
+def _amplitude_spread(evaluation: Evaluation, tier: Tier, points: tuple[Point, ...], body: int) -> Array:
+    return evaluation.working(tier).deck(points, body).amplitude_spread
+
+
+def synchronization_margin() -> Quantity:
+    """Return the factor by which all differences of the motors' torques can grow until the regime ends; at most 1000.
+
+    **Returns** `Quantity`; typical: 2 to 50; 1000 for equal motors.
+
+    >>> from optimize import synchronization_margin
+    >>> (synchronization_margin() > 3.0).words
+    'margin of synchronisation at least 3'
+    """
+    return regime_quantity("synchronization_margin", "", _margin, "margin of synchronisation", tiers=("leading",))
+
+
+def _margin(evaluation: Evaluation, tier: Tier) -> Array:
+    margin = evaluation.regime.margin
+    is_large = margin > _LARGEST_MARGIN
+    # NaN (no regime) stays NaN, and an infinite margin leaves no NaN in derivatives.
+    return jnp.where(is_large, _LARGEST_MARGIN, jnp.where(is_large, 1.0, margin))
+
+
+def resonance_distance() -> Quantity:
+    """Return the distance of the working speed from the nearest natural frequency, relative to the working speed.
+
+        min_r |w_r / Omega - 1|
+
+    **Returns** `Quantity`; typical: 0.3 to 0.9.
+
+    >>> from optimize import resonance_distance
+    >>> (resonance_distance() > 0.5).words
+    'distance from the nearest resonance at least 0.5'
+    """
+    text = "distance from the nearest resonance"
+    return regime_quantity("resonance_distance", "", _distance, text, tiers=("leading",), pieces_function=_distances)
+
+
+def _distance(evaluation: Evaluation, tier: Tier) -> Array:
+    return -jnp.max(_distances(evaluation, -1.0, tier))
+
+
+def _distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
+    each = -jnp.abs(natural_frequencies(evaluation.scene) / evaluation.regime.speed - 1.0)
+    return each if sign < 0.0 else -jnp.max(each)[None]
+
+
+def least_torque() -> Quantity:
+    """Return the factor by which the torques of all motors can be multiplied until they just pass the resonances on the way up.
+
+        max_r max_w (w^4/2) sum_ik S_i S_k |A_ik(w)| / sum_i L_i(w),      A = (H^H - H)/(2 i),    w near w_r
+
+    The numerator is the largest mean torque of a steady vibration at the speed w over all phases; resonances up to 95 % of the
+    slowest motor's working speed count. Rotors of large inertia need this torque in a slow run-up; a fast passage needs less,
+    see `jaxvib.run_up`, which integrates the run-up.
+
+    **Returns** `Quantity`; typical: 0.1 to 0.8; above 1 the motors are caught by a resonance.
+
+    >>> from optimize import least_torque
+    >>> (least_torque() < 0.7).words
+    'least torque that passes the resonances at most 0.7'
+    """
+    text = "least torque that passes the resonances"
+    return regime_quantity("least_torque", "", _least_torque, text, tiers=("leading",), pieces_function=_least_torques)
+
+
+def _least_torque(evaluation: Evaluation, tier: Tier) -> Array:
+    return jnp.max(_least_torques(evaluation, 1.0, tier))
+
+
+def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
+    """Return the ratio of the torques at each resonance, 0 at those above the working speed."""
+    scene = evaluation.scene
+    balance = assemble_torque_balance(scene)
+    if any(balance.is_prescribed):
+        raise InputError("scene", "has an ideal drive, which passes every resonance; this quantity needs motors")
+
+    def ratio(speed: Array, given: TorqueBalance = balance) -> Array:
+        influence = influence_of(given, speed)[0]
+        resisting = magnitude((influence.conj().T - influence) / 2j)
+        needed = speed**4 / 2.0 * (given.unbalance @ resisting @ given.unbalance)
+        return needed / jnp.sum(given.driving_torque(speed))
+
+    frozen = jax.lax.stop_gradient(balance)
+
+    def peak(resonance: Array) -> Array:
+        low, high = (1.0 - _PEAK_REACH) * resonance, (1.0 + _PEAK_REACH) * resonance
+
+        def slope(w: Array) -> Array:
+            return jax.grad(lambda w: 1.0 / ratio(w, frozen))(w)
+
+        def step(_: int, w: Array) -> Array:
+            value, curvature = jax.jvp(slope, (w,), (jnp.ones_like(w),))
+            move = jnp.nan_to_num(value / jnp.abs(curvature))
+            return jnp.clip(w - jnp.clip(move, -0.02 * resonance, 0.02 * resonance), low, high)
+
+        # The ratio is stationary at its peak, so that the derivative of the speed is not needed.
+        return ratio(jax.lax.fori_loop(0, _PEAK_STEPS, step, resonance))
+
+    resonances = jax.lax.stop_gradient(natural_frequencies(scene))
+    slowest = jnp.min(jnp.stack([exciter.drive.speed for exciter in scene.exciters]))
+    counts = (resonances > 0.0) & (resonances < _ON_THE_WAY * slowest)
+    each = jax.vmap(peak)(jnp.where(counts, resonances, 0.5 * slowest))
+    each = jnp.where(counts, each, 0.0)
+    return each if sign > 0.0 else -jnp.max(each)[None]
+
+
+def deck_points(quantities: Iterable[Quantity]) -> list[Point] | None:
+    """Return the points of body 0 to which quantities of the working regime refer; None without such quantities."""
+    found: dict[Point, None] = {}
+    own = [part for quantity in quantities for part in walk(quantity) if isinstance(part, RegimeQuantity)]
+    for part in own:
+        match part.settings:
+            case ((float(x), float(y)), 0, *_):
+                found[x, y] = None
+            case (tuple() as points, 0):
+                found |= dict.fromkeys(points)
+    return list(found) if own else None
+
+
+def working_speed() -> Quantity:
+    return regime_quantity("speed", "rad/s", _working_speed, "speed")
+
+
+def _working_speed(evaluation: Evaluation, tier: Tier) -> Array:
+    motion = evaluation.working(tier)
+    return jnp.mean(jnp.abs(motion.load_speed)) if isinstance(motion, Run) else motion.speed
+
+
+def working_amplitude(scene: Scene, k: int) -> Quantity:
+    structure = scene.machine.structure()
+    name = f"amplitude of {structure.coordinates[k]}"
+    return regime_quantity("amplitude", structure.units[k], _working_amplitude, name, settings=(k,))
+
+
+def _working_amplitude(evaluation: Evaluation, tier: Tier, k: int) -> Array:
+    return evaluation.working(tier).amplitude[k]
+
+
+def working_force(evaluation: Evaluation, tier: Tier) -> Array:
+    return evaluation.working(tier).foundation_force
+
+
+def working_power(evaluation: Evaluation, tier: Tier) -> Array:
+    motion = evaluation.working(tier)
+    assert not isinstance(motion, Run)  # runs do not contain the torques of the drives
+    return jnp.sum(motion.power)

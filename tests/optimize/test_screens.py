@@ -1,0 +1,188 @@
+"""Designs of machines with several exciters: search, brute force, demands, recipes, files, fronts, sweeps."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.machine.structures.screens import SCREENS
+from optimize import (
+    DesignSpace,
+    foundation_force,
+    hold,
+    load_design,
+    motion_spread,
+    pareto,
+    power,
+    recipes,
+    synchronization_margin,
+    synthesize,
+    throw_angle,
+    throw_stroke,
+)
+from optimize.files import SCREEN_TEMPLATES
+
+DECK = [(-1.5, 0.1), (1.5, 0.1)]
+
+
+def screen(**motor):
+    scene = jv.scene_from_toml(SCREENS["linear_screen"])
+    given = {"breakdown_torque": 80.0, "breakdown_slip": 0.35, "inertia": 0.6, **motor}
+    second = jv.Exciter(drive=jv.InductionMotor("1000 rpm", **given), unbalance=4.56, at=(0.7, 0.3), direction=-1)
+    return jv.Scene(scene.machine, exciters=[scene.exciters[0], second], effects=scene.effects)
+
+
+def place(low=0.2, high=1.2):
+    """Design space: the place of the second exciter."""
+    return {"exciters[1].position[0]": (low, high), "exciters[1].position[1]": (low, high)}
+
+
+def straight_at_45():
+    """Square of the spread of the motions plus that of the error of the throw angle, rad."""
+    error = (throw_angle() - "45 deg") / "1 rad"
+    return motion_spread(DECK) ** 2 + error**2
+
+
+def scan(space, objective, points=81):
+    """Least value of an objective on a grid, and then on a grid around it."""
+    low, high = np.zeros(2), np.ones(2)
+    values_of = jax.jit(lambda z: jax.lax.map(lambda one: objective(space.at(one)), z, batch_size=64))
+    for _ in range(3):
+        axes = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+        z = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        values = np.asarray(values_of(jnp.asarray(z)))
+        best = z[np.nanargmin(values)]
+        step = (high - low) / (points - 1)
+        low, high = np.clip(best - 2.0 * step, 0.0, 1.0), np.clip(best + 2.0 * step, 0.0, 1.0)
+    return best, float(np.nanmin(values))
+
+
+@pytest.mark.slow
+def test_straight_throw_is_that_of_a_dense_scan():
+    space, objective = DesignSpace(screen(), place()), straight_at_45()
+    best = synthesize(space, objective, starts=8, iterations=40, verify=False)
+    z, least = scan(space, objective, points=41)
+    assert best.status_name == "done"
+    assert best.values.min() <= least * (1.0 + 1e-9)
+    np.testing.assert_allclose(best.designs[np.argmin(best.values)], z, atol=1e-3)
+    np.testing.assert_allclose(throw_angle()(best.scene), np.pi / 4.0, atol=0.01)
+    assert "speed" in best.summary() and best.after.exists
+
+
+@pytest.mark.slow
+def test_256_starts_find_the_scan_and_verify_it():
+    space, objective = DesignSpace(screen(), place()), straight_at_45()
+    best = synthesize(space, objective)
+    _, least = scan(space, objective)
+    assert best.status_name == "done" and best.starts == 256 and best.same > 128
+    np.testing.assert_allclose(best.values.min(), least, rtol=1e-4)
+    assert best.verified is not None, best.unverified
+    for row in best.table[2:6]:
+        np.testing.assert_allclose(row.time, row.exact, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_margin_and_force_constrain_the_design():
+    """Unequal motors; the springs are free too. The demands are met in the complete search for regimes."""
+    space = DesignSpace(
+        screen(breakdown_torque=60.0),
+        {**place(), "machine.supports[0].stiffness[1]": (3e5, 7e5), "machine.supports[1].stiffness[1]": (3e5, 7e5)},
+    )
+    free = synthesize(space, straight_at_45(), starts=32, verify=False)
+    margin, force = (float(q(free.scene)) for q in (synchronization_margin(), foundation_force()))
+    demands = [synchronization_margin() > 1.2 * margin, foundation_force() < 0.95 * force]
+    best = synthesize(space, straight_at_45(), subject_to=demands, starts=32)
+    assert best.status_name == "done" and best.values.min() > free.values.min()
+    assert any(limit.active for limit in best.limits[:2]) and all(limit.violation == 0.0 for limit in best.limits)
+    regime = jv.synchronous_regimes(best.scene).select(0)
+    assert float(regime.margin) > 1.2 * margin * (1.0 - 1e-6)
+    assert float(regime.foundation_force) < 0.95 * force * (1.0 + 1e-6)
+
+
+@pytest.mark.slow
+def test_designs_without_a_regime_end_in_a_named_status():
+    """A light unbalance does not couple motors of 1000 and at least 2000 rpm."""
+    light = eqx.tree_at(lambda s: s.exciters[0].unbalance, screen(), jnp.asarray(0.05))
+    apart = DesignSpace(light, {"exciters[1].drive.speed": ("2000 rpm", "2500 rpm")})
+    with pytest.raises(jv.ComputationError, match="does not exist for any of the 4 random designs") as raised:
+        synthesize(apart, motion_spread(DECK), starts=4, verify=False)
+    assert raised.value.status == "no_feasible_start"
+
+
+@pytest.mark.parametrize("name", SCREEN_TEMPLATES)
+def test_recipe_files_are_the_recipes(name, tmp_path):
+    kind = name.removesuffix("-design").replace("-", "_")
+    file = {"linear_screen": "screen"}.get(kind, kind)
+    (tmp_path / f"{file}.toml").write_text(SCREENS[kind])
+    (tmp_path / "design.toml").write_text(SCREEN_TEMPLATES[name])
+    assert len(SCREEN_TEMPLATES[name].splitlines()) <= 10
+    design = load_design(tmp_path / "design.toml")
+    points = [tuple(p) for p in ([-0.8, 0.1], [0.8, 0.1])] if kind == "feeder" else None
+    if points:
+        same = recipes.feeder(jv.scene_from_toml(SCREENS[kind]), points=points, stroke="4 mm")
+        assert same.objective == design.objective and same.subject_to == design.subject_to
+    assert design.search == {"starts": 32} and design.space.size == {"circular_screen": 3, "feeder": 9}.get(kind, 5)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('[recipe]\nname = "screen"', "recipe.name is 'screen'"),
+        ('[recipe]\nname = "linear_screen"', "recipe.points is missing"),
+        ('[recipe]\nname = "linear_screen"\npoints = [[0, 0], [1, 0]]\nangles = 3', "did you mean 'angle'"),
+        ('[recipe]\nname = "linear_screen"\npoints = 3', "list of at least two points"),
+        ('[free]\na = [1, 2]\n[recipe]\nname = "feeder"', "given together with"),
+        ('[recipe]\nname = "antiphase"', "needs a machine of platforms"),
+    ],
+)
+def test_wrong_recipes_in_files_are_refused(text, says, tmp_path):
+    (tmp_path / "screen.toml").write_text(SCREENS["linear_screen"])
+    (tmp_path / "design.toml").write_text(f'scene = "screen.toml"\n{text}\n')
+    with pytest.raises(jv.InputError, match=says):
+        load_design(tmp_path / "design.toml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "angle"), [("linear_screen", 45.0), ("feeder", 25.0), ("circular_screen", None)])
+def test_recipes_improve_the_templates(kind, angle):
+    scene = jv.scene_from_toml(SCREENS[kind])
+    points = [(-0.8, 0.1), (0.8, 0.1)] if kind == "feeder" else DECK
+    design = getattr(recipes, kind)(scene, points=points)
+    best = design.run(starts=8)
+    assert best.status_name == "done" and best.verified is not None, best.unverified
+    middle = tuple(np.mean(points, axis=0).tolist())
+    np.testing.assert_allclose(throw_stroke(at=middle)(best.scene), throw_stroke(at=middle)(scene), rtol=1e-6)
+    assert best.values.min() < float(design.objective(scene))
+    if angle is not None:
+        np.testing.assert_allclose(np.rad2deg(throw_angle(at=middle)(best.scene)), angle, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_front_of_throw_and_power():
+    space = DesignSpace(
+        screen(), {"exciters[0].unbalance": (2.0, 6.0)}, ties={"exciters[1].unbalance": "exciters[0].unbalance"}
+    )
+    front = pareto(space, -throw_stroke(), power(), points=3, starts=4)
+    assert len(front.values) == 3 and np.all(np.diff(front.values[:, 1]) < 0.0)
+    assert len(front.scene(0).exciters) == 2
+
+
+@pytest.mark.slow
+def test_sweep_measures_screens_and_names_those_without_regime(tmp_path):
+    places = [0.6, 0.8]
+    measure = {"spread": motion_spread(DECK), "force": foundation_force()}
+    found = jv.sweep(screen(), {"exciters[1].position[0]": places}, measure, tmp_path / "places.zarr")
+    space = DesignSpace(screen(), {"exciters[1].position[0]": (0.5, 1.0)})
+    alone = [float(motion_spread(DECK)(space.scene_of(jnp.array([x])))) for x in places]
+    np.testing.assert_allclose(found.data["spread"], alone, rtol=1e-9)
+    apart = jv.sweep(screen(), {"exciters[1].drive.speed": ["1000 rpm", "2000 rpm"]}, measure, tmp_path / "speeds.zarr")
+    assert {count.status: count.cases for count in apart.counts if count.cases} == {"done": 1, "absent": 1}
+
+
+@pytest.mark.slow
+def test_held_quantity_of_a_screen_keeps_its_value():
+    space = DesignSpace(screen(), place(), [hold(throw_angle(), "45 deg")])
+    best = synthesize(space, motion_spread(DECK), starts=4, iterations=25, verify=False)
+    np.testing.assert_allclose(throw_angle()(best.scene), np.pi / 4.0, rtol=1e-7)
