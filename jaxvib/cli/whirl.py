@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED_TYPE, Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import csv_options
-
-if TYPE_CHECKING:
-    pass
 
 
 @app.command("whirl")
@@ -37,15 +34,10 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
     loaded = loaded_scene(scene)
     rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
     found = jv.whirl(loaded, [rotor_speed], loads=loads)
-    critical = [
-        {"speed": float(w), "forward": bool(f)}
-        for w, f in zip(found.critical.speed, found.critical.forward, strict=True)
-        if np.isfinite(w)
-    ]
-    whirls = [
-        {"speed": float(w), "decay": float(d), "forward": bool(f)}
-        for w, d, f in zip(found.speed[0], found.decay[0], found.forward[0], strict=True)
-    ]
+    turning = zip(found.critical.speed, found.critical.forward, found.critical.straight, strict=True)
+    critical = [{"speed": float(w), "forward": bool(f), "straight": bool(s)} for w, f, s in turning if np.isfinite(w)]
+    moving = zip(found.speed[0], found.decay[0], found.forward[0], found.straight[0], strict=True)
+    whirls = [{"speed": float(w), "decay": float(d), "forward": bool(f), "straight": bool(s)} for w, d, f, s in moving]
     top = 1.3 * max([rotor_speed, *(each["speed"] for each in critical)])
     speeds = np.linspace(0.0, top, 161)
     output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed))
@@ -57,9 +49,12 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
         from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
-        sense = {True: "forward", False: "backward"}
-        rows = [[sense[w["forward"]], f"{scale * w['speed']:.6g}"] for w in critical]
-        moving = [[sense[w["forward"]], f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w in whirls]
+
+        def sense(each: dict[str, Any]) -> str:
+            return "straight" if each["straight"] else "forward" if each["forward"] else "backward"
+
+        rows = [[sense(w), f"{scale * w['speed']:.6g}"] for w in critical]
+        moving = [[sense(w), f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w in whirls]
         return "\n".join(
             [
                 table("critical speeds: whirl speed = rotor speed", ["", unit], rows),

@@ -8,35 +8,42 @@ from matplotlib.axes import Axes
 from jaxvib.display import SpeedUnit, speed_unit
 from jaxvib.draw.style import COLORS, GUIDE, OPERATING, Drawn, legend_above, panels
 
+_SENSES = {
+    "forward": (COLORS[0], "-", "forward whirl"),
+    "backward": (COLORS[1], "--", "backward whirl"),
+    "straight": (COLORS[2], "-.", "straight motion"),
+}
+"""Colour, line and name of each sense."""
+
 
 def campbell_diagram(
     rotor_speed: np.ndarray,
     speed: np.ndarray,
-    forward: np.ndarray,
+    sense: np.ndarray,
     *,
     critical: tuple[np.ndarray, np.ndarray] | None = None,
     at: float | None = None,
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw whirl speeds over the rotor speed: forward whirls as solid lines, backward whirls dashed.
+    """Draw whirl speeds over the rotor speed: forward whirls as solid lines, backward whirls dashed, straight motions dotted.
 
     **Arguments** (ns rotor speeds, nd whirls at each)
 
     - `rotor_speed` (ns,), `speed` (ns, nd): rotor speed and whirl speeds, rad/s, drawn in `unit`
-    - `forward` (ns, nd): True for forward whirls
-    - `critical`: critical speeds (k,), rad/s, and True for forward ones (k,), marked on the line w = n with their values
+    - `sense` (ns, nd): "forward", "backward" or "straight"
+    - `critical`: critical speeds (k,), rad/s, and their senses (k,), marked on the line w = n with their values
     - `at`: operating speed, rad/s
 
     >>> import numpy as np
     >>> n = np.linspace(0.0, 2.0, 5)
-    >>> len(campbell_diagram(n, np.ones((5, 1)), np.ones((5, 1), dtype=bool)).axes)
+    >>> len(campbell_diagram(n, np.ones((5, 1)), np.full((5, 1), "forward")).axes)
     1
     """
     unit, scale = speed_unit(unit)
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
-    for with_rotor, line, color, label in ((True, "-", COLORS[0], "forward whirl"), (False, "--", COLORS[1], "backward whirl")):
-        for k, values in enumerate(whirl_lines(speed, forward == with_rotor)):
+    for word, (color, line, label) in _SENSES.items():
+        for k, values in enumerate(whirl_lines(speed, sense == word)):
             alone = {"marker": "o", "ms": 4.0} if len(rotor_speed) == 1 else {}
             axis.plot(scale * rotor_speed, scale * values, ls=line, color=color, label=None if k else label, **alone)
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
@@ -57,15 +64,15 @@ def campbell_diagram(
     return figure if ax is None else ax
 
 
-def _critical_marks(axis: Axes, speed: np.ndarray, forward: np.ndarray, right: float, top: float) -> None:
+def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: float, top: float) -> None:
     """Draw critical speeds as points on the line w = n, with their values beside vertical lines to the axis.
 
     Close critical speeds share a text.
     """
-    for group, word in critical_groups(speed, forward, right):
+    for group, word in critical_groups(speed, sense, right):
         for k in group:
-            look = {"mfc": "white", "mec": COLORS[0] if forward[k] else COLORS[1], "mew": 1.4, "zorder": 4}
-            axis.plot([speed[k]], [speed[k]], "o" if forward[k] else "s", ms=6.0, **look)
+            look = {"mfc": "white", "mec": _SENSES[str(sense[k])][0], "mew": 1.4, "zorder": 4}
+            axis.plot([speed[k]], [speed[k]], "o" if sense[k] == "forward" else "s", ms=6.0, **look)
             axis.vlines(float(speed[k]), 0.0, float(speed[k]), color=GUIDE, lw=0.7, zorder=1.2)
         at = (speed[group[-1]], 0.02 * top)
         axis.annotate(word, at, xytext=(3, 0), textcoords="offset points", rotation=90, va="bottom", fontsize="small")
@@ -87,11 +94,11 @@ def whirl_lines(speed: np.ndarray, has_sense: np.ndarray) -> np.ndarray:
     return np.sort(np.where(has_sense, speed, np.nan), axis=1)[:, :count].T
 
 
-def critical_groups(speed: np.ndarray, forward: np.ndarray, right: float) -> list[tuple[list[int], str]]:
+def critical_groups(speed: np.ndarray, sense: np.ndarray, right: float) -> list[tuple[list[int], str]]:
     """Return groups of close critical speeds (k,) up to `right`, in ascending order, as indices and a text for each group.
 
     >>> import numpy as np
-    >>> critical_groups(np.array([1.0, 10.0, 10.1]), np.array([True, True, False]), right=20.0)
+    >>> critical_groups(np.array([1.0, 10.0, 10.1]), np.array(["forward", "forward", "backward"]), right=20.0)
     [([0], '1 forward'), ([1, 2], '10 forward, 10.1 backward')]
     """
     groups: list[list[int]] = []
@@ -99,5 +106,4 @@ def critical_groups(speed: np.ndarray, forward: np.ndarray, right: float) -> lis
         if np.isfinite(speed[k]) and speed[k] <= right:
             near = groups and speed[k] - speed[groups[-1][-1]] < 0.035 * right
             groups = [*groups[:-1], [*groups[-1], k]] if near else [*groups, [k]]
-    senses = {True: "forward", False: "backward"}
-    return [(group, ", ".join(f"{speed[k]:.4g} {senses[bool(forward[k])]}" for k in group)) for group in groups]
+    return [(group, ", ".join(f"{speed[k]:.4g} {sense[k]}" for k in group)) for group in groups]

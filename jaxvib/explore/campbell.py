@@ -12,16 +12,21 @@ from jaxvib.draw.whirl import critical_groups, whirl_lines
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
 from jaxvib.steady.whirl import Whirl
 
-_FORWARD = {"color": COLORS[0], "lw": 1.5}
-_BACKWARD = {"color": COLORS[1], "lw": 1.5, "ls": "--"}
+_SENSES = {
+    "forward": {"color": COLORS[0], "lw": 1.5},
+    "backward": {"color": COLORS[1], "lw": 1.5, "ls": "--"},
+    "straight": {"color": COLORS[2], "lw": 1.5, "ls": "-."},
+}
+"""Styles of whirls by their sense."""
+
 _CRITICAL = {"fc": "white", "ec": "black", "lw": 1.2, "zorder": 4.0}
 _DROP_LINE = {"color": GUIDE, "lw": 0.7, "zorder": 1.2}
 _LETTER = 0.11
 """Upper bound of the width of a letter, in units of the drawing."""
 
 _LEGEND = {
-    "forward whirl": _FORWARD,
-    "backward whirl": _BACKWARD,
+    "forward whirl": _SENSES["forward"],
+    "backward whirl": _SENSES["backward"],
     "whirl speed = rotor speed": ROTOR,
     "operating speed": OPERATING,
     "critical speeds (no damping), rpm": _CRITICAL,
@@ -45,22 +50,23 @@ def campbell(found: Whirl, at: float) -> str:
     True
     """
     scale, rotor_speed = speed_unit("rpm")[1], np.asarray(found.rotor_speed)
-    speed, forward = np.asarray(found.speed), np.asarray(found.forward)
-    critical, forward_critical = scale * np.asarray(found.critical.speed), np.asarray(found.critical.forward)
+    speed, sense = np.asarray(found.speed), found.sense
+    critical, critical_sense = scale * np.asarray(found.critical.speed), found.critical.sense
     right = scale * max(float(np.max(rotor_speed)), 1.05 * at)
-    groups = critical_groups(critical, forward_critical, right)
+    groups = critical_groups(critical, critical_sense, right)
     shown = [k for group, _ in groups for k in group]
     top = 1.12 * max(scale * float(np.nanmax(speed)), *critical[shown].tolist(), 1e-300)
     panel = Panel(FIRST, "whirl speed, rpm", (0.0, right), (0.0, top), wide=2.0 * WIDE + APART)
     parts, texts = panel.frame(), panel.texts()
-    for selected, look in ((forward, _FORWARD), (~forward, _BACKWARD)):
-        parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, selected)]
+    for word, look in _SENSES.items():
+        parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, sense == word)]
     end = min(top, right)
     parts += [panel.line([0.0, end], [0.0, end], ROTOR), panel.line([scale * at] * 2, panel.y, OPERATING)]
     for k in shown:
         w = float(critical[k])
-        look = {**_CRITICAL, "ec": COLORS[0] if forward_critical[k] else COLORS[1]}
-        parts += [panel.line([w, w], [0.0, w], _DROP_LINE), dot(*panel.at(w, w), look, square=not forward_critical[k])]
+        look = {**_CRITICAL, "ec": _SENSES[str(critical_sense[k])]["color"]}
+        square = critical_sense[k] != "forward"
+        parts += [panel.line([w, w], [0.0, w], _DROP_LINE), dot(*panel.at(w, w), look, square=square)]
     ends: list[float] = []  # right end of the texts in each row, from the lowest row upward
     for group, word in groups:
         x, _ = panel.at(float(critical[group[-1]]), 0.0)

@@ -158,6 +158,14 @@ class Machine(Part):
         raise InputError("machine", problem)
 
     @property
+    def is_split(self) -> bool:
+        """True if the supports of a rotor differ horizontally and vertically.
+
+        Its whirls are then ellipses, which every rotating force excites.
+        """
+        return False
+
+    @property
     def body_count(self) -> int:
         """Number of bodies on which a point is given by (x, y)."""
         return 1

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 LoadMasses = Literal["fixed", "none"]
 
+_STRAIGHT = 1e-3
+"""Largest ratio of the axes of an ellipse that counts as a straight line."""
+
 _COUPLING, _MIN_COUPLING_ROUNDINGS = 1e-9, 100.0
 """Size of the added coupling that separates two whirls of one speed, relative to the matrices of the machine, and its minimum
 in units of the rounding."""
@@ -56,18 +59,26 @@ class CriticalSpeeds(Result):
 
     - `speed` (nd,), rad/s, ascending; inf for a speed that does not exist (a thin disc has no second forward critical speed)
     - `forward` (nd,): True if the whirl turns in the direction of the rotor. On supports that are equal in both directions an
-      imbalance excites forward whirls only
+      imbalance excites forward whirls only. If they differ, it excites all of them, and between two critical speeds of one
+      motion it turns the rotor's axis backward
+    - `straight` (nd,): True if the axis moves on a straight line, on supports that differ in both directions
     - `status`: a `WhirlStatus`
     """
 
     status: WhirlStatus
     speed: Array = eqx.field(metadata=in_unit("rad/s", "whirl"))
     forward: Array = eqx.field(metadata=in_unit("", "whirl"))
+    straight: Array = eqx.field(metadata=in_unit("", "whirl"))
+
+    @property
+    def sense(self) -> np.ndarray:
+        """Sense of each whirl, (nd,): "forward", "backward" or "straight"."""
+        return _sense_words(self.forward, self.straight)
 
     def summary(self) -> str:
         """Return a line of text for each speed."""
-        pairs = zip(np.asarray(self.speed), np.asarray(self.forward), strict=True)
-        lines = [f"critical speed {speed_text(w, 6)}, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
+        pairs = zip(np.asarray(self.speed), self.sense, strict=True)
+        lines = [f"critical speed {speed_text(w, 6)}, {sense}" for w, sense in pairs if np.isfinite(w)]
         lost = [self.message] if self.status_name != "done" else []
         return "\n".join([*lines, *lost]) or "no critical speed"
 
@@ -78,8 +89,9 @@ class CriticalSpeeds(Result):
         """
         from jaxvib.draw.results import speeds_chart  # slow import
 
-        speed, forward = np.asarray(self.speed), np.asarray(self.forward)
-        return speeds_chart([("forward", speed[forward]), ("backward", speed[~forward])], unit=unit, ax=ax)
+        speed, sense = np.asarray(self.speed), self.sense
+        shown = [word for word in ("forward", "backward", "straight") if word != "straight" or word in sense]
+        return speeds_chart([(word, speed[sense == word]) for word in shown], unit=unit, ax=ax)
 
 
 class Whirl(Result):
@@ -94,6 +106,7 @@ class Whirl(Result):
     - `decay`: (ns, nd) 1/s, negative if the motion grows. An overdamped motion has two decay rates; `decay` is the smaller
       one, with which the displacement creeps back. Several overdamped motions are in the order of increasing decay
     - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
+    - `straight`: (ns, nd) True if the axis moves on a straight line, on supports that differ in both directions
     - `critical`: the critical speeds
     - `status`: a `WhirlStatus`; motions that rounding hides are NaN
     """
@@ -103,13 +116,20 @@ class Whirl(Result):
     speed: Array = eqx.field(metadata=in_unit("rad/s", "rotor_speed", "whirl"))
     decay: Array = eqx.field(metadata=in_unit("1/s", "rotor_speed", "whirl"))
     forward: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
+    straight: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
     critical: CriticalSpeeds = eqx.field(metadata=part(prefix="critical_"))
+
+    @property
+    def sense(self) -> np.ndarray:
+        """Sense of each whirl, (ns, nd): "forward", "backward" (also if it does not oscillate) or "straight"."""
+        return _sense_words(self.forward, self.straight)
 
     def summary(self) -> str:
         """Return the whirls at each rotor speed, and the critical speeds, as text."""
         lines, (unit, scale) = [], speed_unit()
-        for n, *whirls in zip(*(np.asarray(x).tolist() for x in (self.rotor_speed, self.speed, self.forward)), strict=True):
-            shown = ", ".join(f"{scale * w:.6g}{_sense_word(w, f)}" for w, f in zip(*whirls, strict=True))
+        for n, *whirls in zip(*(np.asarray(x).tolist() for x in (self.rotor_speed, self.speed, self.sense)), strict=True):
+            pairs = zip(*whirls, strict=True)
+            shown = ", ".join(f"{scale * w:.6g} {'(overdamped)' if w == 0.0 else word}" for w, word in pairs)
             lines.append(f"rotor {scale * n:.6g} {unit}: whirl {shown} {unit}")
         lost = [self.message] if self.status_name != "done" else []
         return "\n".join([*lines, *lost, self.critical.summary()])
@@ -129,8 +149,8 @@ class Whirl(Result):
 
         if at is not None and not np.isfinite(at):
             raise InputError("at", f"is {at:g} rad/s; it must be finite")
-        critical = (np.asarray(self.critical.speed), np.asarray(self.critical.forward))
-        whirls = map(np.asarray, (self.rotor_speed, self.speed, self.forward))
+        critical = (np.asarray(self.critical.speed), self.critical.sense)
+        whirls = map(np.asarray, (self.rotor_speed, self.speed, self.sense))
         return campbell_diagram(*whirls, critical=critical, at=at, unit=unit, ax=ax)
 
 
@@ -166,10 +186,9 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: LoadMasses
     return outcome(_whirl(model, jnp.atleast_1d(speeds), loads), scene)
 
 
-def _sense_word(speed: float, forward: bool) -> str:
-    if speed == 0.0:
-        return " (overdamped)"
-    return " forward" if forward else " backward"
+def _sense_words(forward: Array, straight: Array) -> np.ndarray:
+    """Return "forward", "backward" or "straight" for each whirl."""
+    return np.where(np.asarray(straight), "straight", np.where(np.asarray(forward), "forward", "backward"))
 
 
 @cached
@@ -192,7 +211,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
         speed = jnp.where(creeps, 0.0, jnp.where(oscillates & (values.imag > 0.0), values.imag, jnp.inf))
         return jnp.lexsort((-values.real, speed))[:nd], oscillates
 
-    def at(n: Array) -> tuple[Array, Array, Array, Array]:
+    def at(n: Array) -> tuple[Array, Array, Array, Array, Array]:
         resisting = carrier.damping + n * gyroscopic
         values = jnp.linalg.eigvals(first_order(resisting))
         # A coupling too small to change the speeds separates two whirls of one speed.
@@ -203,18 +222,20 @@ def _whirl(model: LinearModel, speeds: Array, loads: LoadMasses) -> Whirl:
         nearest = jnp.argmin(jnp.abs(values[:, None] - apart[None, :]), axis=1)
         chosen, oscillates = one_of_each(values, stops[nearest])
         turns = oscillates[chosen]
-        forward = turns & (_sense(model.mount, shapes[:, one_of_each(apart, stops)[0]]) > 0.0)
+        own = shapes[:, one_of_each(apart, stops)[0]]
+        straight = turns & _is_straight(model, own)
         return (
             jnp.where(turns, values.imag[chosen], 0.0),
             -values.real[chosen],
-            forward,
+            turns & (_sense(model.mount, own) > 0.0) & ~straight,
+            straight,
             error[nearest][chosen] > MAX_EIGENVALUE_ERROR,
         )
 
-    speed, decay, forward, lost = jax.vmap(at)(speeds)
+    speed, decay, forward, straight, lost = jax.vmap(at)(speeds)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
     speed, decay = (jnp.where(lost, jnp.nan, x) for x in (speed, decay))
-    return Whirl(status, speeds, speed, decay, forward, critical=_critical_speeds(model, loads))
+    return Whirl(status, speeds, speed, decay, forward, straight, critical=_critical_speeds(model, loads))
 
 
 def _coupling(dtype: np.dtype) -> float:
@@ -251,7 +272,7 @@ def critical_speeds(scene: Scene, *, loads: LoadMasses = "fixed") -> CriticalSpe
     """Return the critical speeds, at which a whirl turns at the speed w of the rotor: (K - w^2 (M - i G)) X = 0.
 
     The eigenproblem is Hermitian. On supports that are equal in both directions, a forward tilt has the inertia A - C, a
-    backward one A + C.
+    backward one A + C. Supports that differ split each critical speed in two.
 
     **Arguments** as `whirl`: `scene`; `loads` "fixed" or "none".
 
@@ -284,7 +305,8 @@ def _critical_speeds(model: LinearModel, loads: LoadMasses) -> CriticalSpeeds:
     lost = ~decided & (error > 2.0 * MAX_EIGENVALUE_ERROR)
     speed = jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.inf)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
-    return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), _sense(mount, shapes) > 0.0)
+    straight = _is_straight(model, shapes)
+    return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), (_sense(mount, shapes) > 0.0) & ~straight, straight)
 
 
 def _two_directions(scene: Scene) -> LinearModel:
@@ -336,3 +358,11 @@ def _sense(mount: Mount, shapes: Array) -> Array:
     the rotor."""
     moved = jnp.stack(mount.rows).astype(shapes.dtype) @ shapes
     return jnp.sum(jnp.imag(moved[:, 0] * jnp.conj(moved[:, 1])), axis=0)
+
+
+def _is_straight(model: LinearModel, shapes: Array) -> Array:
+    """Return True for shapes (nd, k) in which the axis moves on straight lines, which needs supports that differ."""
+    if not model.scene.machine.is_split:
+        return jnp.zeros(shapes.shape[1], bool)
+    moved = jnp.stack(model.mount.rows).astype(shapes.dtype) @ shapes
+    return jnp.abs(_sense(model.mount, shapes)) <= _STRAIGHT * jnp.sum(jnp.abs(moved) ** 2, axis=(0, 1)) / 2.0

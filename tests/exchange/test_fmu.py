@@ -45,6 +45,11 @@ MORE = {
         effects=(jv.Gravity(),),
     ),
 }
+MORE["rotor on split supports"] = jv.Scene(
+    jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0, stiffness_up=1.7e6, damping_up=900.0),
+    jv.balls(count=2, mass=0.05, radius=0.08, drag=0.2),
+    jv.ConstantSpeed(300.0),
+)
 SCENES = scenes() | scenes_of_exciters() | MORE
 CHECKED = ["two masses", "stop", "imbalance and a motor", "rotor with stations", "torus, balls spin and slide"]
 CHECKED += ["two exciters on platforms", "body with loads and an unbalance"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 
@@ -23,7 +24,7 @@ _MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
 
 
 class Rotor(Machine):
-    """Rigid rotor on two isotropic supports, with the coordinates q = (y, z, theta, psi).
+    """Rigid rotor on two supports, with the coordinates q = (y, z, theta, psi).
 
     y and z are the displacements of the mass centre, horizontal and up; theta and psi are the tilts of the axis.
 
@@ -32,13 +33,16 @@ class Rotor(Machine):
         A theta'' + C w psi' + b2 y' + b3 theta' + c2 y + c3 theta = m_y
         A psi'' - C w theta' + b2 z' + b3 psi' + c2 z + c3 psi = m_z
 
-    w is the rotor speed. A point at the distance s along the axis moves by (y + s theta, z + s psi). A load acts at its station
-    s_j. z is the displacement from static equilibrium.
+    w is the rotor speed. If supports differ horizontally and vertically, the equations of z and psi have other coefficients b
+    and c. A point at the distance s along the axis moves by (y + s theta, z + s psi). A load acts at its station s_j. z is the
+    displacement from static equilibrium.
 
     **Attributes**
 
     - `mass` M kg; `transverse_inertia` A and `polar_inertia` C kg m^2, of the rotor without loads
     - `stiffness` k (2,) N/m, `damping` (2,) N s/m and `position` L (2,) m along the axis, of the two supports
+    - `stiffness_up` (2,) N/m and `damping_up` (2,) N s/m: vertical values, if `stiffness` and `damping` are the horizontal
+      ones; None: both directions are equal
     - `stations` s of the loads along the axis, m: one for all (scalar) or (count,)
     - `stiffness_terms` (c1 N/m, c2 N, c3 N m), `damping_terms` (b1 N s/m, b2 N s, b3 N m s); None: the terms of the supports,
       c1 = k_1 + k_2, c2 = k_1 L_1 + k_2 L_2, c3 = k_1 L_1^2 + k_2 L_2^2, and the same for b
@@ -55,6 +59,8 @@ class Rotor(Machine):
     stations: Array = eqx.field(metadata=unit("m", words="station", each="load", typical=0.1))
     stiffness_terms: Array | None = eqx.field(metadata=unit("N/m", "N", "N m", words="stiffness term", typical=1e4))
     damping_terms: Array | None = eqx.field(metadata=unit("N s/m", "N s", "N m s", words="damping term", typical=10.0))
+    stiffness_up: Array | None = eqx.field(metadata=unit("N/m", low=0.0, each="support", words="stiffness up"))
+    damping_up: Array | None = eqx.field(metadata=unit("N s/m", low=0.0, each="support", words="damping up"))
     kind: str = eqx.field(static=True)
     places = "shaft"
 
@@ -74,7 +80,7 @@ class Rotor(Machine):
         damping = terms(self.damping, self.damping_terms)
         zero = jnp.zeros_like(self.mass)
         translation, tilt = self._directions()
-        return Carrier(
+        carrier = Carrier(
             mass=matrix(self.mass, zero, self.transverse_inertia),
             damping=matrix(*damping),
             stiffness=matrix(*stiffness),
@@ -83,6 +89,13 @@ class Rotor(Machine):
             coordinates=("y", "z", "theta", "psi"),
             coordinate_units=("m", "m", "rad", "rad"),
         )
+        is_up = np.array([[False], [True], [False], [True]])
+        changed = {}
+        for name, up in (("stiffness", self.stiffness_up), ("damping", self.damping_up)):
+            if up is not None:
+                whole = jnp.where(is_up, matrix(*terms(up, None)), getattr(carrier, name))
+                changed |= {name: whole, f"foundation_{name}": whole[:2]}
+        return dataclasses.replace(carrier, **changed) if changed else carrier
 
     def mount(self, at: Place = None) -> Mount:
         """Return the station of the exciter, or the mass centre with a lever for each load, and the tilt of the axis."""
@@ -116,6 +129,11 @@ class Rotor(Machine):
         """Return rows (2, 4) of the mass centre, and of the tilt of the axis."""
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
+    @property
+    def is_split(self) -> bool:
+        """True if the supports differ horizontally and vertically."""
+        return self.stiffness_up is not None or self.damping_up is not None
+
     def shaft_supports(self) -> list[tuple[float, float, float]]:
         """Return the two supports."""
         return list(zip(self.position.tolist(), self.stiffness.tolist(), self.damping.tolist(), strict=True))
@@ -132,6 +150,8 @@ def rotor(
     stations: Numbers = 0.0,
     stiffness_terms: Sequence[Number] | None = None,
     damping_terms: Sequence[Number] | None = None,
+    stiffness_up: Numbers | None = None,
+    damping_up: Numbers | None = None,
 ) -> Rotor:
     """Return a rigid rotor on two supports, with the loads at one station or at several.
 
@@ -157,6 +177,8 @@ def rotor(
       typical: 1e6, up to 2e4, 3e4
     - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of the terms that follow from the supports;
       typical: 800, up to 10, 20
+    - `stiffness_up` (2,), N/m, and `damping_up` (2,), N s/m: vertical values of supports that differ in both directions;
+      `stiffness` and `damping` are then the horizontal ones; typical: 0.5 to 2 times those; default: equal to them
 
     **Returns** `Rotor`.
 
@@ -165,7 +187,7 @@ def rotor(
     - wrong units and values that are not allowed
     - supports at one place
     - a polar inertia above twice the transverse one
-    - terms that no supports can have (negative ones, or c2^2 > c1 c3)
+    - terms that no supports can have (negative ones, or c2^2 > c1 c3), or terms together with values up
 
     >>> import jaxvib as jv
     >>> machine = jv.rotor(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(0.604e6, 0.555e6),
@@ -190,18 +212,31 @@ def rotor(
         when_known(_require_two_places, places)
     transverse, polar = read(transverse_inertia=transverse_inertia, polar_inertia=polar_inertia).values()
     when_known(_require_possible_inertia, transverse, polar)
+    for name, given, up in (("stiffness", stiffness_terms, stiffness_up), ("damping", damping_terms, damping_up)):
+        if given is not None and up is not None:
+            problem = f"is given together with {name}_terms, which are those of both directions; give {name} and {name}_up"
+            raise InputError(f"machine.{name}_up", problem)
     found = {**read(mass=mass), **read(2, stiffness=stiffness)}
     k = found["stiffness"]
-    constants = damping_constants(damping, "machine.damping", k, lambda: found["mass"] * k / jnp.sum(k))
+    found |= read(2, damping=damping_constants(damping, "machine.damping", k, lambda: found["mass"] * k / jnp.sum(k)))
+    up = None if stiffness_up is None else read(2, stiffness_up=stiffness_up)["stiffness_up"]
+    resisting = None
+    if damping_up is not None:
+        vertical = k if up is None else up
+        constants = damping_constants(
+            damping_up, "machine.damping_up", vertical, lambda: found["mass"] * vertical / jnp.sum(vertical)
+        )
+        resisting = read(2, damping_up=constants)["damping_up"]
     return Rotor(
         **found,
-        **read(2, damping=constants),
         **read(stations=stations),
         transverse_inertia=transverse,
         polar_inertia=polar,
         position=places,
         stiffness_terms=terms("stiffness_terms", stiffness_terms),
         damping_terms=terms("damping_terms", damping_terms),
+        stiffness_up=up,
+        damping_up=resisting,
         kind="rotor",
     )
 
@@ -228,15 +263,16 @@ def _require_possible_inertia(transverse: float, polar: float) -> None:
 
 
 class PlanarRotor(Machine):
-    """Rotor on one isotropic support, moving horizontally and vertically without tilt.
+    """Rotor on one support, moving horizontally and vertically without tilt.
 
-        M y'' + b y' + k y = f_y,    M z'' + b z' + k z = f_z
+        M y'' + b y' + k y = f_y,    M z'' + b_up z' + k_up z = f_z
 
     **Attributes**; typical values: see `planar_rotor`
 
     - `mass` M, kg, loads not included
     - `stiffness` k, N/m
     - `damping` b, N s/m
+    - `stiffness_up` and `damping_up`: vertical values, if `stiffness` and `damping` are the horizontal ones; None: the same
 
     Source: the special case of `Rotor` with both supports and all loads in the plane of its mass centre.
     """
@@ -244,19 +280,30 @@ class PlanarRotor(Machine):
     mass: Array = eqx.field(metadata=_MASS)
     stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness of the support"))
     damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of the support"))
+    stiffness_up: Array | None = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness of the support up"))
+    damping_up: Array | None = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of the support up"))
     kind: str = eqx.field(static=True)
 
     def carrier(self) -> Carrier:
         """Return the matrices of the two coordinates."""
         eye = jnp.eye(2, dtype=self.mass.dtype)
+
+        def matrix(across: Array, up: Array | None) -> Array:
+            return across * eye if up is None else jnp.diag(jnp.stack([across, up]))
+
         return Carrier(
             mass=self.mass * eye,
-            damping=self.damping * eye,
-            stiffness=self.stiffness * eye,
-            foundation_stiffness=self.stiffness * eye,
-            foundation_damping=self.damping * eye,
+            damping=matrix(self.damping, self.damping_up),
+            stiffness=matrix(self.stiffness, self.stiffness_up),
+            foundation_stiffness=matrix(self.stiffness, self.stiffness_up),
+            foundation_damping=matrix(self.damping, self.damping_up),
             coordinates=("y", "z"),
         )
+
+    @property
+    def is_split(self) -> bool:
+        """True if the support differs horizontally and vertically."""
+        return self.stiffness_up is not None or self.damping_up is not None
 
     def mount(self, at: Place = None) -> Mount:
         """Return the mount, at the rotor's centre. **Raises** `InputError` if a place `at` is given."""
@@ -265,10 +312,17 @@ class PlanarRotor(Machine):
         return Mount(rows=(jnp.eye(2, dtype=self.mass.dtype),), axes=(0, 1))
 
 
-def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarRotor:
-    """Return a rotor that moves horizontally and vertically on one isotropic support.
+def planar_rotor(
+    *,
+    mass: Number,
+    stiffness: Number,
+    damping: Number,
+    stiffness_up: Number | None = None,
+    damping_up: Number | None = None,
+) -> PlanarRotor:
+    """Return a rotor that moves horizontally and vertically on one support.
 
-        M y'' + b y' + k y = f_y,    M z'' + b z' + k z = f_z
+        M y'' + b y' + k y = f_y,    M z'' + b_up z' + k_up z = f_z
 
     **Arguments** (SI, or strings with a unit)
 
@@ -276,6 +330,8 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
     - `stiffness` k, N/m; typical: 1e3 for a soft suspension, 1e5 to 1e6 for bearings
     - `damping` b, N s/m; typical: 50 to 1000; also a ratio of the critical damping 2 sqrt(k M), "5 %", or a loss factor, see
       `one_mass`
+    - `stiffness_up` k_up, N/m, and `damping_up` b_up, N s/m: vertical values, if `stiffness` and `damping` are the horizontal
+      ones; typical: 0.5 to 2 times those; default: equal to them
 
     **Returns** `PlanarRotor`. **Raises** `InputError` for wrong units and values that are not allowed.
 
@@ -285,10 +341,16 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
 
     Source: the special case of Artyunin 2013, equation (1), see `PlanarRotor`.
     """
-    found = read_numbers(PlanarRotor, "machine", mass=mass, stiffness=stiffness)
-    constants = damping_constants(damping, "machine.damping", found["stiffness"], lambda: found["mass"])
-    found |= read_numbers(PlanarRotor, "machine", damping=constants)
-    return PlanarRotor(**found, kind="planar_rotor")
+    read = partial(read_numbers, PlanarRotor, "machine")
+    found = read(mass=mass, stiffness=stiffness)
+    k = found["stiffness"]
+    found |= read(damping=damping_constants(damping, "machine.damping", k, lambda: found["mass"]))
+    up = None if stiffness_up is None else read(stiffness_up=stiffness_up)["stiffness_up"]
+    resisting = None
+    if damping_up is not None:
+        vertical = damping_constants(damping_up, "machine.damping_up", k if up is None else up, lambda: found["mass"])
+        resisting = read(damping_up=vertical)["damping_up"]
+    return PlanarRotor(**found, stiffness_up=up, damping_up=resisting, kind="planar_rotor")
 
 
 _ROTOR = """
@@ -317,13 +379,14 @@ static_imbalance = { moment = "8 g m" }
 """
 
 TEMPLATES = {
-    "planar_rotor": """# A rotor on one isotropic support, without tilt.
+    "planar_rotor": """# A rotor on one support, without tilt.
 # Numbers are in SI units; text can have any unit of the same dimension.
 [machine]
 kind = "planar_rotor"
 mass = 37.0                 # kg, with the body of the exciter, without the loads
 stiffness = "1160 N/mm"     # of the support, horizontal and vertical
 damping = 840.0             # N s/m
+# stiffness_up = "1740 N/mm"  # up, if the support differs horizontally and vertically; also damping_up
 """
     + _ROTOR,
     "rotor": """# A rigid rotor on two supports; it moves in two directions and tilts about two axes.
@@ -338,6 +401,7 @@ stiffness = ["604 N/mm", "555 N/mm"]      # of the two supports
 damping = [439.0, 404.0]                  # N s/m
 position = [0.165, -0.155]                # m, of the supports
 stations = [0.28, 0.25, -0.25, -0.28]     # m, positions of the loads; one number if all run in one plane
+# stiffness_up = ["906 N/mm", "833 N/mm"]   # up, if the supports differ horizontally and vertically; also damping_up
 # stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of stiffness and position of the supports
 """
     + _ROTOR,

@@ -296,8 +296,9 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     """Return the natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor, the frequencies of
-    the forward whirls at the rotor speed."""
+    the forward whirls at the rotor speed, on supports that differ horizontally and vertically those of all whirls."""
     if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
-    return jnp.sort(jnp.where(found.forward[0] & jnp.isfinite(found.speed[0]), found.speed[0], jnp.inf))
+    excited = jnp.isfinite(found.speed[0]) if scene.machine.is_split else found.forward[0] & jnp.isfinite(found.speed[0])
+    return jnp.sort(jnp.where(excited, found.speed[0], jnp.inf))
