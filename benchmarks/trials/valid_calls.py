@@ -256,14 +256,25 @@ def calls() -> Iterator[Callable[[], Call]]:
     # Bearing
     yield call("BearingPendulum", mass=2.0, length=0.3, inertia=0.0, bearing=0.01, g=9.81)
     p, rec = later(pendulum), later(record)
-    given = dict(angle=0.1, rate=0.0, viscous=1e-3, dry=1e-3, width=None, stepsize_controller=None, solver=None, adjoint=None)
+    given = dict(
+        angle=0.1,
+        rate=0.0,
+        viscous=1e-3,
+        dry=1e-3,
+        air=None,
+        torque=None,
+        width=None,
+        stepsize_controller=None,
+        solver=None,
+        adjoint=None,
+    )
     yield call("swing", pendulum=p, time=np.linspace(0.0, 2.0, 20), **given, max_steps=9999, throw=True)
     t = np.arange(0.0, 2.0, 0.1)
     yield call("Record", time=t, angle=0.1 * np.cos(6.0 * t), name="record")
     csv = later(_csv)
     yield call("read_record", path=csv, columns=("time (s)", "angle (rad)"), angle_unit="rad")
     yield call("ten_periods", pendulum=p, record=rec, periods=4, instrument=0.0, turns=None)
-    yield call("identify", pendulum=p, record=rec, dry=False, instrument=0.0, throw=False)
+    yield call("identify", pendulum=p, record=rec, dry=False, air=False, torque=False, instrument=0.0, throw=False)
     # Capture
     torus = dict(turns=2, starts=1, spread=1e-3, seed=0, resolution=None, rotation="rolling")
     fewer = dict(stepsize_controller=later(lambda: jv.EqualSteps(100)), equations=jv.vector_field)

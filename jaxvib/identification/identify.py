@@ -159,6 +159,8 @@ def identify(
     unknown: Sequence[str] = (),
     known: Mapping[str, Number] | None = None,
     dry: bool = False,
+    air: bool = False,
+    torque: bool = False,
     instrument: float = 0.0,
     throw: bool = True,
 ) -> MachineFit | Identified:
@@ -177,7 +179,8 @@ def identify(
 
     For a `BearingPendulum`, see `jaxvib.study.bearing.identify.identify_bearing`:
 
-        record(t_i) = offset + f(t_i) + noise,      J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
+        record(t_i) = offset + f(t_i) + noise
+        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width) - b |f'| f' + M
 
     **Arguments**
 
@@ -187,8 +190,8 @@ def identify(
     - `unknown`: names of numbers of the scene or of arrays of them, such as "machine.stiffness"
     - `known`: values of numbers with their standard errors, such as {"machine.mass[1]": "95 kg +- 1 %"}; without an error the
       value is exact. Numbers that are neither in `unknown` nor in `known` have the values of the scene exactly
-    - `dry`, `instrument`: only for a pendulum. `dry`: True to identify the dry friction mu2 as well. `instrument`: relative
-      uncertainty of J; typical: 0.01 to 0.03 (default 0)
+    - `dry`, `air`, `torque`, `instrument`: only for a pendulum. True to identify the dry friction mu2, the drag b of the air or
+      the torque M as well. `instrument`: relative uncertainty of J; typical: 0.01 to 0.03 (default 0)
     - `throw`: raise if no fit is found
 
     **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,
@@ -212,9 +215,10 @@ def identify(
             raise InputError(
                 "record", f"is {type(records).__name__}; it must be a Record(time, angle) or come from read_record"
             )
-        return identify_bearing(subject, records, dry=dry, instrument=instrument, throw=throw)
-    if dry or instrument:
-        raise InputError("dry" if dry else "instrument", "is for a BearingPendulum; leave it out for a Scene")
+        return identify_bearing(subject, records, dry=dry, air=air, torque=torque, instrument=instrument, throw=throw)
+    of_pendulum = {"dry": dry, "air": air, "torque": torque, "instrument": instrument}
+    for name in (name for name, value in of_pendulum.items() if value):
+        raise InputError(name, "is for a BearingPendulum; leave it out for a Scene")
     runs = [records] if isinstance(records, MeasuredRun) else records
     if isinstance(runs, Record) or not runs or not all(isinstance(run, MeasuredRun) for run in runs):
         raise InputError("records", f"is {quoted(records)}; it must be a list of runs of read_run or MeasuredRun.from_arrays")

@@ -19,8 +19,9 @@ def scipy_swing(rod, times, angle, rate, viscous, dry=0.0, air=0.0, torque=0.0):
     m, l, j, d, g = (float(x) for x in (rod.mass, rod.length, rod.total_inertia, rod.bearing, rod.g))
     out, t, y = np.full(len(times), np.nan), times[0], np.array([angle, rate])
     while True:
-        sign = np.sign(y[1]) if y[1] != 0.0 else -np.sign(y[0])
-        if y[1] == 0.0 and abs(np.tan(y[0])) < dry * d / (2.0 * l):
+        pull = torque - m * g * l * np.sin(y[0])
+        sign = np.sign(y[1]) if y[1] != 0.0 else np.sign(pull)
+        if y[1] == 0.0 and abs(pull) < dry * abs(m * g * np.cos(y[0])) * d / 2.0:
             out[times >= t] = y[0]
             return out, t
 

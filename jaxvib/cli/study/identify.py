@@ -45,6 +45,8 @@ def _with_number_options(command: Command) -> Command:
 @click.option(
     "--dry/--no-dry", "identify__dry", default=None, help="Identify the dry friction mu2 as well as the viscous friction mu1."
 )
+@click.option("--air/--no-air", "identify__air", default=None, help="Identify the quadratic drag of the air as well.")
+@click.option("--torque/--no-torque", "identify__torque", default=None, help="Identify a constant torque as well.")
 @shared
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify numbers of a machine from recorded runs, or the friction of a bearing from a recorded swing.
@@ -70,8 +72,8 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
             value = value.split(",") if field == "columns" and isinstance(value, str) else value
             old = tables.get(section, {})
             tables[section] = {**old, field: value} if isinstance(old, dict) else old
-    pendulum, swing, dry, instrument = measurement_from_tables(tables, record.parent)
-    found = identify_bearing(pendulum, swing, dry=dry, instrument=instrument)
+    pendulum, swing, options = measurement_from_tables(tables, record.parent)
+    found = identify_bearing(pendulum, swing, **options)
     output.picture("record.png", found.plot)
     data = output.file("fit.csv")
     if data is not None:
@@ -81,7 +83,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     document = {
         "status": found.status_name,
         "message": found.message,
-        **fields_of(found, "notes", "viscous", "dry", "correlation"),
+        **fields_of(found, "notes", "viscous", "dry", "air", "torque", "correlation"),
         "decrement": None
         if ten is None
         else {**fields_of(ten, "viscous", "scatter", "drift", "period", "periods"), "pairs": len(ten.estimates)},
@@ -90,13 +92,13 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
         "inertia_by_frequency": found.inertia,
         **fields_of(found, "noise", "pattern", "structure", "until", "stopped_at"),
         "samples": swing.samples,
-        "instrument": instrument,
+        "instrument": options["instrument"],
     }
 
     def text() -> str:
         rows = [_row("mu1, N m s", found.viscous)]
-        if found.dry is not None:
-            rows.append(_row("mu2", found.dry))
+        more = {"mu2": found.dry, "drag of the air, N m s^2": found.air, "torque, N m": found.torque}
+        rows += [_row(name, each) for name, each in more.items() if each is not None]
         if ten is not None:
             rows.append(_row(f"mu1 by the formula of {ten.periods} periods, N m s", ten.viscous))
         rows.append(_row("frequency of small swings, rad/s", found.frequency))

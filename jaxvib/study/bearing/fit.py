@@ -17,7 +17,7 @@ from jax import Array
 from jaxvib.runtime.programs import cached
 from jaxvib.study.bearing.decrement import TurningPoints, period_stretch
 from jaxvib.study.bearing.record import Record
-from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
+from jaxvib.study.bearing.swing import BearingPendulum, Friction, controller_to, swing_states
 
 _MAX_ITERATIONS = 64
 
@@ -28,16 +28,16 @@ TOLERANCE = 1e-9
 class Unknowns(NamedTuple):
     """Parameters of a fit.
 
-    **Attributes**: `angle` rad and `rate` rad/s at the first sample, measured from the hanging position; `offset` rad: the
-    recorded angle of the hanging position; `frequency` rad/s of small swings; `viscous` mu1 N m s; `dry` mu2 or None.
+    **Attributes**: `angle` rad and `rate` rad/s at the first sample, measured from the rest position, which a constant torque
+    shifts from the hanging position; `offset` rad: the recorded angle of the rest position; `frequency` rad/s of small swings;
+    `friction`. With these, the torque is nearly uncorrelated with the others.
     """
 
     angle: Array
     rate: Array
     offset: Array
     frequency: Array
-    viscous: Array
-    dry: Array | None
+    friction: Friction
 
 
 class Fit(NamedTuple):
@@ -54,8 +54,12 @@ class Fit(NamedTuple):
     converged: Array
 
 
-def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool) -> tuple[Unknowns, Array]:
+def first_guess(
+    pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool, air: bool = False, torque: bool = False
+) -> tuple[Unknowns, Array]:
     """Return the initial parameters of a fit, from the turning points, and the smoothing width of dry friction.
+
+    **Arguments**: `dry`, `air`, `torque`: True for unknowns of the fit; the drag of the air and the torque are 0 at first.
 
     A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction and 2 T_f/(m g l) to dry friction.
     """
@@ -78,8 +82,12 @@ def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints,
         rate=jnp.asarray(-first * w * math.sin(phase)),
         offset=jnp.asarray(offset),
         frequency=jnp.asarray(w),
-        viscous=jnp.asarray(2.0 * inertia * w * share / math.pi),
-        dry=jnp.asarray(loss * length / float(pendulum.bearing)) if dry and pendulum.bearing is not None else None,
+        friction=Friction(
+            viscous=jnp.asarray(2.0 * inertia * w * share / math.pi),
+            dry=jnp.asarray(loss * length / float(pendulum.bearing)) if dry and pendulum.bearing is not None else None,
+            air=jnp.asarray(0.0) if air else None,
+            torque=jnp.asarray(0.0) if torque else None,
+        ),
     )
     return guess, jnp.asarray(0.005 * w * float(np.min(a)))
 
@@ -102,36 +110,40 @@ def fit_swing(
     """
     size = jnp.std(angle) * jnp.sqrt(2.0)
     duration = time[-1] - time[0]
-    inertia, length = pendulum.total_inertia, pendulum.length
+    inertia, length, law = pendulum.total_inertia, pendulum.length, start.friction
     scale = Unknowns(
         angle=size,
         rate=size * start.frequency,
         offset=size,
         frequency=1.0 / duration,
-        viscous=inertia / duration,
-        dry=None if start.dry is None else 2.0 * length * size / (_bearing(pendulum) * start.frequency * duration),
+        friction=Friction(
+            viscous=inertia / duration,
+            dry=None if law.dry is None else 2.0 * length * size / (_bearing(pendulum) * start.frequency * duration),
+            air=None if law.air is None else inertia / (size * start.frequency * duration),
+            torque=None if law.torque is None else inertia * start.frequency**2 * size,
+        ),
     )
 
     def states(at: Unknowns) -> tuple[Array, Array]:
-        # Give the pendulum the gravity with which its small swings have the trial frequency.
-        gravity = at.frequency**2 * inertia / (pendulum.mass * length)
-        with_frequency = eqx.tree_at(lambda p: p.g, pendulum, gravity)
+        # Give the pendulum the gravity with which its small swings about the rest position have the trial frequency.
+        stiffness, torque = at.frequency**2 * inertia, at.friction.torque
+        rest = jnp.zeros(()) if torque is None else jnp.arctan(torque / stiffness)
+        with_frequency = eqx.tree_at(lambda p: p.g, pendulum, stiffness / (jnp.cos(rest) * pendulum.mass * length))
         solver, adjoint = diffrax.Tsit5(), diffrax.ForwardMode()
-        smooth = None if at.dry is None else width
+        smooth = None if at.friction.dry is None else width
         run = swing_states(
             with_frequency,
             time,
-            at.angle,
+            at.angle + rest,
             at.rate,
-            at.viscous,
-            at.dry,
+            at.friction,
             smooth,
             controller_to(TOLERANCE),
             solver,
             adjoint,
             max_steps,
         )
-        return at.offset + run.angle, run.stopped_at
+        return at.offset + run.angle - rest, run.stopped_at
 
     first, unravel = jax.flatten_util.ravel_pytree(start)
     unit, _ = jax.flatten_util.ravel_pytree(scale)

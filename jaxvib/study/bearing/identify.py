@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
@@ -24,9 +25,9 @@ from jaxvib.study.bearing.decrement import (
     ten_periods,
     turning_points,
 )
-from jaxvib.study.bearing.fit import TOLERANCE, Fit, first_guess, fit_swing, steps_for
+from jaxvib.study.bearing.fit import TOLERANCE, Fit, Unknowns, first_guess, fit_swing, steps_for
 from jaxvib.study.bearing.record import Record
-from jaxvib.study.bearing.swing import BearingPendulum
+from jaxvib.study.bearing.swing import BearingPendulum, Friction
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -65,9 +66,10 @@ class Identified(Result):
     - `notes`: sentences with further advice for the reader
     - `viscous` mu1, N m s, and `dry` mu2 (None if it was not requested): an `Estimate` each, whose interval includes the error
       of the instruments; typical: 3e-4 to 2e-3 N m s and 0.001 to 0.005
+    - `air` b, N m s^2, and `torque` M, N m: an `Estimate` each, None if it was not requested
     - `correlation` of the errors of mu1 and mu2 (NaN without mu2)
-    - `frequency` of small swings, rad/s; `offset`: the recorded angle of the hanging position, rad; `angle`, rad, and `rate`,
-      rad/s, at the first sample: an `Estimate` each
+    - `frequency` of small swings, rad/s; `offset`: the recorded angle of the rest position, rad; `angle` from it, rad, and
+      `rate`, rad/s, at the first sample: an `Estimate` each
     - `inertia`, kg m^2: J that follows from the frequency, with the mass and length of the pendulum
     - `noise`: standard deviation of a sample, rad
     - `pattern`: correlation of neighbouring residuals, 0 for noise
@@ -85,6 +87,8 @@ class Identified(Result):
     notes: tuple[str, ...]
     viscous: Estimate = eqx.field(metadata=in_unit("N m s"))
     dry: Estimate | None = eqx.field(metadata=in_unit(""))
+    air: Estimate | None = eqx.field(metadata=in_unit("N m s^2"))
+    torque: Estimate | None = eqx.field(metadata=in_unit("N m"))
     correlation: float = eqx.field(metadata=in_unit(""))
     frequency: Estimate = eqx.field(metadata=in_unit("rad/s"))
     offset: Estimate = eqx.field(metadata=in_unit("rad"))
@@ -104,9 +108,9 @@ class Identified(Result):
 
     def summary(self) -> str:
         """Return the estimates with their intervals as text."""
-        lines = [f"mu1 {shown(self.viscous)} N m s"]
-        if self.dry is not None:
-            lines[0] += f", mu2 {shown(self.dry)}"
+        more = (("mu2", self.dry, ""), ("air drag", self.air, " N m s^2"), ("torque", self.torque, " N m"))
+        parts = [f"{name} {shown(each)}{unit}" for name, each, unit in more if each is not None]
+        lines = [", ".join([f"mu1 {shown(self.viscous)} N m s", *parts])]
         if self.decrement is not None:
             lines.append(f"formula of {self.decrement.periods} periods: mu1 {shown(self.decrement.viscous)} N m s")
         lines.append(f"frequency {shown(self.frequency)} rad/s, noise {self.noise:.2g} rad; {self.message}")
@@ -124,11 +128,19 @@ class Identified(Result):
 
 
 def identify_bearing(
-    pendulum: BearingPendulum, record: Record, *, dry: bool = False, instrument: float = 0.0, throw: bool = True
+    pendulum: BearingPendulum,
+    record: Record,
+    *,
+    dry: bool = False,
+    air: bool = False,
+    torque: bool = False,
+    instrument: float = 0.0,
+    throw: bool = True,
 ) -> Identified:
-    """Return mu1, or mu1 and mu2, of a bearing from a whole recorded swing.
+    """Return mu1, and if requested mu2, the drag of the air and a constant torque, of a bearing from a whole recorded swing.
 
-        record(t_i) = offset + f(t_i) + noise,      J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
+        record(t_i) = offset + f(t_i) + noise
+        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width) - b |f'| f' + M
 
     - Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
       Levenberg and Marquardt's method with forward-mode derivatives through the integration
@@ -144,6 +156,7 @@ def identify_bearing(
     - `pendulum`: a `BearingPendulum`
     - `record` of its swing; typical: 250 to 10,000 samples over 10 to 60 s, first amplitude 3 to 60 deg
     - `dry`: True to identify the dry friction mu2 as well (the pendulum then needs the diameter `bearing`)
+    - `air`: True to identify b as well; `torque`: True to identify M as well. Only large swings distinguish M from the offset
     - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
       intervals; typical: 0.01 to 0.03 (0.03 in the paper; default 0)
     - `throw`: raise if no fit is found
@@ -161,7 +174,7 @@ def identify_bearing(
     released = turns.time[0] - record.time[0] <= _MAX_HALF_PERIODS * half
     swing = record if released else record.between(float(turns.time[0]), math.inf)
     until = float(turns.time[-1]) if record.time[-1] - turns.time[-1] > _MAX_HALF_PERIODS * half else float(record.time[-1])
-    start, width = first_guess(pendulum, swing, turns, dry)
+    start, width = first_guess(pendulum, swing, turns, dry, air, torque)
     time = swing.time - swing.time[0]
     arguments = (pendulum, jnp.asarray(time), jnp.asarray(swing.angle))
     steps, swinging = steps_for(start, time), np.where(swing.time <= until, 1.0, 0.0)
@@ -174,6 +187,9 @@ def identify_bearing(
         start = fit_swing(*arguments, jnp.asarray(large), start, width, steps).unknowns
     fit = fit_swing(*arguments, jnp.asarray(swinging), start, width, steps)
     found = _interpret_fit(pendulum, swing, turns, fit, float(width), instrument, until)
+    if found.status_name == "patterned":
+        note = _better_law(found, jnp.asarray(swinging), fit.unknowns, width, steps)
+        found = dataclasses.replace(found, notes=(*found.notes, *note))
     if throw and bool(found.status == IdentifyStatus.not_converged):
         raise ComputationError("not_converged", f"{record.name}: {found.message}")
     return found
@@ -201,25 +217,28 @@ def _interpret_fit(
     quantile = student_quantile(samples - len(values))
     plain = [interval(v, float(e), quantile, 0.0) for v, e in zip(values, errors, strict=True)]
     angle, rate, offset, frequency = plain[:4]
-    viscous, *more = (interval(v, float(e), quantile, instrument) for v, e in zip(values[4:], errors[4:], strict=True))
-    dry = more[0] if more else None
+    each = [interval(v, float(e), quantile, instrument) for v, e in zip(values[4:], errors[4:], strict=True)]
+    law = jax.tree.unflatten(jax.tree.structure(fit.unknowns.friction), each)
+    viscous, dry = law.viscous, law.dry
     pattern = float(np.sum(residuals[1:] * residuals[:-1]) / np.sum(residuals**2)) if np.any(residuals) else 0.0
     structure, chance = _structure(record.time[used], residuals, turns, len(values))
     correlation = float(covariance[4, 5] / (errors[4] * errors[5])) if dry is not None else math.nan
 
-    is_long = turns.amplitude.size > 20
+    is_long, weight = turns.amplitude.size > 20, float(pendulum.mass * pendulum.g * pendulum.length)
     stop = float(fit.stopped_at) + float(record.time[0])
     found = Identified(
         status=IdentifyStatus.found,
         notes=(),
         viscous=viscous,
         dry=dry,
+        air=law.air,
+        torque=law.torque,
         correlation=correlation,
         frequency=frequency,
         offset=offset,
         angle=angle,
         rate=rate,
-        inertia=float(pendulum.mass * pendulum.g * pendulum.length) / frequency.value**2,
+        inertia=math.sqrt(max(weight**2 - (0.0 if law.torque is None else law.torque.value) ** 2, 0.0)) / frequency.value**2,
         noise=float(fit.noise),
         pattern=pattern,
         structure=structure,
@@ -240,12 +259,12 @@ def _interpret_fit(
 
 def _status(found: Identified, *, has_converged: bool, is_patterned: bool, instrument: float) -> IdentifyStatus:
     """Return the status of a fit from its intervals."""
-    viscous, dry = found.viscous, found.dry
+    coefficients = [each for each in (found.viscous, found.dry, found.air) if each is not None]
     if not has_converged:
         return IdentifyStatus.not_converged
-    if viscous.high < 0.0 or (dry is not None and dry.high < 0.0):
+    if any(each.high < 0.0 for each in coefficients):
         return IdentifyStatus.negative
-    if viscous.low <= 0.0 and (dry is None or dry.low <= 0.0):
+    if all(each.low <= 0.0 for each in coefficients):
         return IdentifyStatus.undetermined
     if abs(found.frequency.value / float(found.pendulum.frequency) - 1.0) > _MAX_FREQUENCY_DIFFERENCE + instrument:
         return IdentifyStatus.contradicted
@@ -262,7 +281,7 @@ def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
     if abs(frequency / small - 1.0) > 0.02:
         differs = f"the swing's frequency is {frequency:.4g} rad/s, the pendulum's length and inertia give {small:.4g}"
         yield f"{differs}: mu1 is proportional to the moment of inertia, check these values"
-    for name, estimate in (("mu1", found.viscous), ("mu2", found.dry)):
+    for name, estimate in (("mu1", found.viscous), ("mu2", found.dry), ("the drag of the air", found.air)):
         if estimate is not None and estimate.low <= 0.0:
             is_below = estimate.high < 0.0
             yield (
@@ -278,6 +297,45 @@ def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
         yield "the residuals of the fit are not noise: the intervals include their correlation, but not the error of the law"
     if decrement is not None and decrement.is_drifting:
         yield "the formula of ten periods assumes viscous friction only: here its interval does not contain mu1"
+
+
+_LAWS = {"dry": "dry friction", "air": "drag of the air", "torque": "a constant torque"}
+"""Parts of the law other than viscous friction, by the argument of `identify` that adds them."""
+
+_CLEARLY = 4.0
+"""Distance of a coefficient from 0, in standard errors, above which its part of the law is named."""
+
+_LESS_NOISE = 0.9
+"""Ratio of the residuals with a larger law to those without it, below which it fits clearly better."""
+
+
+def _better_law(found: Identified, weight: Array, start: Unknowns, width: Array, steps: int) -> Iterator[str]:
+    """Yield a sentence about the parts of the law of friction that the record needs in addition, from a fit with all parts."""
+    law, pendulum, record = start.friction, found.pendulum, found.record
+    missing = [name for name in _LAWS if getattr(law, name) is None]
+    if not missing:
+        return
+    if pendulum.bearing is None:  # only the product of mu2 and the diameter counts here
+        pendulum = dataclasses.replace(pendulum, bearing=0.1 * pendulum.length)
+    start = start._replace(friction=law._replace(**{name: jnp.asarray(0.0) for name in missing}))
+    time = jnp.asarray(record.time - record.time[0])
+    fit = fit_swing(pendulum, time, jnp.asarray(record.angle), weight, start, width, steps)
+    used = np.asarray(weight) > 0.0
+    if not bool(fit.converged) or float(fit.noise) > _LESS_NOISE * found.noise:
+        return
+    covariance = colored_covariance(np.asarray(fit.slopes)[used], np.asarray(fit.residual)[used])
+    values, errors = fit.unknowns.friction, Friction(*np.sqrt(np.diagonal(covariance))[4:])
+    needed = []
+    for name in missing:
+        value, error = float(getattr(values, name)), float(getattr(errors, name))
+        if abs(value) > _CLEARLY * error and (name == "torque" or value > 0.0):
+            needed.append(name)
+    if needed:
+        words, options = " and ".join(_LAWS[each] for each in needed), ", ".join(f"{each}=True" for each in needed)
+        yield (
+            f"a law with {words} fits clearly better: residuals of {float(fit.noise):.2g} rad in place of {found.noise:.2g} "
+            f"rad; identify with {options}"
+        )
 
 
 def _structure(time: np.ndarray, residuals: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import Tables, build_part, misplaced_name, suggest_name
@@ -18,12 +18,11 @@ _FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "fr
 
 
 class Measurement(NamedTuple):
-    """Arguments of `identify`: `pendulum`, `record`, `dry`, `instrument`."""
+    """Arguments of `identify`: `pendulum`, `record`, and the `options` dry, air, torque and instrument."""
 
     pendulum: BearingPendulum
     record: Record
-    dry: bool
-    instrument: float
+    options: dict[str, Any]
 
 
 def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
@@ -54,7 +53,7 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
         if name not in _FIELDS:
             raise InputError(f"record.{name}", f"is not a field here; {suggest_name(name, list(_FIELDS))}")
     record = build_part(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
-    return Measurement(pendulum, record, *options)
+    return Measurement(pendulum, record, options)
 
 
 def _record(
@@ -81,10 +80,12 @@ def _record(
     return read
 
 
-def _options(dry: object = False, instrument: Number = 0.0) -> tuple[bool, float]:
-    if not isinstance(dry, bool):
-        raise InputError("identify.dry", f"is {quoted(dry)}; write true or false")
-    return dry, float(number(instrument, "", "identify.instrument", low=0.0))
+def _options(dry: object = False, air: object = False, torque: object = False, instrument: Number = 0.0) -> dict[str, Any]:
+    laws = {"dry": dry, "air": air, "torque": torque}
+    for name, value in laws.items():
+        if not isinstance(value, bool):
+            raise InputError(f"identify.{name}", f"is {quoted(value)}; write true or false")
+    return {**laws, "instrument": float(number(instrument, "", "identify.instrument", low=0.0))}
 
 
 TEMPLATE = """# Recorded swing of a pendulum that was released on a stationary bearing.
@@ -104,6 +105,8 @@ bearing = "20 mm"           # diameter at which dry friction acts
 
 [identify]
 dry = true                  # identify the dry friction mu2 as well as the viscous friction mu1
+# air = true                # and the quadratic drag of the air
+# torque = true             # and a constant torque, such as that of a cable; needs large swings
 instrument = 0.03           # relative uncertainty of the moment of inertia, from its measurement
 """
 """Commented example of a measurement file."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -33,9 +33,11 @@ if TYPE_CHECKING:
 class BearingPendulum(eqx.Module):
     """Pendulum on a stationary bearing; its angle f is measured from the hanging position.
 
-        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) sign(f'),      J = m l^2 + J_C,      N = m (l f'^2 + g cos f)
+        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) sign(f') - b |f'| f' + M
+        J = m l^2 + J_C,      N = m (l f'^2 + g cos f)
 
-    mu1 and mu2 are the viscous and dry friction of the bearing; N is its radial load, along the rod.
+    mu1 and mu2 are the viscous and dry friction of the bearing; N is its radial load, along the rod. b is the drag of the air,
+    M a constant torque, for example of a cable.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -87,9 +89,23 @@ class BearingPendulum(eqx.Module):
         """
         return self.mass * (self.length * rate**2 + self.g * jnp.cos(angle))
 
+    def rest_angle(self, torque: Array | float) -> Array:
+        """Return the angle, rad, at which the pendulum rests under a constant `torque` M, N m: m g l sin f = M."""
+        return jnp.arcsin(jnp.clip(torque / (self.mass * self.g * self.length), -1.0, 1.0))
+
     def dead_zone(self, dry: Array) -> Array:
         """Return the angle, rad, up to which dry friction mu2 (`dry`) holds the pendulum at rest: tan f = mu2 d/(2 l)."""
         return jnp.arctan(dry * _diameter(self) / (2.0 * self.length))
+
+
+class Friction(NamedTuple):
+    """Torques on a pendulum other than that of gravity: coefficients `viscous` mu1, N m s, `dry` mu2, and `air` b, N m s^2, and
+    the constant `torque` M, N m; None for those that are absent."""
+
+    viscous: Array
+    dry: Array | None = None
+    air: Array | None = None
+    torque: Array | None = None
 
 
 class SwingStatus(eqx.Enumeration):
@@ -149,6 +165,8 @@ def swing(
     rate: Number = 0.0,
     viscous: Number,
     dry: Number | None = None,
+    air: Number | None = None,
+    torque: Number | None = None,
     width: Number | None = None,
     stepsize_controller: Tolerance | diffrax.AbstractStepSizeController | None = None,
     solver: diffrax.AbstractSolver | None = None,
@@ -158,9 +176,9 @@ def swing(
 ) -> Swing:
     """Return the pendulum's motion at the times `time`, from `angle` and `rate` at the first of them.
 
-        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
+        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width) - b |f'| f' + M
 
-    If the pendulum turns within the dead zone |tan f| < mu2 d/(2 l), dry friction holds it permanently.
+    If the pendulum turns within the dead zone |sin f - M/(m g l)| < mu2 d/(2 l) cos f, dry friction holds it permanently.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -169,6 +187,8 @@ def swing(
     - `angle` from hanging, rad, and `rate`, rad/s (default 0), at time[0]; typical: 3 to 60 deg
     - `viscous` mu1, N m s; typical: 3e-4 to 2e-3
     - `dry` mu2, no unit; typical: about 0.0015 for ball bearings; default: no dry friction
+    - `air`: drag b of the air, N m s^2; typical: 1e-6 to 1e-3; default: none
+    - `torque` M, N m, constant, below m g l; typical: -0.01 to 0.01; default: none
     - `width`, rad/s: range of f' over which the dry friction changes its sign; default: a twentieth of the dead zone's angle
       times the natural frequency. A swing as small as the dead zone then loses 0.1 % too little energy; the error of larger
       swings is smaller. A smaller width needs more steps
@@ -198,15 +218,21 @@ def swing(
     if times.ndim != 1:
         raise InputError("time", "is one number; a list of times is needed")
     when_known(_require_ascending, times)
-    friction = number(dry, "", "dry", low=0.0) if dry is not None else None
-    if friction is not None:
+    friction = Friction(
+        number(viscous, "N m s", "viscous", low=0.0),
+        None if dry is None else number(dry, "", "dry", low=0.0),
+        None if air is None else number(air, "N m s^2", "air", low=0.0),
+        None if torque is None else number(torque, "N m", "torque"),
+    )
+    if dry is not None:
         _diameter(pendulum)
+    if torque is not None:
+        when_known(_require_rest, friction.torque, pendulum.mass * pendulum.g * pendulum.length)
     run = swing_states(
         pendulum,
         times,
         number(angle, "rad", "angle"),
         number(rate, "rad/s", "rate"),
-        number(viscous, "N m s", "viscous", low=0.0),
         friction,
         None if width is None else number(width, "rad/s", "width", low=0.0, open_low=True),
         controller_to(chosen.tolerance) if isinstance(chosen, Tolerance) else chosen,
@@ -220,6 +246,11 @@ def swing(
 def _require_ascending(times: np.ndarray) -> None:
     if np.any(np.diff(times) <= 0.0):
         raise InputError("time", "must ascend, each time later than the one before")
+
+
+def _require_rest(torque: np.ndarray, most: np.ndarray) -> None:
+    if np.any(np.abs(torque) >= most):
+        raise InputError("torque", f"is {float(torque):g} N m; it must be below m g l, {float(most):.4g} N m")
 
 
 def _diameter(pendulum: BearingPendulum) -> Array:
@@ -240,31 +271,29 @@ def swing_states(
     times: Array,
     angle: Array,
     rate: Array,
-    viscous: Array,
-    dry: Array | None,
+    friction: Friction,
     width: Array | None,
     controller: diffrax.AbstractStepSizeController,
     solver: diffrax.AbstractSolver,
     adjoint: diffrax.AbstractAdjoint,
     max_steps: int,
 ) -> Swing:
-    """Compute a `swing` without validation of its arguments; `dry` may be negative, which happens in a fit to noise."""
-    given = (pendulum.frequency, angle, rate, viscous) if dry is None else (pendulum.frequency, angle, rate, viscous, dry)
-    exists = jnp.all(jnp.isfinite(jnp.stack(jnp.broadcast_arrays(*given))))
+    """Compute a `swing` without validation of its arguments; coefficients may be negative, which happens in a fit to noise."""
+    given = jnp.stack(jnp.broadcast_arrays(pendulum.frequency, angle, rate, *jax.tree.leaves(friction)))
+    exists = jnp.all(jnp.isfinite(given))
     # A swing of a batch that does not exist (a step of a fit left the allowed range) must not disturb the other swings.
-    angle, rate, viscous = (jnp.where(exists, value, 0.0) for value in (angle, rate, viscous))
-    dry = None if dry is None else jnp.where(exists, dry, 0.0)
+    angle, rate, friction = jax.tree.map(lambda value: jnp.where(exists, value, 0.0), (angle, rate, friction))
     pendulum = eqx.tree_at(lambda p: p.g, pendulum, jnp.where(exists, pendulum.g, 1.0))
-    frequency = pendulum.frequency
+    frequency, dry = pendulum.frequency, friction.dry
     if dry is not None and width is None:
         zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
         width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
-    slowness = None if dry is None or width is None else _slowness(pendulum, frequency, dry, width)
+    slowness = None if dry is None or width is None else _slowness(pendulum, friction, dry, width)
     # There is no change of sign if friction already holds the pendulum at the start.
     free = None if slowness is None else slowness(times[0], (angle, rate), None) > 0.0
     scale = jax.lax.stop_gradient(frequency)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(_rates(pendulum, viscous, dry, width, free)),
+        diffrax.ODETerm(_rates(pendulum, friction, width, free)),
         solver,
         t0=times[0],
         t1=times[-1],
@@ -285,7 +314,7 @@ def swing_states(
     last = solution.ts[1][0]
     if dry is not None and free is not None:
         last, stopped = jnp.where(free, last, times[0]), stopped | ~free
-        last, rest = _last_part(pendulum, dry, times, last, (end, end_slip))
+        last, rest = _last_part(pendulum, friction, dry, times, last, (end, end_slip))
         after = stopped & ~jnp.isfinite(f)
         f, slip = (jnp.where(after, value, before) for value, before in zip(rest, (f, slip), strict=True))
     finished = stopped | (solution.result == diffrax.RESULTS.successful)
@@ -307,7 +336,7 @@ _Pair: TypeAlias = tuple[Array, Array]
 """Angle and rate of a pendulum, or their rates."""
 
 
-def _slowness(pendulum: BearingPendulum, frequency: Array, dry: Array, width: Array) -> Callable[..., Array]:
+def _slowness(pendulum: BearingPendulum, friction: Friction, dry: Array, width: Array) -> Callable[..., Array]:
     """Return a function of the motion that becomes negative when the pendulum is slow within the dead zone.
 
     There the integration ends, because with the smoothed sign of dry friction the pendulum would creep.
@@ -316,19 +345,27 @@ def _slowness(pendulum: BearingPendulum, frequency: Array, dry: Array, width: Ar
     def moving(t: RealScalarLike, y: _Pair, args: None, **_: object) -> Array:
         f, slip = y
         slow = jnp.abs(slip) - 3.0 * width
-        return jnp.maximum(slow, frequency * (jnp.abs(jnp.tan(f)) - jnp.tan(pendulum.dead_zone(dry))))
+        lean = jnp.tan(f)
+        if friction.torque is not None:  # gravity without the part that balances the torque
+            lean = lean - friction.torque / (pendulum.mass * pendulum.g * pendulum.length * jnp.cos(f))
+        return jnp.maximum(slow, pendulum.frequency * (jnp.abs(lean) - jnp.tan(pendulum.dead_zone(dry))))
 
     return moving
 
 
 def _rates(
-    pendulum: BearingPendulum, viscous: Array, dry: Array | None, width: Array | None, free: Array | None
+    pendulum: BearingPendulum, friction: Friction, width: Array | None, free: Array | None
 ) -> Callable[[RealScalarLike, _Pair, None], _Pair]:
     """Return the equations of motion of the pendulum; with dry friction it stays at rest unless it is `free` at the start."""
 
     def rates(t: RealScalarLike, y: _Pair, args: None) -> _Pair:
         f, slip = y
-        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - viscous * slip
+        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - friction.viscous * slip
+        if friction.air is not None:
+            torque = torque - friction.air * jnp.abs(slip) * slip
+        if friction.torque is not None:
+            torque = torque + friction.torque
+        dry = friction.dry
         if dry is None or width is None or free is None:
             return slip, torque / pendulum.total_inertia
         torque = torque - dry_lever(dry, _diameter(pendulum), slip, width) * jnp.abs(pendulum.radial_load(f, slip))
@@ -337,7 +374,9 @@ def _rates(
     return rates
 
 
-def _last_part(pendulum: BearingPendulum, dry: Array, times: Array, last: Array, y: _Pair) -> tuple[Array, _Pair]:
+def _last_part(
+    pendulum: BearingPendulum, friction: Friction, dry: Array, times: Array, last: Array, y: _Pair
+) -> tuple[Array, _Pair]:
     """Return the time at which a slow pendulum comes to rest, and its angles and rates until then.
 
     The motion continues from the state `y` at the time `last`. With the exact sign of dry friction it is a harmonic motion
@@ -346,6 +385,9 @@ def _last_part(pendulum: BearingPendulum, dry: Array, times: Array, last: Array,
     (end, end_slip), frequency = y, pendulum.frequency
     way = jnp.where(end_slip < 0.0, -1.0, 1.0)
     middle = -way * pendulum.dead_zone(dry)
+    if friction.torque is not None:
+        rest = pendulum.rest_angle(friction.torque)
+        middle, frequency = middle + rest, frequency * jnp.sqrt(jnp.cos(rest))
     reach = jnp.hypot(end - middle, end_slip / frequency)
     last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - middle)) / frequency
     phase = frequency * jnp.maximum(last - times, 0.0)

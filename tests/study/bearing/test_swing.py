@@ -12,7 +12,7 @@ from swings import ROD, T, scipy_swing
 import jaxvib as jv
 from jaxvib.machine.effects.friction import sliding_sign
 from jaxvib.runtime.compat import no_host_checks
-from jaxvib.study.bearing.swing import SwingStatus, controller_to, swing_states
+from jaxvib.study.bearing.swing import Friction, SwingStatus, controller_to, swing_states
 
 
 def test_radial_load_is_what_holds_the_bob_on_its_circle():
@@ -48,6 +48,27 @@ def test_large_viscous_swing_is_scipys():
     np.testing.assert_allclose(swing.angle, expected, atol=1e-6)
 
 
+def test_drag_of_the_air_and_a_torque_are_scipys():
+    t = np.linspace(0.0, 20.0, 301)
+    expected, _ = scipy_swing(ROD, t, 1.6, 0.5, 2e-3, air=3e-3, torque=0.1)
+    swing = jv.swing(ROD, t, angle=1.6, rate=0.5, viscous=2e-3, air=3e-3, torque=0.1)
+    np.testing.assert_allclose(swing.angle, expected, atol=1e-6)
+    rest = float(ROD.rest_angle(0.1))
+    np.testing.assert_allclose(0.3 * 9.81 * 0.25 * np.sin(rest), 0.1, rtol=1e-12)
+    late = jv.swing(ROD, [0.0, 300.0], angle=rest + 0.01, viscous=2e-3, torque=0.1)
+    np.testing.assert_allclose(late.angle[-1], rest, atol=1e-6)
+
+
+def test_swing_with_a_torque_stops_in_the_shifted_dead_zone():
+    t = np.linspace(0.0, 80.0, 801)
+    rest, zone = float(ROD.rest_angle(0.02)), float(ROD.dead_zone(jnp.asarray(0.02)))
+    swing = jv.swing(ROD, t, angle=0.17, viscous=2e-4, dry=0.02, torque=0.02, width=1e-5)
+    assert bool(swing.status == jv.SwingStatus.stopped) and abs(float(swing.angle[-1]) - rest) < zone < 0.5 * rest
+    expected, stop = scipy_swing(ROD, t, 0.17, 0.0, 2e-4, 0.02, torque=0.02)
+    assert abs(float(swing.stopped_at) - stop) < 0.5
+    np.testing.assert_allclose(swing.angle, expected, atol=1e-5)
+
+
 def test_dry_friction_converges_to_the_sharp_law():
     t = np.linspace(0.0, 80.0, 801)
     expected, stop = scipy_swing(ROD, t, 0.17, 0.0, 2e-4, 0.02)
@@ -77,17 +98,17 @@ def test_a_pendulum_let_go_in_the_dead_zone_stays():
 def test_derivatives_of_the_swing():
     """Central differences, step 1e-4 of each number: their own error is about 1e-6 at a tolerance of 1e-11."""
     t = jnp.linspace(0.0, 10.0, 60)
-    at = jnp.array([0.3, 0.1, 2e-3, 0.02])
+    at = jnp.array([0.3, 0.1, 2e-3, 0.02, 1e-3, 0.03])
 
     def angles(x, adjoint=None):
-        given = dict(angle=x[0], rate=x[1], viscous=x[2], dry=x[3], width=5e-3, adjoint=adjoint)
+        given = dict(angle=x[0], rate=x[1], viscous=x[2], dry=x[3], air=x[4], torque=x[5], width=5e-3, adjoint=adjoint)
         return jv.swing(ROD, t, stepsize_controller=jv.Tolerance(1e-11), **given).angle
 
     forward = eqx.filter_jit(jax.jacfwd(lambda x: angles(x, diffrax.ForwardMode())))(at)
     steps = 1e-4 * jnp.diag(at)
     around = eqx.filter_jit(jax.vmap(angles))(jnp.concatenate([at[None, :] + steps, at[None, :] - steps]))
-    difference = (around[:4] - around[4:]) / (2.0 * jnp.diagonal(steps)[:, None])
-    for k in range(4):
+    difference = (around[:6] - around[6:]) / (2.0 * jnp.diagonal(steps)[:, None])
+    for k in range(6):
         np.testing.assert_allclose(forward[:, k], difference[k], atol=3e-5 * np.max(np.abs(difference[k])), equal_nan=False)
     weights = jnp.cos(jnp.arange(60.0))
     reverse = jax.grad(lambda x: weights @ angles(x))(at)
@@ -103,6 +124,7 @@ def test_derivatives_of_the_swing():
         (dict(angle="3 kg"), "angle is '3 kg', which is not in rad"),
         (dict(dry=0.1, width=0.0), "width is 0 rad/s; it must be greater than 0"),
         (dict(pendulum=jv.BearingPendulum(0.3, 0.2), dry=0.1), "pendulum.bearing is missing"),
+        (dict(torque=1.0), "torque is 1 N m; it must be below m g l, 0.7358 N m"),
         (dict(pendulum="rod"), "pendulum is 'rod'; it must be a BearingPendulum"),
     ],
 )
@@ -126,7 +148,7 @@ def test_too_few_steps_have_a_status():
 def swings_with_slopes(x):
     def swing(x):
         pendulum = eqx.tree_at(lambda p: p.g, ROD, x["g"])
-        given = (x["angle"], jnp.zeros(()), jnp.asarray(1e-3), x["dry"], jnp.asarray(1e-3))
+        given = (x["angle"], jnp.zeros(()), Friction(jnp.asarray(1e-3), x["dry"]), jnp.asarray(1e-3))
         run = swing_states(pendulum, T[:200], *given, controller_to(1e-8), diffrax.Tsit5(), diffrax.ForwardMode(), 4096)
         return run.angle, run.status
 
