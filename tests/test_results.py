@@ -198,7 +198,7 @@ RESULTS = {
 
 # fmt: off
 SEVERAL_PANELS = ["Run", "Envelope", "MotorRunUp", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-                  "BalancedStates", "Swing", "Identified", "MachineFit", "RunPrediction", "RunUps", "Audit",
+                  "BalancedStates", "Swing", "Identified", "MachineFit", "RunPrediction", "RunUps",
                   "SynchronousRegimes", "SynchronousOrbit"]
 # fmt: on
 

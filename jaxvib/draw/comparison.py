@@ -150,7 +150,9 @@ def stability_chart(
     if logarithmic:
         axes.set_yscale("log")
         log_ticks(axes)
-    axes.set_xlim(scale * np.nanmin(omega), scale * np.nanmax(omega))
+    low, high = scale * np.nanmin(omega), scale * np.nanmax(omega)
+    if low < high:
+        axes.set_xlim(low, high)
     for k, (kind, points) in enumerate(marks.items()):
         # Points of different kinds can lie on each other: hollow marks of different sizes remain visible.
         look: Look = {"mec": COLORS[k % len(COLORS)], "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
