@@ -26,7 +26,8 @@ def campbell_diagram(
     unit: SpeedUnit | None = None,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Draw whirl speeds over the rotor speed: forward whirls as solid lines, backward whirls dashed, straight motions dotted.
+    """Draw whirl speeds over the rotor speed: lines of forward whirls are solid, of backward whirls dashed, of straight motions
+    dash-dotted.
 
     **Arguments** (ns rotor speeds, nd whirls at each)
 

@@ -152,27 +152,27 @@ class Disagreement(NamedTuple):
         )
 
 
-def disagreement(held: np.ndarray, run: np.ndarray, gradient: np.ndarray, names: Sequence[str]) -> Disagreement:
+def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, names: Sequence[str]) -> Disagreement:
     """Return the deviation of a run by the ratio of likelihoods of "own numbers" to "the numbers of the others".
 
-    **Arguments**: information (k, k) of the others, `held`, and of the run, about relative changes of k numbers; `gradient` of
-    the run, J^T residuals/noise^2, at the numbers that fit the others and the run together; `names` (k,).
+    **Arguments**: information (k, k) of the `others` and of the `run`, about relative changes of k numbers; `gradient` of the
+    run, J^T residuals/noise^2, at the numbers that fit the others and the run together; `names` (k,).
 
-    >>> held, run = np.array([[400.0]]), np.array([[100.0]])    # 0 +- 0.05 and 0.6 +- 0.1, together 0.12
-    >>> found = disagreement(held, run, 100.0 * np.array([0.6 - 0.12]), ["mass"])
+    >>> others, run = np.array([[400.0]]), np.array([[100.0]])    # 0 +- 0.05 and 0.6 +- 0.1, together 0.12
+    >>> found = disagreement(others, run, 100.0 * np.array([0.6 - 0.12]), ["mass"])
     >>> bool(abs(found.change - 0.6) < 1e-12), bool(abs(found.error**2 - 0.1**2 - 0.05**2) < 1e-12), found.chance < 1e-7
     (True, True, True)
     """
     from scipy.special import chdtrc  # slow to import
 
-    (alone, ranks), (others, more), (together, both) = pseudoinverse(run), pseudoinverse(held), pseudoinverse(held + run)
-    freedom, size = ranks + more - both, np.diagonal(held + run)
-    shared = np.diagonal(held @ together @ run)  # information about the difference between the run and the others
+    (alone, ranks), (without, more), (together, both) = pseudoinverse(run), pseudoinverse(others), pseudoinverse(others + run)
+    freedom, size = ranks + more - both, np.diagonal(others + run)
+    shared = np.diagonal(others @ together @ run)  # information about the difference between the run and the others
     known = np.where(shared > 1e-9 * size, shared, np.inf)
     most = int(np.argmax(gradient**2 / known))
     if freedom < 1 or not np.isfinite(known[most]):
         return Disagreement(1.0, names[most], 0.0, math.inf)
-    statistic = float(gradient @ (alone + others) @ gradient)
+    statistic = float(gradient @ (alone + without) @ gradient)
     change, error = gradient[most] / known[most], 1.0 / math.sqrt(known[most])
     return Disagreement(float(chdtrc(freedom, statistic)), names[most], float(change), float(error))
 

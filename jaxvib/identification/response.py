@@ -123,7 +123,7 @@ class _Steps(NamedTuple):
 
 
 def rotor_force(angle: Any, speed: Any, acceleration: Any, direction: int) -> Any:
-    """Return F = -p'' (..., 2), (across, up), per unit of the unbalance, of NumPy or JAX arrays (...) of a rotor's motion."""
+    """Return F = -p'' (..., 2), horizontal and up, per unit of the unbalance, from NumPy or JAX arrays (...) of its motion."""
     xp = np if isinstance(angle, np.ndarray) else jnp
     cos, sin = xp.cos(direction * angle), xp.sin(direction * angle)
     turned = direction * acceleration

@@ -159,7 +159,7 @@ class Machine(Part):
 
     @property
     def is_split(self) -> bool:
-        """True if the supports of a rotor differ horizontally and vertically.
+        """True if horizontal and vertical values of a rotor's supports differ.
 
         Its whirls are then ellipses, which every rotating force excites.
         """

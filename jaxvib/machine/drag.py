@@ -66,7 +66,7 @@ def drag_of(
 
     **Returns** an array with one number, with derivatives.
 
-    **Raises** `InputError` for arguments that the cause needs or does not have, and outside the range of validity:
+    **Raises** `InputError` for a missing argument, for one that the cause does not use, and outside the range of validity:
 
     - oil: Re up to 3e5. The ball is far from walls: in a channel narrower than about five balls the drag is larger
     - rolling: f up to r/10

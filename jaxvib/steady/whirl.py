@@ -59,9 +59,9 @@ class CriticalSpeeds(Result):
 
     - `speed` (nd,), rad/s, ascending; inf for a speed that does not exist (a thin disc has no second forward critical speed)
     - `forward` (nd,): True if the whirl turns in the direction of the rotor. On supports that are equal in both directions an
-      imbalance excites forward whirls only. If they differ, it excites all of them, and between two critical speeds of one
-      motion it turns the rotor's axis backward
-    - `straight` (nd,): True if the axis moves on a straight line, on supports that differ in both directions
+      imbalance excites forward whirls only. If horizontal and vertical values differ, it excites all of them, and between the
+      two critical speeds of one motion it turns the rotor's axis backward
+    - `straight` (nd,): True if the axis moves on a straight line, which needs different horizontal and vertical supports
     - `status`: a `WhirlStatus`
     """
 
@@ -106,7 +106,7 @@ class Whirl(Result):
     - `decay`: (ns, nd) 1/s, negative if the motion grows. An overdamped motion has two decay rates; `decay` is the smaller
       one, with which the displacement creeps back. Several overdamped motions are in the order of increasing decay
     - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
-    - `straight`: (ns, nd) True if the axis moves on a straight line, on supports that differ in both directions
+    - `straight`: (ns, nd) True if the axis moves on a straight line, which needs different horizontal and vertical supports
     - `critical`: the critical speeds
     - `status`: a `WhirlStatus`; motions that rounding hides are NaN
     """

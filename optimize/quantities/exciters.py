@@ -105,7 +105,7 @@ def throw_stroke(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier
     - `tier`: "leading" (averaged theory, the default), "exact" (the exact periodic motion), or "time" (the full equations,
       integrated from the exact motion)
 
-    **Returns** `Quantity`; typical: 4 to 16 mm. **Raises** `InputError` for a place that is no point.
+    **Returns** `Quantity`; typical: 4 to 16 mm. **Raises** `InputError` for `at` that is not a point.
 
     >>> from optimize import throw_stroke
     >>> (throw_stroke(at=(0.5, 0.1)) > "6 mm").words
@@ -124,7 +124,7 @@ def throw_angle(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier 
 
     **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
 
-    **Returns** `Quantity`; typical: 30 to 60 degrees. **Raises** `InputError` for a place that is no point.
+    **Returns** `Quantity`; typical: 30 to 60 degrees. **Raises** `InputError` for `at` that is not a point.
 
     >>> from optimize import throw_angle
     >>> (throw_angle() > "40 deg").words
@@ -144,7 +144,7 @@ def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body
     **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; `slope` of the deck, rad or text; typical: "-15 deg" to 0 (the
     default).
 
-    **Returns** `Quantity`; typical: 2 to 5. **Raises** `InputError` for a place that is no point.
+    **Returns** `Quantity`; typical: 2 to 5. **Raises** `InputError` for `at` that is not a point.
 
     >>> from optimize import throw_number
     >>> throw_number(at=(1.5, 0.1), slope="-5 deg").unit
@@ -165,7 +165,7 @@ def roundness(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = 
     **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
 
     **Returns** `Quantity`; typical: below 0.05 for a linear screen, above 0.9 for a circular one. **Raises** `InputError` for
-    a place that is no point.
+    `at` that is not a point.
 
     >>> from optimize import roundness
     >>> (roundness() > 0.9).words
@@ -207,7 +207,7 @@ def motion_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Ti
 
     **Arguments**: `points`: a list of (x, y), m or text; `body`, `tier` as in `throw_stroke`; typical: 2 to 10 points.
 
-    **Returns** `Quantity`; typical: 0.01 to 0.3. **Raises** `InputError` for places that are no points.
+    **Returns** `Quantity`; typical: 0.01 to 0.3. **Raises** `InputError` for `points` that are not a list of points.
 
     >>> from optimize import motion_spread
     >>> (motion_spread([(-1.0, 0.1), (1.0, 0.1)]) < 0.05).words
@@ -222,7 +222,7 @@ def amplitude_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier:
 
     **Arguments**: `points`: a list of (x, y), m or text; `body`, `tier` as in `throw_stroke`; typical: 2 to 10 points.
 
-    **Returns** `Quantity`; typical: 0.01 to 0.5. **Raises** `InputError` for places that are no points.
+    **Returns** `Quantity`; typical: 0.01 to 0.5. **Raises** `InputError` for `points` that are not a list of points.
 
     >>> from optimize import amplitude_spread
     >>> amplitude_spread([(-1.0, 0.1), (1.0, 0.1)]).unit

@@ -33,7 +33,7 @@ class Rotor(Machine):
         A theta'' + C w psi' + b2 y' + b3 theta' + c2 y + c3 theta = m_y
         A psi'' - C w theta' + b2 z' + b3 psi' + c2 z + c3 psi = m_z
 
-    w is the rotor speed. If supports differ horizontally and vertically, the equations of z and psi have other coefficients b
+    w is the rotor speed. If the supports have other values vertically, the equations of z and psi have other coefficients b
     and c. A point at the distance s along the axis moves by (y + s theta, z + s psi). A load acts at its station s_j. z is the
     displacement from static equilibrium.
 
@@ -59,8 +59,8 @@ class Rotor(Machine):
     stations: Array = eqx.field(metadata=unit("m", words="station", each="load", typical=0.1))
     stiffness_terms: Array | None = eqx.field(metadata=unit("N/m", "N", "N m", words="stiffness term", typical=1e4))
     damping_terms: Array | None = eqx.field(metadata=unit("N s/m", "N s", "N m s", words="damping term", typical=10.0))
-    stiffness_up: Array | None = eqx.field(metadata=unit("N/m", low=0.0, each="support", words="stiffness up"))
-    damping_up: Array | None = eqx.field(metadata=unit("N s/m", low=0.0, each="support", words="damping up"))
+    stiffness_up: Array | None = eqx.field(metadata=unit("N/m", low=0.0, each="support", words="vertical stiffness"))
+    damping_up: Array | None = eqx.field(metadata=unit("N s/m", low=0.0, each="support", words="vertical damping"))
     kind: str = eqx.field(static=True)
     places = "shaft"
 
@@ -131,7 +131,7 @@ class Rotor(Machine):
 
     @property
     def is_split(self) -> bool:
-        """True if the supports differ horizontally and vertically."""
+        """True if horizontal and vertical values of the supports differ."""
         return self.stiffness_up is not None or self.damping_up is not None
 
     def shaft_supports(self) -> list[tuple[float, float, float]]:
@@ -177,8 +177,8 @@ def rotor(
       typical: 1e6, up to 2e4, 3e4
     - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of the terms that follow from the supports;
       typical: 800, up to 10, 20
-    - `stiffness_up` (2,), N/m, and `damping_up` (2,), N s/m: vertical values of supports that differ in both directions;
-      `stiffness` and `damping` are then the horizontal ones; typical: 0.5 to 2 times those; default: equal to them
+    - `stiffness_up` (2,), N/m, and `damping_up` (2,), N s/m: vertical values of the supports; `stiffness` and `damping` are
+      then the horizontal ones; typical: 0.5 to 2 times those; default: equal to them
 
     **Returns** `Rotor`.
 
@@ -187,7 +187,7 @@ def rotor(
     - wrong units and values that are not allowed
     - supports at one place
     - a polar inertia above twice the transverse one
-    - terms that no supports can have (negative ones, or c2^2 > c1 c3), or terms together with values up
+    - terms that no supports can have (negative ones, or c2^2 > c1 c3), or terms together with vertical values
 
     >>> import jaxvib as jv
     >>> machine = jv.rotor(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(0.604e6, 0.555e6),
@@ -280,8 +280,8 @@ class PlanarRotor(Machine):
     mass: Array = eqx.field(metadata=_MASS)
     stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness of the support"))
     damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of the support"))
-    stiffness_up: Array | None = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness of the support up"))
-    damping_up: Array | None = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of the support up"))
+    stiffness_up: Array | None = eqx.field(metadata=unit("N/m", low=0.0, words="vertical stiffness of the support"))
+    damping_up: Array | None = eqx.field(metadata=unit("N s/m", low=0.0, words="vertical damping of the support"))
     kind: str = eqx.field(static=True)
 
     def carrier(self) -> Carrier:
@@ -302,7 +302,7 @@ class PlanarRotor(Machine):
 
     @property
     def is_split(self) -> bool:
-        """True if the support differs horizontally and vertically."""
+        """True if horizontal and vertical values of the support differ."""
         return self.stiffness_up is not None or self.damping_up is not None
 
     def mount(self, at: Place = None) -> Mount:
@@ -386,7 +386,7 @@ kind = "planar_rotor"
 mass = 37.0                 # kg, with the body of the exciter, without the loads
 stiffness = "1160 N/mm"     # of the support, horizontal and vertical
 damping = 840.0             # N s/m
-# stiffness_up = "1740 N/mm"  # up, if the support differs horizontally and vertically; also damping_up
+# stiffness_up = "1740 N/mm"  # vertical, if it differs from the horizontal one; also damping_up
 """
     + _ROTOR,
     "rotor": """# A rigid rotor on two supports; it moves in two directions and tilts about two axes.
@@ -401,7 +401,7 @@ stiffness = ["604 N/mm", "555 N/mm"]      # of the two supports
 damping = [439.0, 404.0]                  # N s/m
 position = [0.165, -0.155]                # m, of the supports
 stations = [0.28, 0.25, -0.25, -0.28]     # m, positions of the loads; one number if all run in one plane
-# stiffness_up = ["906 N/mm", "833 N/mm"]   # up, if the supports differ horizontally and vertically; also damping_up
+# stiffness_up = ["906 N/mm", "833 N/mm"]   # vertical, if they differ from the horizontal ones; also damping_up
 # stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of stiffness and position of the supports
 """
     + _ROTOR,

@@ -296,7 +296,7 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     """Return the natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor, the frequencies of
-    the forward whirls at the rotor speed, on supports that differ horizontally and vertically those of all whirls."""
+    the forward whirls at the rotor speed, or of all whirls if horizontal and vertical values of its supports differ."""
     if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])

@@ -123,7 +123,8 @@ def _speeds(balance: TorqueBalance) -> np.ndarray:
 
 
 def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _PHASES_PER_UNKNOWN) -> np.ndarray:
-    """Return regular sets of phases (n, count), and random ones, `per_unknown` for each squared number of unknown phases.
+    """Return regular sets of phases (n, count), and random ones, whose number is `per_unknown` times the square of that of the
+    unknown phases.
 
     The phases of masses with prescribed speed are 0.
     """

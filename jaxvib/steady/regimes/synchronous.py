@@ -292,12 +292,12 @@ def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
     frozen = jax.lax.stop_gradient(balance)
     x = jax.lax.stop_gradient(unknowns_of(frozen, omega, phases))
     if x.size == 0:
-        return numbers_at(balance, x, None)
+        return fields_at(balance, x, None)
     x, _ = damped_newton(lambda x, given: (balance_residuals(x, given), None), x, frozen, on_scalars=False)
-    return numbers_at(balance, x, slopes_of(x, frozen))
+    return fields_at(balance, x, slopes_of(x, frozen))
 
 
-def numbers_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: Array | None = None) -> dict[str, Any]:
+def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: Array | None = None) -> dict[str, Any]:
     """Return the fields of a regime, without the scene, with derivatives with respect to the scene.
 
     **Arguments**: unknowns `x` that solve the balance, and the `slopes` there, both without derivatives (None if there are no

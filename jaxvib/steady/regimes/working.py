@@ -28,16 +28,16 @@ from jaxvib.steady.regimes.search import is_balanced, sets_of_phases
 from jaxvib.steady.regimes.synchronous import (
     RegimeStatus,
     SynchronousRegime,
-    numbers_at,
+    fields_at,
     require_one_speed,
 )
 
 _PHASES_PER_UNKNOWN = 4
-"""Random sets of phases for each squared number of unknown phases. They are few, because a design evaluates thousands of
-machines."""
+"""Number of random sets of phases divided by the square of the number of unknown phases. It is small, because a design
+evaluates thousands of machines."""
 
 _SPEEDS, _LOWEST_SPEED, _HIGHEST_SPEED = 64, 0.3, 1.01
-"""Number and range of the speeds, relative to that of the fastest drive, among which the fastest start is searched for."""
+"""Number and range of the speeds, relative to that of the fastest drive, among which the speed of a start is searched for."""
 
 _ITERATIONS = 20
 """Maximum number of steps of Newton's method from a start."""
@@ -50,9 +50,9 @@ _SAME_SPEED = 0.05
 def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
     """Return the regime in which the motors of a machine work: the stable synchronous regime nearest to their speeds.
 
-    Newton's method starts from a fixed list of phases, each at the largest speed at which the sum of all torques is 0. Of the
-    regimes within 5 % of the fastest one, the stable one with the least value of Blekhman's function is returned. Without
-    damping it is the deepest minimum, which the exciters reach from most initial states:
+    Newton's method starts from a fixed list of sets of phases, each at the largest speed at which the sum of all torques is 0.
+    Of the regimes within 5 % of the fastest one, the stable one with the least value of Blekhman's function is returned.
+    Without damping it is the deepest minimum, which the exciters reach from most initial states:
 
         Lambda = -(Omega^4/4) sum_ik S_i S_k Re(exp(i (alpha_k - alpha_i)) H_ik)
 
@@ -62,7 +62,8 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
     **Arguments**
 
     - `scene` as for `synchronous_regimes`, whose exciters have unbalances and no loads; typical: 1 to 4 exciters
-    - `throw`: raise if no start leads to a stable regime; otherwise, and under a JAX transformation, the status shows it
+    - `throw`: True to raise an error if no start leads to a stable regime; with False, and under a JAX transformation, only the
+      status shows it
 
     **Returns** `SynchronousRegime`; with the status `none_stable` its numbers are NaN.
 
@@ -79,7 +80,7 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
     >>> bool(regime.stable), round(abs(float(regime.phases[1])), 4)    # half a turn apart: a vertical line
     (True, 3.1416)
 
-    Source: I. I. Blekhman, Synchronization in Science and Technology, 1988, for the function; the choice is ours.
+    Source: I. I. Blekhman, Synchronization in Science and Technology, 1988, for the function; this package for the choice.
     """
     scene = validate_scene(scene)
     require_rotating_masses(scene)
@@ -94,7 +95,7 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
 @cached
 def _working(scene: Scene) -> SynchronousRegime:
     balance = assemble_torque_balance(scene)
-    numbers = numbers_at(balance, *_stable_solution(jax.lax.stop_gradient(balance)))
+    numbers = fields_at(balance, *_stable_solution(jax.lax.stop_gradient(balance)))
     stable = numbers["stable"]
     status = RegimeStatus.where(stable, numbers["status"], RegimeStatus.none_stable)
     kept = {**without_numbers(stable, numbers), "status": status, "can_start": numbers["can_start"]}
