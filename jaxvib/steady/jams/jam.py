@@ -32,6 +32,7 @@ from jaxvib.steady.jams.folds import (
     branch_pieces,
     branch_root,
     branch_tangent,
+    piece_modes,
     rotor_speed_at,
     scanned_speed,
 )
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 
 STABILITY_CRITERION = "by slope, for light loads that stay together"
 """Name of the stability criterion of jam modes, with its assumption."""
+
+_UNRESOLVED = "the branch has no peak of its own, because of damping, a close resonance or an exciter that does not move,"
 
 
 class JamStatus(eqx.Enumeration):
@@ -143,6 +146,17 @@ class JamModes(AbstractJam):
         """Existence of each mode, (2 nd + 1,) Booleans."""
         return self.status != JamStatus.absent
 
+    @property
+    def unresolved(self) -> list[int]:
+        """Numbers of the modes that exist at no rotor speed, because their resonance has no peak of its own on the branch.
+
+        Such a resonance is closer to another one than its bandwidth, is strongly damped, or does not move the exciter.
+        """
+        if np.all(self.folds.exists):
+            return []
+        numbers = np.asarray(_modes_of_pieces(self.folds, self.resonances))
+        return [int(k) for k in np.asarray(self.mode) if k not in numbers]
+
     def mode_numbers(self) -> list[int]:
         """Return the numbers of the modes that exist, from 1 to 2 nd + 1."""
         return [int(k) for k, name in zip(np.asarray(self.mode), status_names(self.status), strict=True) if name != "absent"]
@@ -163,9 +177,9 @@ class JamModes(AbstractJam):
     def _require(self, mode: int) -> None:
         if status_names(self.status)[mode - 1] == "absent":
             there, rotor = ", ".join(map(str, self.mode_numbers())), speed_text(np.asarray(self.rotor_speed)[0], 6)
+            why = f": {_UNRESOLVED} at resonance {(mode + 1) // 2}" if mode in self.unresolved else ""
             raise ComputationError(
-                "absent",
-                f"jam mode {mode} does not exist at rotor speed {rotor}; existing modes: {there}",
+                "absent", f"jam mode {mode} does not exist at rotor speed {rotor}{why}; existing modes: {there}"
             )
 
     @validated
@@ -239,6 +253,12 @@ def stays_text(jam: Jam, growth: float) -> str:
 
 
 @cached
+def _modes_of_pieces(folds: Folds, resonances: Array) -> Array:
+    """Return the mode number of each piece of a branch."""
+    return piece_modes(jnp.where(folds.exists, folds.omega, jnp.inf), folds.exists, resonances)
+
+
+@cached
 def _row(jams: Jam, row: Array | np.ndarray) -> Jam:
     return jax.tree.map(lambda leaf: leaf[row], jams)
 
@@ -276,7 +296,7 @@ def jam_modes(scene: Scene) -> JamModes:
     mass. The relative error of the result is about this share times the magnification at resonance, see `jam_orbit`.
 
     Resonances whose distance is smaller than their bandwidth have one common peak of the branch and one pair of modes, with
-    the number of the resonance nearest to the peak; the status of the other modes is `absent`.
+    the number of the resonance nearest to the peak; the status of the other modes is `absent`, and `unresolved` lists them.
 
     **Returns** `JamModes`; derivatives of every field with respect to every parameter of the scene are exact (implicit
     function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.

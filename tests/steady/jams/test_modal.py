@@ -170,3 +170,23 @@ def test_single_precision_finds_the_jams_of_double_precision():
     np.testing.assert_array_equal(found.exists, double.exists)
     np.testing.assert_allclose(found.omega, double.omega, rtol=2e-5)
     np.testing.assert_allclose(found.foundation_force, double.foundation_force, rtol=2e-3)
+
+
+@pytest.mark.parametrize("apart", [0.9, 1.1])
+def test_close_resonances_share_a_peak_within_their_bandwidth(apart):
+    """Sum of two equal peaks 1/((w - w_r)^2 + d^2), d = c/(2 m): one peak up to the distance 2 d/sqrt(3)."""
+    c = 2e-3
+    link = 0.5 * ((1.0 + apart * 2.0 / np.sqrt(3.0) * c / 2.0) ** 2 - 1.0)
+    machine = jv.two_mass(mass=1.0, stiffness=1.0, damping=c, link_stiffness=link, link_damping=0.0)
+    scene = jv.Scene(machine, jv.balls(count=1, mass=1e-9, radius=0.1, drag=1e-18), jv.ConstantSpeed(3.0))
+    modes = jv.jam_modes(scene)
+    assert modes.unresolved in (([],) if apart > 1.0 else ([1, 2], [3, 4]))
+    assert not set(modes.unresolved) & set(modes.mode_numbers())
+
+
+def test_equal_resonances_leave_one_pair_of_modes():
+    """Only one combination of equal platforms without links moves the exciter."""
+    modes = jv.jam_modes(SCENES["equal frequencies"])
+    assert len(modes.unresolved) == 2 * (N - 1)
+    with pytest.raises(jv.ComputationError, match="no peak of its own"):
+        modes.select(modes.unresolved[0])
