@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 import operator
@@ -100,6 +101,23 @@ class Dynamics(eqx.Module):
         cases = zip(self.exciters, motions, rolling, solved, strict=True)
         rates = [exciter.rates(motion, contact, *part) for exciter, motion, contact, part in cases]
         return State(state.velocity, carrier, exciters=rates)
+
+    def at_rows(self, rows: Array) -> Dynamics:
+        """Return the equations with the accelerations of P's rows and of further `rows` (k, nd) in place of the carrier's q''.
+
+        The cost is then proportional to nd, and not to its square. There must be fewer rows P than coordinates.
+        """
+        every = jnp.concatenate([self.rows, rows])
+        supports = tuple(_Support(support.rows, every @ support.input_matrix) for support in self.supports)
+        return dataclasses.replace(
+            self,
+            stiffness=every @ self.stiffness,
+            damping=every @ self.damping,
+            gyroscopic=None if self.gyroscopic is None else every @ self.gyroscopic,
+            input_matrix=every @ self.input_matrix,
+            rows=jnp.eye(self.rows.shape[0], every.shape[0], dtype=every.dtype),
+            supports=supports,
+        )
 
     def _unforced(self, state: State, speeds: Sequence[Array]) -> Array:
         """Return the accelerations of the carrier without exciters."""

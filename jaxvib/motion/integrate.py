@@ -131,7 +131,8 @@ class IntegrationPlan(NamedTuple):
 
     **Attributes**: `solver` of diffrax, None for the method of order 8 in its fastest form; `control` of the steps; `adjoint`
     of diffrax, None for step replay; `samples`: number of stored states of the whole run, 0 for none; `turns`: length of the
-    measuring window in periods of the slowest motion; `max_steps`; `progress_meter` of diffrax.
+    measuring window in periods of the slowest motion; `bounds`, see `frequency_bounds`; `max_steps`; `progress_meter` of
+    diffrax.
     """
 
     solver: diffrax.AbstractSolver | None
@@ -139,6 +140,7 @@ class IntegrationPlan(NamedTuple):
     adjoint: diffrax.AbstractAdjoint | None
     samples: int
     turns: Array | np.ndarray
+    bounds: tuple[Array | np.ndarray, Array | np.ndarray]
     max_steps: int
     progress_meter: diffrax.AbstractProgressMeter | None = None
 
@@ -151,8 +153,8 @@ def integrate(
     # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
-    (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
-    saves = _saves(scene, end, slowest, plan)
+    unit = natural_units(scene)
+    saves = _saves(scene, end, plan)
     single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
     model = assemble(scene)
     field = dynamics_of(model)
@@ -160,7 +162,7 @@ def integrate(
         field, state, wrapped=single and plan.solver is None, has_common_turns=has_common_turns, solver=plan.solver
     )
     solver = motion.method(plan.adjoint) if plan.solver is None else plan.solver
-    first_step, controller = _steps(motion, state, unit, plan.control, end, fastest)
+    first_step, controller = _steps(motion, state, unit, plan, end)
     solution = solve(
         motion.term,
         solver,
@@ -208,10 +210,10 @@ def integrate(
     )
 
 
-def _saves(scene: Scene, end: Array, slowest: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:
+def _saves(scene: Scene, end: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:
     """Return the times of stored states: the measuring window, the end, and evenly spaced times over the whole run."""
     longest = 2.0 * jnp.pi * WINDOW_SAMPLES / (MIN_SAMPLES_PER_TURN * jax.lax.stop_gradient(scene.top_speed))
-    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.turns / slowest, longest), end / 2.0)
+    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.turns / plan.bounds[1], longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW_SAMPLES)), diffrax.SubSaveAt(t1=True)]
     if plan.samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, plan.samples)))
@@ -219,14 +221,10 @@ def _saves(scene: Scene, end: Array, slowest: Array, plan: IntegrationPlan) -> l
 
 
 def _steps(
-    motion: PackedSystem,
-    state: State,
-    unit: State,
-    control: diffrax.AbstractStepSizeController | StepControl,
-    end: Array,
-    fastest: Array,
+    motion: PackedSystem, state: State, unit: State, plan: IntegrationPlan, end: Array
 ) -> tuple[Array | None, diffrax.AbstractStepSizeController]:
     """Return the length of the first step, s, and the controller of the others."""
+    control, fastest = plan.control, jnp.asarray(plan.bounds[0])
     if isinstance(control, StepControl):
         first = 0.05 / fastest
         if control.steps is not None:

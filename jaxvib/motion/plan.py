@@ -65,7 +65,7 @@ class RunPlan:
     - `is_known`: True if scene, end and state have values
     - `is_estimated`: True if a second run with larger steps estimates the error; `accuracy`: the error that repeated runs must
       reach, or None
-    - `fastest`: fastest rate of the motion, rad/s, NaN if it is not needed
+    - `fastest`: fastest rate of the motion, rad/s
     """
 
     given_scene: Scene
@@ -118,8 +118,7 @@ def plan_run(
     is_estimated = isinstance(control, StepControl) and (known if estimate is None else estimate)
     if isinstance(steps, Accuracy) and not known:
         raise InputError("accuracy", "repeats the run and cannot be used inside jit, grad or vmap; use Tolerance(...)")
-    is_rate_needed = known or max_steps is None or is_estimated
-    fastest = numpy_of_known(frequency_bounds(scene)[0]) if is_rate_needed else np.asarray(np.nan, end.dtype)
+    fastest, slowest = map(numpy_of_known, frequency_bounds(scene))
     stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
     if max_steps is None:
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end)
@@ -141,7 +140,7 @@ def plan_run(
         scene=scene,
         end=end,
         state=state,
-        integration=IntegrationPlan(solver, control, adjoint, kept, periods, most, progress_meter),
+        integration=IntegrationPlan(solver, control, adjoint, kept, periods, (fastest, slowest), most, progress_meter),
         stretches=max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _STRETCH_TURNS))) if is_cut else 1,
         is_known=known,
         is_estimated=is_estimated,

@@ -35,6 +35,22 @@ def _hermite() -> tuple[np.ndarray, np.ndarray]:
 _EVEN, _ODD = _hermite()
 
 
+def _beyond() -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrices (2, 8) that give, from values and slopes of four samples, the value and the slope of the polynomial
+    through them one step before the first and one step after the last sample."""
+    powers = np.arange(2 * NODES)
+
+    def rows(places: np.ndarray) -> np.ndarray:
+        s = places[:, None]
+        return np.concatenate([s**powers, powers * s ** np.maximum(powers - 1, 0)])
+
+    weights = rows(np.asarray([-1.0, 1.0]) * (_MIDDLE + 1.0)) @ np.linalg.inv(rows(np.arange(NODES) - _MIDDLE))
+    return weights[0::2], weights[1::2]
+
+
+_BEFORE, _AFTER = _beyond()
+
+
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """Locate the extrema of an evenly sampled motion over its first half, its second half and all of it.
 
@@ -51,12 +67,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """
     n, half = len(x), len(x) // 2
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
-    # The first and the last four samples are used for two steps each. Slices are read faster than samples at given indices.
-    last = n - NODES + 1
-    windows = (
-        [jnp.concatenate([y[k : k + 1], y[k : last + k], y[last + k - 1 : last + k]]) for k in range(NODES)] for y in (x, v)
-    )
-    share, inner = _extrema_between(x, v, _polynomial(*windows), np.arange(n - 1) - first - _MIDDLE)
+    share, inner = _extrema_between(x, v)
 
     def greatest(sign: Array) -> tuple[Array, Array, Array]:
         """Maxima of `sign` times the motion over the first half of the samples, the second half and the step between them.
@@ -109,13 +120,23 @@ def greatest(values: Array) -> Array:
     return values[jnp.argmax(values)]
 
 
-def _extrema_between(x: Array, v: Array, polynomial: list[Array], start: np.ndarray) -> tuple[Array, Array]:
+def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
     """Return the place of the extremum in each step between two samples, from 0 to 1, and the value at this place. In a step
     without an extremum it is the value of the first sample.
 
-    **Arguments**: x, v (n,) samples and slopes, a `polynomial` for each step, and the place on it at which the step starts.
+    **Arguments**: x, v (n,): samples and slopes.
     """
-    rise, begin, end, origin = x[1:] - x[:-1], v[:-1], v[1:], jnp.asarray(start, x.dtype)
+    n, rise, begin, end, origin = len(x), x[1:] - x[:-1], v[:-1], v[1:], -0.5
+    # A sample beyond each end, on the polynomial of the outermost four. The samples of each step are then slices, which are
+    # read several times as fast as samples at given indices.
+    first, last = x[:1], x[-1:]
+    before = _BEFORE.astype(x.dtype) @ jnp.concatenate([x[:NODES] - first, v[:NODES]])
+    after = _AFTER.astype(x.dtype) @ jnp.concatenate([x[-NODES:] - last, v[-NODES:]])
+    padded = (
+        jnp.concatenate([first + before[:1], x, last + after[:1]]),
+        jnp.concatenate([before[1:], v, after[1:]]),
+    )
+    polynomial = _polynomial(*([y[k : n - 1 + k] for k in range(NODES)] for y in padded))
     slope = _derivative(polynomial)
     curvature = _derivative(slope)
     turns = begin * end < 0.0

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.display import quantity_text
+from jaxvib.equations.dynamics import Dynamics
 from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
@@ -209,10 +210,24 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
     """Return the least and greatest values of each output, and their places, (2, 3, outputs) each, see `locate_extrema`."""
+    # One output after the other fits the processor's cache.
+    found = jax.lax.map(lambda pair: locate_extrema(*pair), _sampled_outputs(model, field, times, states))
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), found)
+
+
+def _sampled_outputs(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array]:
+    """Return displacements and foundation forces (outputs, nt), and their rates times the sampling step."""
+    carrier, step = model.carrier, _step(times)
+    nb, nd = carrier.foundation_damping.shape
+    if isinstance(field, Dynamics) and not model.supports and 2 * (field.rows.shape[0] + nb) < nd:
+        # The rate of the force, T_K q' + T_C q'', needs the accelerations of the rows T_C only.
+        field = field.at_rows(carrier.foundation_damping)
+        q, v = states.displacement.T, states.velocity.T
+        damping_rate = scalarized_vmap(_rates)((times, states), field).velocity[:, -nb:].T
+        force, change = carrier.foundation_force(q, v), carrier.foundation_stiffness @ v + damping_rate
+        return jnp.concatenate([q, force]), jnp.concatenate([v, change]) * step
     rates = scalarized_vmap(_rates)((times, states), field)
-    # An output is a row: contiguous samples are faster.
-    values, slopes = jax.vmap(lambda *y: _outputs(model, _step(times), *y), out_axes=-1)(states, rates)
-    return jax.vmap(locate_extrema, out_axes=-1)(values, slopes)
+    return jax.vmap(lambda *y: _outputs(model, step, *y), out_axes=-1)(states, rates)
 
 
 def _rates(moment: tuple[Array, State], field: Field) -> State:

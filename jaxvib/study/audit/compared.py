@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate
+from jaxvib.motion.integrate import IntegrationPlan, StepControl, frequency_bounds, integrate
 from jaxvib.motion.run import Run
 from jaxvib.motion.start import initial_state
 from jaxvib.runtime.cache import compiled_anew
@@ -107,7 +107,7 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
         start = initial_state(scene)  # if the jam does not exist, a run from another state takes the same time
     end = jnp.asarray(_TURNS * 2.0 * math.pi / float(scene.drive.speed))
     control = StepControl(jnp.asarray(_TOLERANCE, end.dtype), None, jnp.asarray(_MAX_STEPS, jnp.int32))
-    plan = IntegrationPlan(None, control, None, 0, jnp.asarray(20.0, end.dtype), _MAX_STEPS)
+    plan = IntegrationPlan(None, control, None, 0, jnp.asarray(20.0, end.dtype), frequency_bounds(scene), _MAX_STEPS)
     numbers, choices = eqx.partition((scene, end, start, plan), eqx.is_array)
 
     @jax.jit
