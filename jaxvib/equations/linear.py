@@ -120,8 +120,9 @@ class LinearModel(Model):
         values, vectors = hermitian_modes(square)
         return root_or_zero(values), inverse.T @ vectors
 
-    def decomposed(self) -> Self:
-        """Return this model with its modal form, which is faster for many load speeds.
+    def decomposed(self, direction: Array | None = None) -> Self:
+        """Return this model with its modal form, which is faster for many load speeds; `direction` (count, nd) of the forces
+        of several masses, default: `direction` of the model.
 
         Models of up to 3 coordinates are returned without it, because a direct solution takes no longer.
         """
@@ -131,7 +132,8 @@ class LinearModel(Model):
         frequencies, shapes = frozen.modes()
         carrier = frozen.carrier
         matrices = carrier.stiffness, carrier.damping, frozen.mass
-        modal = modal_response(frequencies, shapes, *matrices, frozen.direction)
+        direction = frozen.direction if direction is None else jax.lax.stop_gradient(direction)
+        modal = modal_response(frequencies, shapes, *matrices, direction)
         return eqx.tree_at(lambda model: model.modal, self, modal, is_leaf=lambda leaf: leaf is None)
 
 

@@ -16,13 +16,14 @@ class ModalResponse(eqx.Module):
 
         D(w)^-1 = Z diag(1 / (i w - s)) W,      e^H B D(w)^-1 B^T e = sum_k r_k / (i w - s_k)
 
-    For each frequency, a vector costs two products with matrices, and the receptance of the mount costs O(nd). There are no
-    derivatives with respect to parameters of the scene, because eigenvectors of equal frequencies have none.
+    For each frequency, a vector costs two products with matrices, and each receptance costs O(nd). There are no derivatives
+    with respect to parameters of the scene, because eigenvectors of equal frequencies have none.
 
     **Attributes**
 
     - `poles` s (2 nd,) 1/s, the roots of det(K + s C + s^2 M) = 0; `outputs` Z (nd, 2 nd); `inputs` W (2 nd, nd)
-    - `residues` r (2 nd,) of the receptance of the mount; `norms` (3,), the largest row sums of |K|, |C| and |M|
+    - `residues` r of the receptance of the mount, (2 nd,), or of the receptances between several masses, (count, count, 2 nd)
+    - `norms` (3,), the largest row sums of |K|, |C| and |M|
     - `is_rough`: True if the result may lose more than 2 digits because eigenvectors are nearly parallel
     """
 
@@ -34,15 +35,18 @@ class ModalResponse(eqx.Module):
     is_rough: Array
 
     def receptance(self, omega: Array, factor: Array) -> Array:
-        """Return `factor` (scalar) times e^H B D^-1 B^T e, m/N, the displacement of the mount per force that turns with it.
+        """Return `factor` (scalar) times the receptance e^H B D^-1 B^T e, m/N, the displacement of the mount per force that
+        turns with it; or times the receptances e_i^H B_i D^-1 B_k^T e_k (count, count) between masses.
 
         The factor is inside the sum because the derivative with respect to `omega` (scalar, rad/s) is then one sum, which is
         13 times as fast. The sum uses real numbers because the imaginary part of an undamped carrier is then exactly 0.
         """
-        decay, apart = -self.poles.real, omega - self.poles.imag
+        poles = jnp.broadcast_to(self.poles, self.residues.shape)
+        decay, apart = -poles.real, omega - poles.imag
         weight = factor / (decay**2 + apart**2)
         real, imag = self.residues.real, self.residues.imag
-        return jax.lax.complex(jnp.sum((real * decay + imag * apart) * weight), jnp.sum((imag * decay - real * apart) * weight))
+        parts = (real * decay + imag * apart) * weight, (imag * decay - real * apart) * weight
+        return jax.lax.complex(*(jnp.sum(part, axis=-1) for part in parts))
 
     def solve(self, omega: Array, force: Array) -> Array:
         """Return D^-1 f (nd,), m, for amplitudes `force` f (nd,), N."""
@@ -64,7 +68,7 @@ def modal_response(
     each mode is then a separate block, which is solved to rounding, and needs no separate case.
 
     **Arguments**: undamped `frequencies` (nd,) rad/s and mass-normalised `shapes` (nd, nd); `stiffness` K, `damping` C
-    and `mass` M (nd, nd); `direction` B^T e (nd,).
+    and `mass` M (nd, nd); `direction` B^T e (nd,), or those of several masses (count, nd).
     """
     n, eps = frequencies.shape[0], jnp.finfo(frequencies.dtype).eps
     positive = jnp.where(frequencies > 0.0, frequencies, jnp.inf)
@@ -85,11 +89,12 @@ def modal_response(
     inverse = solve_in_turn(vectors, unit.astype(vectors.dtype))
     outputs, inputs = (shapes / stiff[None, :]) @ vectors[0::2], inverse @ shapes.T
     spread = jnp.linalg.norm(vectors) * jnp.linalg.norm(inverse)
+    left, right = direction.conj() @ outputs, direction @ inputs.T
     return ModalResponse(
         poles=poles,
         outputs=outputs,
         inputs=inputs,
-        residues=(direction.conj() @ outputs) * (inputs @ direction),
+        residues=left * right if direction.ndim == 1 else left[:, None] * right[None],
         norms=jnp.stack([jnp.max(jnp.sum(jnp.abs(a), axis=1)) for a in (stiffness, damping, mass)]),
         is_rough=(spread > 100.0 * n) | jnp.any(frequencies <= 0.0),
     )

@@ -26,6 +26,7 @@ from jaxvib.machine.drives.drive import ConstantSpeed, Drive
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve, times
+from jaxvib.runtime.programs import cached
 
 _TORQUE_POINTS = 33
 """Number of speeds from 0 to the working speed at which the largest torque of a motor is read."""
@@ -81,6 +82,13 @@ class TorqueBalance(eqx.Module):
         """Return D(omega) (nd, nd) complex, N/m."""
         speeds = self.rotor_speeds(jnp.full_like(self.unbalance, omega))
         return self.model.dynamic_stiffness(omega, self.averaged.gyroscopic_speed(speeds))
+
+    def decomposed(self) -> TorqueBalance:
+        """Return this balance with the modal form of its model, for searches at many speeds.
+
+        Each influence coefficient then costs O(nd), and has no derivatives with respect to parameters of the scene.
+        """
+        return eqx.tree_at(lambda balance: balance.model, self, self.model.decomposed(self.direction))
 
     def total_driving_torque(self, omega: Array, factor: Array | None = None) -> Array:
         """Return `driving_torque`, with all its differences between the masses multiplied by `factor`.
@@ -184,6 +192,12 @@ def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
     )
 
 
+@cached
+def assemble_for_search(scene: Scene) -> TorqueBalance:
+    """Assemble the torque balance of a validated scene in the form for searches, see `TorqueBalance.decomposed`."""
+    return assemble_torque_balance(scene).decomposed()
+
+
 def _motor_torque(averaged: Averaged) -> Array:
     """Return the largest torque of each mass's motor, see `TorqueBalance`."""
     shares, each = jnp.linspace(0.0, 1.0, _TORQUE_POINTS, dtype=averaged.drag.dtype), []
@@ -198,20 +212,22 @@ def _motor_torque(averaged: Averaged) -> Array:
     return jax.lax.stop_gradient(each[0] if len(each) == 1 else jnp.concatenate(each))
 
 
-def influence_of(balance: TorqueBalance, omega: Array) -> tuple[Array, Array]:
-    """Return the influence coefficients of the rotating masses.
+def influence_of(balance: TorqueBalance, omega: Array) -> Array:
+    """Return the influence coefficients H_jk (count, count), complex, m/N: response at mass j per force of mass k."""
+    if balance.model.modal is not None:
+        return balance.model.modal.receptance(omega, jnp.ones_like(omega))
+    return balance.direction.conj() @ response_of(balance, omega)
 
-    **Returns** H_jk (count, count), complex: response at mass j per centrifugal force of mass k; and D^-1 P^T (nd, count):
-    response of the carrier.
-    """
+
+def response_of(balance: TorqueBalance, omega: Array) -> Array:
+    """Return the response of the carrier per force of each mass, D^-1 P^T (nd, count), complex, m/N."""
     dynamic = balance.dynamic_stiffness(omega)
-    response = small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
-    return balance.direction.conj() @ response, response
+    return small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
 
 
-def torques_at(balance: TorqueBalance, influence: Array, omega: Array, turn: Array) -> Array:
-    """Return V (count,) N m from influence coefficients (count, count) and exp(i alpha) (count,)."""
-    return mean_torque(balance.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, balance.unbalance * turn))
+def torques_at(unbalance: Array, influence: Array, omega: Array, turn: Array) -> Array:
+    """Return V (count,) N m from unbalances (count,), influence coefficients (count, count) and exp(i alpha) (count,)."""
+    return mean_torque(unbalance, -(omega**4) * jnp.conj(turn) * times(influence, unbalance * turn))
 
 
 def unknowns_of(balance: TorqueBalance, omega: Array, phase: Array) -> Array:
@@ -245,7 +261,7 @@ def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = N
     """
     w, angles = motion_of(balance, x)
     turn = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
-    torque = torques_at(balance, influence_of(balance, w)[0], w, turn)
+    torque = torques_at(balance.unbalance, influence_of(balance, w), w, turn)
     residual = (balance.total_driving_torque(w, factor) + torque) / balance.torque_scale
     return residual[np.flatnonzero(~balance.is_prescribed)] if any(balance.is_prescribed) else residual
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import averaged_growth
-from jaxvib.equations.torque_balance import TorqueBalance, assemble_torque_balance, influence_of
+from jaxvib.equations.torque_balance import TorqueBalance, assemble_for_search, assemble_torque_balance, response_of
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -179,7 +179,7 @@ def phase_jams(
         return phase_jam(scene, *near)
     loads = loads_with_drag(scene)
     number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
-    balance = _assembled_balance(scene)
+    balance = assemble_for_search(scene)
     return _jams_from_starts(scene, balance, *solved_clusters(balance, number, random_numbers(seed)))
 
 
@@ -229,9 +229,6 @@ def _distinct(
         else:
             reached[place] += int(starts[m])
     return places, np.asarray(reached, dtype=int)
-
-
-_assembled_balance = cached(assemble_torque_balance)
 
 
 @cached
@@ -290,10 +287,9 @@ def _follow_pattern(scene: Scene, phase: Array, omega: Array, restart: Array) ->
         w, begins = at
         start = jnp.where(begins, phase, last)
         factor, angles, residual = phases_near(balance, at_speed(balance, w), start)
-        answer = influence_of(balance, w)[1]
         good = (residual < jnp.sqrt(jnp.finfo(residual.dtype).eps)) & (factor > 0.0)
         braked = eqx.tree_at(lambda field: field.drag, balance.averaged, factor * balance.drag)
-        growth = averaged_growth(braked, w, angles, w**2 * answer @ (balance.unbalance * jnp.exp(1j * angles)))
+        growth = averaged_growth(braked, w, angles, w**2 * response_of(balance, w) @ (balance.unbalance * jnp.exp(1j * angles)))
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 

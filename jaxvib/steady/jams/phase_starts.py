@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.equations.linear import LinearModel, estimated_frequencies
 from jaxvib.equations.torque_balance import TorqueBalance, influence_of, torques_at
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.runtime.devices import on_device
@@ -123,6 +123,9 @@ def _cluster_balance(balance: TorqueBalance, cluster: np.ndarray) -> TorqueBalan
     levers = on_device(np.asarray(averaged.levers)[:, first])
     averaged = eqx.tree_at(lambda a: (a.unbalance, a.drag, a.inertia, a.levers), averaged, (*scaled, levers))
     direction = on_device(np.asarray(balance.direction)[first])
+    if balance.model.modal is not None:
+        residues = on_device(np.asarray(balance.model.modal.residues)[first][:, first])
+        balance = eqx.tree_at(lambda b: b.model.modal.residues, balance, residues)
     motor_torque = on_device(np.asarray(balance.motor_torque)[first])
     return eqx.tree_at(lambda b: (b.averaged, b.direction, b.motor_torque), balance, (averaged, direction, motor_torque))
 
@@ -198,7 +201,7 @@ class AtSpeed(eqx.Module):
 
 def at_speed(balance: TorqueBalance, omega: Array) -> AtSpeed:
     """Return the data of the search at one load speed."""
-    influence = influence_of(balance, omega)[0]
+    influence = influence_of(balance, omega)
     torque = jnp.sum(magnitude(influence) * balance.unbalance[:, None] * balance.unbalance[None, :]) * omega**4
     return AtSpeed(omega, influence, torque / (jnp.min(balance.drag) * jnp.abs(balance.speed - omega)))
 
@@ -248,17 +251,22 @@ def _newton_round(row: Array, phase: Array, balance: TorqueBalance, at: AtSpeed)
 
 def load_speeds(balance: TorqueBalance) -> np.ndarray:
     """Return load speeds below the rotor speed, dense near the carrier's resonances at this rotor speed."""
-    mass, nd = np.asarray(balance.model.mass), balance.model.mass.shape[0]
-    stiffness, damping = np.asarray(balance.model.carrier.stiffness), np.asarray(balance.model.damping(balance.speed))
-    flow = np.linalg.solve(mass, np.concatenate([-stiffness, -damping], axis=1))
-    poles = np.linalg.eigvals(np.concatenate([np.eye(nd, 2 * nd, nd), flow]))
-    speed = float(balance.speed)
-    centres = np.unique(np.abs(poles[np.abs(poles.imag) > 0.0].imag))
+    model, speed = balance.model, float(balance.speed)
+    poles = _poles(model, balance.speed) if model.modal is None else np.asarray(model.modal.poles)
+    turning = np.abs(np.imag(poles))
+    centres = np.unique(turning[turning > 0.0])
     apart = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 30)])
     crowd = [w * (1.0 + side * apart) for w in centres for side in (-1.0, 1.0)]
     top = speed * (1.0 - np.geomspace(1e-6, 0.1, 12))
     speeds = np.unique(np.concatenate([np.linspace(0.02, 0.98, LOAD_SPEEDS) * speed, top, *crowd]))
     return speeds[(speeds > 1e-3 * speed) & (speeds < speed)]
+
+
+def _poles(model: LinearModel, speed: Array) -> np.ndarray:
+    """Return the roots s (2 nd,) of det(K + s (C + n G) + s^2 M) = 0, n the rotor's `speed`."""
+    flow = np.linalg.solve(model.mass, -np.concatenate([model.carrier.stiffness, model.damping(speed)], axis=1))
+    nd = len(flow)
+    return np.linalg.eigvals(np.concatenate([np.eye(nd, 2 * nd, nd), flow]))
 
 
 def _regular_phases(balance: TorqueBalance) -> np.ndarray:
@@ -279,13 +287,14 @@ def phases_near(
     **Returns** the multiple, positive in a jam; the phases; and the remaining relative difference between the multiples.
     """
 
-    def differ(x: Array, given: tuple[TorqueBalance, AtSpeed]) -> tuple[Array, Array]:
-        balance, at = given
+    def differ(x: Array, given: tuple[Array, Array, AtSpeed]) -> tuple[Array, Array]:
+        unbalance, most, at = given
         angles = jnp.concatenate([jnp.zeros(1, x.dtype), x])
-        torque = torques_at(balance, at.influence, at.omega, jax.lax.complex(jnp.cos(angles), jnp.sin(angles)))
-        each = -torque / (balance.drag * (balance.speed - at.omega) * at.most)
+        torque = torques_at(unbalance, at.influence, at.omega, jax.lax.complex(jnp.cos(angles), jnp.sin(angles)))
+        each = -torque / most
         return each[1:] - each[:-1], each
 
+    given = balance.unbalance, balance.drag * (balance.speed - at.omega) * at.most, at
     x = start[1:] - start[0]
-    x, each = damped_newton(differ, x, (balance, at), steps) if x.size else (x, differ(x, (balance, at))[1])
+    x, each = damped_newton(differ, x, given, steps) if x.size else (x, differ(x, given)[1])
     return each[0] * at.most, jnp.concatenate([jnp.zeros(1, x.dtype), x]), jnp.max(jnp.abs(each - each[0]))

@@ -21,6 +21,7 @@ from jaxvib.equations.torque_balance import (
     balance_residuals,
     influence_of,
     motion_of,
+    response_of,
     torques_at,
     unknowns_of,
 )
@@ -156,7 +157,7 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
 @cached
 def _phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     balance = assemble_torque_balance(scene)
-    return torques_at(balance, influence_of(balance, omega)[0], omega, jnp.exp(1j * phase))
+    return torques_at(balance.unbalance, influence_of(balance, omega), omega, jnp.exp(1j * phase))
 
 
 def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
@@ -209,6 +210,7 @@ def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_scal
 
     frozen = jax.lax.stop_gradient(balance)
     start = jax.lax.stop_gradient(unknowns_of(balance, omega, phase))
+    on_scalars = on_scalars and balance.model.modal is None  # a sum over many modes has too many operations
     x, _ = damped_newton(residuals, start, frozen, on_scalars=on_scalars)
     # One more Newton step: its derivative with respect to the scene is that of the implicit function theorem.
     x = x - eliminate(jax.jacfwd(balance_residuals)(x, frozen), balance_residuals(x, balance))
@@ -222,10 +224,9 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     balance = assemble_torque_balance(scene)
     frozen = jax.lax.stop_gradient(balance)
     w, angles = solve_balance(balance, omega, phase)
-    influence, answer = influence_of(balance, w)
-    turn = jnp.exp(1j * angles)
-    torque = torques_at(balance, influence, w, turn)
-    z = w**2 * answer @ (balance.unbalance * turn)
+    turn, response = jnp.exp(1j * angles), response_of(balance, w)
+    torque = torques_at(balance.unbalance, balance.direction.conj() @ response, w, turn)
+    z = w**2 * response @ (balance.unbalance * turn)
     force = balance.model.carrier.foundation_force(z, 1j * w * z)
     residual = jnp.max(jnp.abs(balance.drag * (balance.speed - w) + torque)) / jnp.max(balance.drag * balance.speed)
     tiny = jnp.sqrt(jnp.finfo(w.dtype).eps)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import averaged_growth, largest_growth, mean_torque
-from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, influence_of, motion_of
+from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, influence_of, motion_of, response_of
 from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, svd_in_turn
 
 _TRIALS, _NEWTON_STEPS, _POLISHING_STEPS = 120, 6, 8
@@ -51,7 +51,7 @@ def _rank_tolerance(values: Array) -> Array:
 
 def vibration_scale(balance: TorqueBalance, omega: Array) -> Array:
     """Return the largest vibrational torque that is possible at the speed `omega`, (count,) N m, for each mass."""
-    influence = influence_of(balance, omega)[0]
+    influence = influence_of(balance, omega)
     return omega**4 / 2.0 * balance.unbalance * jnp.sum(magnitude(influence) * balance.unbalance[None, :], axis=1)
 
 
@@ -83,7 +83,7 @@ def implicit_step(x: Array, slopes: Slopes, residuals: Array) -> Array:
 
 def regime_growth(balance: TorqueBalance, omega: Array, phase: Array, neutral: Array | int) -> Array:
     """Return the growth rate of small disturbances of a regime according to the averaged equations, 1/s."""
-    vibration = omega**2 * influence_of(balance, omega)[1] @ (balance.unbalance * jnp.exp(1j * phase))
+    vibration = omega**2 * response_of(balance, omega) @ (balance.unbalance * jnp.exp(1j * phase))
     return averaged_growth(balance.averaged, omega, phase, vibration, balance.averaged.free_shifts + neutral)
 
 
@@ -132,7 +132,7 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
     """
     if x.size == 0:
         return jnp.full((), jnp.inf, balance.unbalance.dtype)
-    frozen, one = jax.lax.stop_gradient(balance), jnp.ones((), x.dtype)
+    frozen, one = jax.lax.stop_gradient(balance).decomposed(), jnp.ones((), x.dtype)
     start = jax.lax.stop_gradient(x)
     omega = motion_of(frozen, start)[0]
     free = np.flatnonzero(~frozen.is_prescribed)

@@ -104,7 +104,7 @@ def _data_at(balance: TorqueBalance, speeds: np.ndarray) -> tuple[np.ndarray, np
 @cached
 def _at_speeds(balance: TorqueBalance, speeds: Array) -> tuple[Array, Array]:
     """Return influence coefficients (n, count, count) and driving torques (n, count) at speeds (n,)."""
-    return jax.vmap(lambda w: (influence_of(balance, w)[0], balance.driving_torque(w)))(speeds)
+    return jax.vmap(lambda w: (influence_of(balance, w), balance.driving_torque(w)))(speeds)
 
 
 def _speeds(balance: TorqueBalance) -> np.ndarray:

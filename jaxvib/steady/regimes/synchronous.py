@@ -16,11 +16,12 @@ from jaxvib.equations.averaged import require_rotating_masses
 from jaxvib.equations.linear import peak_force
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
+    assemble_for_search,
     assemble_torque_balance,
     balance_residuals,
     can_start,
-    influence_of,
     motion_of,
+    response_of,
     torques_at,
     unknowns_of,
 )
@@ -265,15 +266,12 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = Non
             raise InputError("near", f"must be (speed, phases) with one phase for each of the {count} rotating masses")
         speed, phases = number(near[0], "rad/s", "near[0]", low=0.0, open_low=True), numbers(near[1], "rad", "near[1]", count)
         return outcome(_regime_near(scene, speed, phases), scene)
-    omega, phases = all_regimes(_balance_of(scene))
+    omega, phases = all_regimes(assemble_for_search(scene))
     found = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a), omega, phases)
     kept = np.flatnonzero(status_names(found["status"]) != "not_converged")
     kept = kept[np.lexsort((-found["speed"][kept], ~found["stable"][kept]))]
     search = RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none
     return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[kept], found)), scene=scene, search=search)
-
-
-_balance_of = cached(assemble_torque_balance)
 
 
 @cached
@@ -309,9 +307,8 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
         x = implicit_step(x, slopes, balance_residuals(x, balance))
     w, angles = motion_of(balance, x)
     angles = jnp.concatenate([angles[:1], jnp.arctan2(jnp.sin(angles[1:]), jnp.cos(angles[1:]))])
-    influence, response = influence_of(balance, w)
-    turn = jnp.exp(1j * angles)
-    vibration = torques_at(balance, influence, w, turn)
+    turn, response = jnp.exp(1j * angles), response_of(balance, w)
+    vibration = torques_at(balance.unbalance, balance.direction.conj() @ response, w, turn)
     driving = jnp.where(balance.is_prescribed, -vibration, balance.driving_torque(w))
     z = w**2 * response @ (balance.unbalance * turn)
     force = peak_force(balance.model.carrier.foundation_force(z, 1j * w * z))

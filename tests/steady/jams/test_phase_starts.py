@@ -53,7 +53,7 @@ def test_regular_phases_are_every_split_into_two():
 @pytest.mark.parametrize("omega", [150.0, 170.0, 200.0])
 def test_loads_together_need_the_drag_that_is_computed_by_hand(omega):
     p, w = parts(), jnp.asarray(omega)
-    influence = influence_of(p, w)[0]
+    influence = influence_of(p, w)
     factor, phase, residual = phases_near(p, at_speed(p, w), jnp.array([0.3, 0.3001]))
     np.testing.assert_allclose(factor, needed(omega), rtol=1e-9)
     np.testing.assert_allclose(phase, [0.0, 0.0], atol=1e-9)
@@ -61,7 +61,7 @@ def test_loads_together_need_the_drag_that_is_computed_by_hand(omega):
     # Without a step: how far the loads' multiples differ, beside what their torques could be at most.
     start = jnp.array([0.0, 1.0])
     factor, phase, residual = phases_near(p, at_speed(p, w), start, 0)
-    each = -np.asarray(torques_at(p, influence, w, jnp.exp(1j * start))) / (0.04 * 0.08**2 * (460.0 - omega))
+    each = -np.asarray(torques_at(p.unbalance, influence, w, jnp.exp(1j * start))) / (0.04 * 0.08**2 * (460.0 - omega))
     most = omega**4 * np.sum(np.abs(influence)) * 0.004**2 / (0.04 * 0.08**2 * (460.0 - omega))
     np.testing.assert_allclose(residual, abs(each[1] - each[0]) / most, rtol=1e-9)
     np.testing.assert_allclose([factor, phase[1]], [each[0], 1.0], rtol=1e-9)
