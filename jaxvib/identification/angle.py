@@ -2,7 +2,12 @@
 
 Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots, whose number has the smallest Bayesian
 information criterion. Its second derivative, which the force of an unbalance needs, is smooth. Marks of a wheel that are
-unevenly spaced have one unknown offset each.
+unevenly spaced have one unknown offset each. The covariance of the coefficients gives functions e_m(t), such that
+
+    angle(t) = spline(t) + sum_m z_m e_m(t),      z_m independent and standard normal
+
+The numbers z_m can be further unknowns of a fit: vibrations then make the angle more accurate, and the intervals of all other
+unknowns include its error.
 """
 
 from __future__ import annotations
@@ -10,13 +15,17 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.identification.records.channel import Channel
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.machine.drives.drive import Drive
+from jaxvib.machine.drives.drive import Drive, IdealDrive
+from jaxvib.machine.numbers import unit
 from jaxvib.machine.scene import Exciter, Scene
 
 _DEGREE = 5
@@ -29,37 +38,94 @@ _MAX_INTERVALS = 512
 _MAX_SPEED_CHANGE = 0.1
 """Relative change of the speed between two pulses above which the angle between them is uncertain."""
 
+_MIN_SPEED = 0.02
+"""Speed relative to the largest one below which the error of a pulse's angle does not decrease further."""
+
+MAX_ERRORS = 64
+"""Largest number of errors z_m of an angle."""
+
+_ERRORS_TOGETHER = 8
+"""Errors are added in groups of this number, so that runs of nearly equal splines share a program."""
+
+
+class RecordedDrive(IdealDrive):
+    """Drive that follows a recorded angle, given by polynomials of the relative time in each of equal intervals.
+
+    **Attributes**: `speed`, the largest one, rad/s; `table` (intervals, powers, 1 + m): coefficients of the angle and of its
+    errors e_m; `begin` and `width`, s, of the first interval; `last`: number of the last interval (further rows are padding).
+    """
+
+    speed: Array = eqx.field(metadata=unit("rad/s"))
+    table: Array = eqx.field(metadata=unit("rad"))
+    begin: Array = eqx.field(metadata=unit("s"))
+    width: Array = eqx.field(metadata=unit("s"))
+    last: Array
+    kind: str = eqx.field(static=True, default="recorded", kw_only=True)
+
+    def columns_at(self, t: Array, order: int) -> Array:
+        """Return the angle and its errors (1 + m,) at time `t`, or their derivatives of an `order`."""
+        place = (t - self.begin) / self.width
+        k = jnp.clip(jnp.floor(place), 0.0, self.last)
+        rows = self.table[k.astype(int)]
+        factors = [math.perm(p, order) * (place - k) ** (p - order) for p in range(order, rows.shape[0])]
+        return jnp.stack(factors) @ rows[order:] / self.width**order
+
+    def angle_at(self, t: Array) -> Array:
+        """Return the angle, rad."""
+        return self.columns_at(t, 0)[0]
+
+    def speed_at(self, t: Array) -> Array:
+        """Return the speed, rad/s."""
+        return self.columns_at(t, 1)[0]
+
+    def acceleration_at(self, t: Array) -> Array:
+        """Return the acceleration, rad/s^2."""
+        return self.columns_at(t, 2)[0]
+
+    def with_errors(self, z: Array) -> RecordedDrive:
+        """Return the drive whose angle has the errors `z` (m,)."""
+        moved = self.table[:, :, :1] + (self.table[:, :, 1:] @ z)[:, :, None]
+        return eqx.tree_at(lambda own: own.table, self, jnp.concatenate([moved, self.table[:, :, 1:]], axis=2))
+
 
 class RotorAngle(NamedTuple):
     """Angle of a rotor over time.
 
     **Attributes**
 
-    - `spline` of the angle over time; None if the angle follows from the `drive`
-    - `drive`: drive of prescribed speed, None with a spline
+    - `drive` that turns the rotor in this way
+    - `spline` of the angle and its errors over time; None if the angle follows from the drive of the scene
     - `span`, s, in which the angle is known
     - `marked`: True if the zero of the angle is a mark on the rotor, the same in all runs
     - `error`, rad: root mean square of the standard error of the angle in the span
+    - `left_out`, rad: part of `error` that the m errors do not contain
     - `notes`: sentences for the reader
     """
 
+    drive: Drive
     spline: Any
-    drive: Drive | None
     span: tuple[float, float]
     marked: bool
     error: float
+    left_out: float
     notes: tuple[str, ...]
 
-    def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the angle (rad), the speed (rad/s) and the acceleration (rad/s^2) at times of any shape."""
-        if self.drive is not None:
-            drive: Any = self.drive
-            flat = np.ravel(time)
-            functions = (lambda t: drive.rotor_angle(t, None), lambda t: drive.rotor_speed(t, None), drive.rotor_acceleration)
-            angle, speed, acceleration = (np.asarray(jax.vmap(f)(flat), dtype=float).reshape(time.shape) for f in functions)
-            return angle, speed, acceleration
-        spline = self.spline
-        return spline(time), spline(time, 1), spline(time, 2)
+    @property
+    def errors(self) -> int:
+        """Number m of errors."""
+        return self.drive.table.shape[2] - 1 if isinstance(self.drive, RecordedDrive) else 0
+
+    def at(self, time: np.ndarray) -> np.ndarray:
+        """Return the angle (rad) at times (n,)."""
+        if self.spline is not None:
+            return self.spline(time)[:, 0]
+        return np.asarray(jax.vmap(lambda t: self.drive.rotor_angle(t, None))(time), dtype=float)
+
+    def without_errors(self) -> Drive:
+        """Return the drive without the errors of its angle."""
+        if not isinstance(self.drive, RecordedDrive):
+            return self.drive
+        return eqx.tree_at(lambda own: own.table, self.drive, self.drive.table[:, :, :1])
 
 
 def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
@@ -88,7 +154,7 @@ def _prescribed(scene: Scene, k: int, exciter: Exciter, run: MeasuredRun) -> Rot
             f"has no channel of the rotor's angle, and {scene.prefix_of(k)}drive is {exciter.drive.kind!r}, whose speed "
             "depends on the machine; add a channel of kind pulses, angle or speed",
         )
-    return RotorAngle(None, exciter.drive, (-math.inf, math.inf), False, 0.0, ())
+    return RotorAngle(exciter.drive, None, (-math.inf, math.inf), False, 0.0, 0.0, ())
 
 
 def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
@@ -98,17 +164,18 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     if time.size < _MIN_PULSES:
         raise InputError(where, f"has {time.size} {channel.kind}; at least {_MIN_PULSES} are needed, record more turns")
     time = time - channel.delay
+    notes: list[str] = []
     if channel.kind == "speed":
-        spline, error = fit_spline(time, np.abs(value))
-        rough = spline.antiderivative()
-        # The error of an integral of independent errors of the speed.
-        return RotorAngle(rough, None, (time[0], time[-1]), False, error * math.sqrt((time[-1] - time[0]) * _step(time)), ())
-    marks = value.astype(int) % channel.per_turn if channel.kind == "pulses" and channel.per_turn > 1 else None
-    angle = 2.0 * np.pi * value / channel.per_turn if channel.kind == "pulses" else value * np.sign(value[-1] - value[0])
-    spline, error = fit_spline(time, angle, marks)
-    notes = []
-    if channel.kind == "pulses":
-        speed = spline(0.5 * (time[1:] + time[:-1]), 1)
+        spline = fit_spline(time, np.abs(value)).antiderivative()
+    elif channel.kind == "angle":
+        spline = fit_spline(time, value * np.sign(value[-1] - value[0]))
+    else:
+        angle = 2.0 * np.pi * value / channel.per_turn
+        marks = value.astype(int) % channel.per_turn if channel.per_turn > 1 else None
+        rough = np.convolve(np.pad(np.gradient(angle, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
+        # The errors of pulses are errors of their times.
+        spline = fit_spline(time, angle, marks, np.maximum(rough, _MIN_SPEED * np.max(rough)))
+        speed = spline(0.5 * (time[1:] + time[:-1]), 1)[:, 0]
         fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite nothing
         change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=fast, initial=0.0))
         if change > _MAX_SPEED_CHANGE:
@@ -116,53 +183,104 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
                 f"{where}: the speed changes by up to {change:.0%} from one pulse to the next, and the angle between them is "
                 "uncertain; use more pulses per turn"
             )
-    return RotorAngle(spline, None, (time[0], time[-1]), True, error, tuple(notes))
+    grid = spline(np.linspace(time[0], time[-1], 4 * spline.c.shape[0]))[:, 1:]
+    sizes = np.sqrt(np.mean(grid**2, axis=0))
+    error, left_out = float(np.linalg.norm(sizes)), float(np.linalg.norm(sizes[MAX_ERRORS:]))
+    span = float(time[0]), float(time[-1])
+    return RotorAngle(_recorded_drive(spline), spline, span, channel.kind != "speed", error, left_out, tuple(notes))
 
 
-def _step(time: np.ndarray) -> float:
-    return float(np.median(np.diff(time)))
+def _recorded_drive(spline: Any) -> RecordedDrive:
+    """Return the drive that follows a spline of an angle and its errors."""
+    knots, count = np.unique(spline.t), min(1 + MAX_ERRORS, spline.c.shape[1])
+    intervals, width = knots.size - 1, (knots[-1] - knots[0]) / (knots.size - 1)
+    rows, columns = 2 ** math.ceil(math.log2(intervals)), 1 - (1 - count) // _ERRORS_TOGETHER * _ERRORS_TOGETHER
+    table = np.zeros((rows, spline.k + 1, columns))
+    for p in range(spline.k + 1):
+        table[:intervals, p, :count] = spline(knots[:-1], p)[:, :count] * width**p / math.factorial(p)
+    speed = np.max(np.abs(spline(knots, 1)[:, 0]))
+    speed, begin, width, last = (jnp.asarray(float(each)) for each in (speed, knots[0], width, intervals - 1))
+    return RecordedDrive(speed, jnp.asarray(table), begin, width, last)
 
 
-def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None) -> tuple[Any, float]:
-    """Return a spline of degree 5 through noisy values, and the root mean square of its standard error.
+def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None, spread: np.ndarray | None = None) -> Any:
+    """Return a spline of degree 5 through noisy values, with 1 + m columns: the values, and m errors of them.
+
+    The errors are principal components of the covariance of the coefficients, in the order of their size.
 
     **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): the number of a value's mark, each with an unknown
-    offset (0 on average).
+    offset (0 on average); `spread` (n,): standard deviations of the values up to a common factor.
 
     >>> t = np.linspace(0.0, 2.0, 200)
-    >>> spline, error = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
-    >>> bool(abs(spline(1.0, 2) - 60.0) < 0.1), bool(2e-4 < error < 2e-3)
+    >>> spline = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
+    >>> bool(abs(spline(1.0, 2)[0] - 60.0) < 0.1), bool(5e-5 < np.linalg.norm(spline(1.0)[1:]) < 5e-4)
     (True, True)
     """
     from scipy.interpolate import BSpline  # slow to import
 
-    n = time.size
-    best: tuple[float, Any, float] = (math.inf, None, math.inf)
-    kinds = np.eye(1 if marks is None else int(np.max(marks)) + 1)[0 * np.arange(n) if marks is None else marks]
-    offsets = kinds[:, 1:] - kinds[:, :1]
+    weights = np.ones(time.size) if spread is None else np.mean(spread) / spread
+    offsets = np.zeros((time.size, 0))
+    if marks is not None:
+        kinds = np.eye(int(np.max(marks)) + 1)[marks]
+        offsets = (kinds[:, 1:] - kinds[:, :1]) * weights[:, None]
+    tried = []
     intervals = 1
-    while intervals <= min(_MAX_INTERVALS, n // 4):
-        inner = np.linspace(time[0], time[-1], intervals + 1)
-        knots = np.concatenate([[time[0]] * _DEGREE, inner, [time[-1]] * _DEGREE])
-        basis: Any = BSpline.design_matrix(time, knots, _DEGREE)
-        count = basis.shape[1] + offsets.shape[1]
-        square = np.zeros((count, count))
-        size = basis.shape[1]
-        square[:size, :size] = (basis.T @ basis).toarray()
-        square[:size, size:] = basis.T @ offsets
-        square[size:, :size] = square[:size, size:].T
-        square[size:, size:] = offsets.T @ offsets
-        right = np.concatenate([basis.T @ value, offsets.T @ value])
-        square[np.diag_indices(count)] += 1e-12 * np.trace(square) / count  # intervals without a value
-        inverse = np.linalg.inv(square)
-        found = inverse @ right
-        found += inverse @ (right - square @ found)
-        left = value - basis @ found[:size] - offsets @ found[size:]
-        variance = float(left @ left) / max(n - count, 1)
-        criterion = n * math.log(max(float(left @ left) / n, 1e-26)) + count * math.log(n)
-        if criterion < best[0]:
-            at = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * intervals + 1), knots, _DEGREE)
-            spread = np.mean(np.einsum("ij,jk,ik->i", at.toarray(), inverse[:size, :size], at.toarray()))
-            best = criterion, BSpline(knots, found[:size], _DEGREE), math.sqrt(variance * float(spread))
+    while intervals <= min(_MAX_INTERVALS, time.size // 4):
+        tried.append(_fit_knots(time, value * weights, weights, offsets, intervals))
         intervals = max(intervals + 1, int(1.4 * intervals))
-    return best[1], best[2]
+    best = min(tried, key=lambda each: each.criterion)
+    sizes, axes = np.linalg.eigh(best.covariance())
+    root = axes * np.sqrt(np.maximum(sizes, 0.0))
+    grid = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * len(best.found)), best.knots, _DEGREE)
+    errors = root @ np.linalg.svd(grid @ root, full_matrices=False)[2].T
+    return BSpline(best.knots, np.concatenate([best.found[:, None], errors], axis=1), _DEGREE)
+
+
+class _KnotsFit(NamedTuple):
+    """Fit of a spline with given `knots`.
+
+    **Attributes**: `found` coefficients (k,); Bayesian information `criterion`; `variance` of the values; diagonals `band` of
+    the normal equations, their solution `answers` (k, o) for the products of splines and offsets, and the inverse `schur`
+    (o, o) of those of the offsets.
+    """
+
+    knots: np.ndarray
+    found: np.ndarray
+    criterion: float
+    variance: float
+    band: np.ndarray
+    answers: np.ndarray
+    schur: np.ndarray
+
+    def covariance(self) -> np.ndarray:
+        """Return the covariance (k, k) of the coefficients."""
+        from scipy.linalg import solveh_banded  # slow to import
+
+        alone = solveh_banded(self.band, np.eye(len(self.found)), lower=True)
+        return self.variance * (alone + self.answers @ self.schur @ self.answers.T)
+
+
+def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets: np.ndarray, intervals: int) -> _KnotsFit:
+    """Return the fit of weighted values by a spline with equal intervals."""
+    from scipy.interpolate import BSpline  # slow to import
+    from scipy.linalg import solveh_banded
+    from scipy.sparse import diags
+
+    n = time.size
+    knots = np.concatenate([[time[0]] * _DEGREE, np.linspace(time[0], time[-1], intervals + 1), [time[-1]] * _DEGREE])
+    basis: Any = diags(weights) @ BSpline.design_matrix(time, knots, _DEGREE)
+    square = basis.T @ basis
+    size, count = square.shape[0], square.shape[0] + offsets.shape[1]
+    band = np.stack([np.pad(square.diagonal(k), (0, k)) for k in range(_DEGREE + 1)])
+    band[0] += 1e-12 * np.mean(band[0])  # intervals without a value
+    answers = solveh_banded(band, basis.T @ offsets, lower=True) if offsets.size else np.zeros((size, 0))
+    schur = np.linalg.inv(offsets.T @ offsets - (basis.T @ offsets).T @ answers)
+    found, shifts, left = np.zeros(size), np.zeros(offsets.shape[1]), value
+    for _ in range(2):  # once for the values, once for rounding errors
+        alone = solveh_banded(band, basis.T @ left, lower=True)
+        step = schur @ (offsets.T @ (left - basis @ alone))
+        found, shifts = found + alone - answers @ step, shifts + step
+        left = value - basis @ found - offsets @ shifts
+    square_sum = float(left @ left)
+    criterion = n * math.log(max(square_sum / n, 1e-26)) + count * math.log(n)
+    return _KnotsFit(knots, found, criterion, square_sum / max(n - count, 1), band, answers, schur)

@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.identification.directions import Information, eliminate, elimination, polar_unbalances
-from jaxvib.identification.fit import Fitted, prior_equations, run_equations
+from jaxvib.identification.fit import Fitted, angle_shares, prior_equations, run_equations
 
 CHANCE = 1e-5
 """Share of records with pure noise about the fit that get the status `patterned`."""
@@ -22,8 +22,11 @@ _CONTRADICTION = 4.0
 """Distance of a fitted value from a known one, in standard errors, that errors cannot explain."""
 
 _ANGLE_SHARE = 0.1
-"""Share of the residuals due to errors of the rotor's angle above which intervals count as too narrow. The share is small
-because these errors change slowly and do not average out like noise."""
+"""Share of the residuals due to errors of the rotor's angle that are not unknowns above which intervals count as too narrow.
+The share is small because these errors change slowly and do not average out like noise."""
+
+_COARSE_ANGLE = 0.3
+"""Standard error of the rotor's angle, rad, above which the response is not linear in it."""
 
 _UNEXPLAINED = 0.5
 """Share of a channel's standard deviation in the residuals above which a fit counts as none."""
@@ -52,20 +55,31 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
     """Return the status of a fit, the smallest chance of its residuals under pure noise, and notes."""
     chance, notes = 1.0, [*_contradictions(fitted), *_disagreements(fitted)]
     contradicted = bool(notes)
+    coarse = [max(rotor.error for rotor in rotors) for rotors in fitted.problem.rotors]
+    for k, error in enumerate(coarse):
+        if error > _COARSE_ANGLE:
+            notes.append(
+                f"the rotor's angle in run {k + 1} has the standard error {error:.2g} rad between its pulses, and a fit may "
+                "end in a wrong minimum: use more pulses per turn, or sample them faster"
+            )
     explained, is_inaccurate = [], False
+    shares = angle_shares(fitted)
     for k, (samples, left, raw, mask) in enumerate(
         zip(fitted.problem.runs, fitted.residuals, fitted.problem.raw, fitted.problem.masks, strict=True)
     ):
         for c, channel in enumerate(samples.channels):
             valid = mask[:, c]
-            by_angle = fitted.problem.angle_errors[k] * float(np.std(raw[valid, c]))
-            if by_angle > _ANGLE_SHARE * np.std(left[valid, c]):
+            if shares[k][c] > _ANGLE_SHARE:
                 is_inaccurate = True
-                size = np.std(left[valid, c])
                 notes.append(
-                    f"the standard error of the rotor's angle in run {k + 1}, {fitted.problem.angle_errors[k]:.2g} rad, "
-                    f"changes channel {channel.name!r} by {by_angle:.2g}, and its residuals are {size:.2g}; the "
-                    "intervals do not include this error: use more pulses per turn, or sample them faster"
+                    f"a part of the error of the rotor's angle in run {k + 1}, {fitted.problem.angle_errors[k]:.2g} rad, is "
+                    f"not in the intervals, and it is {shares[k][c]:.0%} of the residuals of channel {channel.name!r}: use "
+                    "more pulses per turn, or sample them faster"
+                )
+            if fitted.outliers[k][c]:
+                notes.append(
+                    f"{fitted.outliers[k][c]:.1%} of the readings of channel {channel.name!r} in run {k + 1} are outliers, "
+                    "which have little influence"
                 )
             explained.append(np.std(left[valid, c]) / max(float(np.std(raw[valid, c])), 1e-300))
             one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], fitted.problem.angles[k][:, 0], fitted.x.size)
@@ -76,7 +90,7 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
         return FitStatus.not_converged, chance, notes
     if contradicted:
         return FitStatus.contradicted, chance, notes
-    if chance < CHANCE or is_inaccurate:
+    if chance < CHANCE or is_inaccurate or max(coarse) > _COARSE_ANGLE:
         return FitStatus.patterned, chance, notes
     return FitStatus.undetermined if found.undetermined.size else FitStatus.found, chance, notes
 
@@ -192,7 +206,7 @@ def _disagreements(fitted: Fitted) -> Iterator[str]:
     if len(problem.runs) < 2:
         return
     exciters = range(len(problem.unbalances))
-    own = np.array([*range(p - unknowns.turns), *range(p, p + 2 * len(exciters))])
+    own = np.array([*range(p - unknowns.turns - unknowns.errors), *range(p, p + 2 * len(exciters))])
     names = [*(number.name for number in unknowns.numbers), *(f"the gain of channel {name!r}" for name in unknowns.gains)]
     names += [f"{what} exciters[{k}].unbalance" for k in exciters for what in ("the size of", "the angle (rad) of")]
     turn, _ = polar_unbalances(problem, fitted.linear)

@@ -1,7 +1,9 @@
 """Least-squares fit of a machine to recorded runs by the method of Levenberg and Marquardt with projected linear unknowns.
 
 At every trial the linear unknowns (first states, unbalances, offsets) are those of least squares. Only the other unknowns are
-damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals filtered to white noise.
+damped. The noise of each channel follows from its residuals, and the fit is repeated with residuals filtered to white noise. If
+the residuals have outliers, these have little influence; a clipped reading is a bound. If the error of a
+rotor's angle is not small beside the noise, the angle is fitted with the machine.
 """
 
 from __future__ import annotations
@@ -12,20 +14,32 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.identification.problem import Problem, with_noise
+from jaxvib.identification.problem import Problem, with_angle_errors, with_noise
 from jaxvib.identification.response import linear_equations, model_readings, normal_equations
-from jaxvib.numerics.noise import autoregression
+from jaxvib.numerics.noise import Noise, noise_of
 
 _MAX_ITERATIONS = 40
 _LONGEST_STEP = 0.7
 """Largest change of the logarithm of an unknown in one step."""
 
+_NEAR_REDUCTION = 0.1
+"""Expected relative reduction of the cost below which undamped steps are tried first."""
+
+_VALLEY_STEPS = 3
+"""Number of undamped steps after the first one."""
+
 _CONVERGED = 1e-2
 """Length of the next undamped step, in standard errors, below which the fit has converged."""
 
-_MAX_PASSES = 6
+_MAX_PASSES = 8
 _STEADY_NOISE = 0.01
 """Relative change of the noise of a channel below which its filter is final."""
+
+_STEADY_VALUES = 0.05
+"""Change of the unknowns in a pass, in standard errors, below which the influence of outliers and bounds is final."""
+
+_ANGLE_MATTERS = 0.03
+"""Share of the noise due to the error of the rotor's angle above which the angle is fitted with the machine."""
 
 _RIDGE = 1e-13
 """Relative addition to the diagonal of normal equations, which keeps undetermined combinations of unknowns in place."""
@@ -38,8 +52,9 @@ class Fitted(NamedTuple):
 
     - `x` (p,), `linear` (L,), and the `problem` with its filters and weights
     - `information` (p + L, p + L) of the data alone, `prior` (p + L, p + L) of known values
-    - `residuals` (n, C) of each run, readings minus model, NaN for samples that do not count
+    - `differences` (n, C) of each run, readings minus model
     - `noise` (C,) of each run: standard deviation of the residuals
+    - `outliers` (C,) of each run: share of the residuals that are outliers
     - `converged`
     """
 
@@ -48,9 +63,16 @@ class Fitted(NamedTuple):
     problem: Problem
     information: np.ndarray
     prior: np.ndarray
-    residuals: tuple[np.ndarray, ...]
+    differences: tuple[np.ndarray, ...]
     noise: tuple[np.ndarray, ...]
+    outliers: tuple[np.ndarray, ...]
     converged: bool
+
+    @property
+    def residuals(self) -> tuple[np.ndarray, ...]:
+        """Differences (n, C) of each run, NaN for samples that do not count."""
+        pairs = zip(self.problem.masks, self.differences, strict=True)
+        return tuple(np.where(mask, each, np.nan) for mask, each in pairs)
 
 
 class _Trial(NamedTuple):
@@ -102,7 +124,7 @@ def unbalance_prior(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, n
     return information, gradient, cost
 
 
-def _project(problem: Problem, x: np.ndarray) -> _Trial:
+def project(problem: Problem, x: np.ndarray) -> _Trial:
     """Return the best linear unknowns at `x`, and their cost."""
     total = _linear_equations(problem, x)
     matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
@@ -137,7 +159,7 @@ def _linear_equations(problem: Problem, x: np.ndarray) -> np.ndarray:
 def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> np.ndarray:
     """Return the best linear unknowns at `x`, with the components (a, b) of each unbalance if they are not None."""
     if unbalance is None:
-        return _project(problem, x).linear
+        return project(problem, x).linear
     total, n = _linear_equations(problem, x), unbalance.size
     return np.concatenate([unbalance, _solve(total[n:-1, n:-1], total[n:-1, -1] - total[n:-1, :n] @ unbalance)])
 
@@ -172,23 +194,26 @@ def _equations(problem: Problem, trial: _Trial) -> tuple[np.ndarray, np.ndarray,
     return total[:-1, :-1], prior, total[:-1, -1] + gradient
 
 
-def _minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
+def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
     """Return the minimum near `x`, the information of data and of known values there, and True if it was reached."""
-    best, damping = _project(problem, x), 1e-2
+    best, damping = project(problem, x), 1e-2
     for _ in range(_MAX_ITERATIONS):
         information, prior, gradient = _equations(problem, best)
         matrix, p = information + prior, best.x.size
         if not np.all(np.isfinite(matrix)):
             return best, information, prior, False
-        undamped = _solve(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
+        undamped = _undamped(matrix, gradient)
         if gradient @ undamped < _CONVERGED**2:
             return best, information, prior, True
+        if gradient @ undamped < _NEAR_REDUCTION * best.cost:
+            trial = _follow_valley(problem, best.x + _limited(problem, undamped))
+            if trial.cost < best.cost:
+                best = trial
+                continue
         while True:
             damped = matrix.copy()
             damped[np.arange(p), np.arange(p)] += damping * (np.diagonal(matrix)[:p] + 1e-12 * np.max(np.diagonal(matrix)[:p]))
-            step = _solve(damped, gradient)[:p]
-            step *= min(1.0, _LONGEST_STEP / max(float(np.max(np.abs(step), initial=0.0)), 1e-300))
-            trial = _project(problem, best.x + step)
+            trial = project(problem, best.x + _limited(problem, _solve(damped, gradient)))
             if trial.cost < best.cost:
                 best, damping = trial, max(0.1 * damping, 1e-9)
                 break
@@ -198,10 +223,34 @@ def _minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.n
     return best, *_equations(problem, best)[:2], False
 
 
-def residuals_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
-    """Return readings minus model (n, C) of each run, NaN for samples that do not count."""
+def _undamped(matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    return _solve(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
+
+
+def _limited(problem: Problem, step: np.ndarray) -> np.ndarray:
+    """Return the step of x of at most the longest length; errors of rotor angles do not count."""
+    step = step[: problem.unknowns.count]
+    longest = float(np.max(np.abs(step[: step.size - problem.unknowns.errors]), initial=0.0))
+    return step * min(1.0, _LONGEST_STEP / max(longest, 1e-300))
+
+
+def _follow_valley(problem: Problem, x: np.ndarray) -> _Trial:
+    """Return the values after some undamped steps. The cost may rise in between: this follows a curved valley of the cost,
+    such as that of two dampings under hardly any noise, in a tenth of the steps of the damped method."""
+    trial = project(problem, x)
+    for _ in range(_VALLEY_STEPS):
+        information, prior, gradient = _equations(problem, trial)
+        step = _undamped(information + prior, gradient)
+        if not np.all(np.isfinite(step)) or gradient @ step < _CONVERGED**2:
+            break
+        trial = project(problem, trial.x + _limited(problem, step))
+    return trial
+
+
+def differences_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
+    """Return readings minus model (n, C) of each run."""
     found = []
-    for samples, place, raw, mask in zip(problem.runs, linear_places(problem), problem.raw, problem.masks, strict=True):
+    for samples, place, raw in zip(problem.runs, linear_places(problem), problem.raw, strict=True):
         model = model_readings(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear[place]))
         shown = np.stack(
             [
@@ -210,7 +259,7 @@ def residuals_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np
             ],
             axis=1,
         )
-        found.append(np.where(mask, raw - shown[: len(raw)], np.nan))
+        found.append(raw - shown[: len(raw)])
     return found
 
 
@@ -229,48 +278,79 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
 
     The first pass weighs each channel by its own size, the next by their residuals, the last with filters to white noise.
     """
-    white = [[np.ones(1) for _ in samples.channels] for samples in problem.runs]
     sizes = [
-        np.array([np.std(raw[mask[:, k], k]) if np.any(mask[:, k]) else 0.0 for k in range(raw.shape[1])])
+        [np.std(raw[mask[:, k], k]) if np.any(mask[:, k]) else 0.0 for k in range(raw.shape[1])]
         for raw, mask in zip(problem.raw, problem.masks, strict=True)
     ]
-    deviations = [np.where(each > 0.0, each, 1.0) for each in sizes]
-    found = _pass(problem, white, deviations, starts)
-    if _largest_change([each / size for each, size in zip(found.noise, deviations, strict=True)]) < 0.3:
+    noise = [[Noise(np.ones(1), float(size) or 1.0) for size in of_run] for of_run in sizes]
+    found = _pass(problem, noise, None, starts)
+    if _largest_change(noise, [[Noise(np.ones(1), each) for each in of_run] for of_run in found.noise]) < 0.3:
         return found._replace(converged=False)  # the model does not resemble the records, and their noise is unknown
-    found = _pass(problem, white, found.noise, [found.x])
+    noise = [[Noise(np.ones(1), float(each)) for each in of_run] for of_run in found.noise]
+    found = _pass(problem, noise, None, [found.x])
+    is_final = not any(np.any(each) for each in problem.bounds)
+    matters = [bool(np.any(each > _ANGLE_MATTERS)) for each in angle_shares(found)]
+    if any(matters):
+        problem, is_final = with_angle_errors(problem, matters), False
+        found = found._replace(x=np.concatenate([found.x, np.zeros(problem.unknowns.errors)]))
     for _ in range(_MAX_PASSES):  # goes on after a pass that has not converged, since its weights were not final
-        models = [[autoregression(each[:, k]) for k in range(each.shape[1])] for each in found.residuals]
-        new = [np.array([deviation for _, deviation in of_run]) for of_run in models]
-        change = _largest_change([after / before for after, before in zip(new, deviations, strict=True)])
-        if change < _STEADY_NOISE:
+        new = [[noise_of(each[:, k]) for k in range(each.shape[1])] for each in found.residuals]
+        if is_final and _largest_change(noise, new) < _STEADY_NOISE:
             break
-        deviations = new
-        found = _pass(problem, [[taps for taps, _ in of_run] for of_run in models], deviations, [found.x])
+        before, noise = found.x, new
+        found = _pass(problem, noise, found.differences, [before])
+        matrix = found.information + found.prior
+        change = np.concatenate([found.x - before, np.zeros(found.linear.size)])
+        is_final = bool(change @ matrix @ change < _STEADY_VALUES**2) or not _has_scores(problem, noise)
     return found
 
 
-def _largest_change(ratios: Sequence[np.ndarray]) -> float:
-    return max(float(np.max(np.abs(each - 1.0))) for each in ratios)
+def _has_scores(problem: Problem, noise: Sequence[Sequence[Noise]]) -> bool:
+    """Return True if the readings of a fit depend on the last fit: outliers and bounds."""
+    heavy = any(each.outliers for of_run in noise for each in of_run)
+    return heavy or any(np.any(each) for each in problem.bounds)
+
+
+def angle_shares(fitted: Fitted) -> list[np.ndarray]:
+    """Return, for each run and channel, the reading due to the standard error of the rotor's angle, relative to the noise."""
+    problem = fitted.problem
+    return [
+        np.array([error * np.std(raw[mask[:, k], k]) / max(noise[k], 1e-300) for k in range(raw.shape[1])])
+        for error, raw, mask, noise in zip(problem.angle_errors, problem.raw, problem.masks, fitted.noise, strict=True)
+    ]
+
+
+def _largest_change(before: Sequence[Sequence[Noise]], after: Sequence[Sequence[Noise]]) -> float:
+    """Return the largest relative change of the standard deviation of a channel."""
+    pairs = [pair for runs in zip(before, after, strict=True) for pair in zip(*runs, strict=True)]
+    return max(abs(new.deviation / old.deviation - 1.0) for old, new in pairs)
 
 
 def _pass(
-    problem: Problem, filters: Sequence[Sequence[np.ndarray]], deviations: Sequence[np.ndarray], starts: Sequence[np.ndarray]
+    problem: Problem,
+    noise: Sequence[Sequence[Noise]],
+    differences: Sequence[np.ndarray] | None,
+    starts: Sequence[np.ndarray],
 ) -> Fitted:
-    """Return the fit with these filters to white noise and its standard deviations, the best one of those from `starts`."""
-    problem = with_noise(problem, filters, deviations)
-    minima = [_minimize(problem, x) for x in starts]
+    """Return the fit with this noise, the best one of those from `starts`; for `differences` see `with_noise`."""
+    problem = with_noise(problem, noise, differences)
+    minima = [minimize(problem, x) for x in starts]
     trial, information, prior, converged = min(minima, key=lambda each: each[0].cost)
-    left = residuals_of(problem, trial.x, trial.linear)
-    noise = [np.nanstd(each, axis=0) for each in left]
+    left = differences_of(problem, trial.x, trial.linear)
+    pairs = zip(left, problem.masks, noise, strict=True)
+    found = [
+        np.array([max(float(np.std(each[mask[:, k], k])), 1e-12 * old.deviation) for k, old in enumerate(of_run)])
+        for each, mask, of_run in pairs
+    ]
     return Fitted(
         x=trial.x,
         linear=trial.linear,
         problem=problem,
         information=information,
         prior=prior,
-        residuals=tuple(left),
-        noise=tuple(np.maximum(each, 1e-12 * old) for each, old in zip(noise, deviations, strict=True)),
+        differences=tuple(left),
+        noise=tuple(found),
+        outliers=tuple(np.array([each.outliers for each in of_run]) for of_run in noise),
         converged=converged,
     )
 
@@ -284,4 +364,4 @@ def information_at(problem: Problem, unbalance: np.ndarray) -> Fitted:
     linear[: unbalance.size] = unbalance
     x = np.zeros(problem.unknowns.count)
     information, prior, _ = _equations(problem, _Trial(x, linear, 0.0))
-    return Fitted(x, linear, problem, information, prior, (), (), True)
+    return Fitted(x, linear, problem, information, prior, (), (), (), True)

@@ -23,6 +23,7 @@ from jaxvib.identification.directions import (
     information_of,
 )
 from jaxvib.identification.fit import Fitted, fit_from
+from jaxvib.identification.likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.problem import Problem, build_problem, natural
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.start import track_orders
@@ -40,9 +41,6 @@ from jaxvib.units import Number
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
-
-QUANTILE = 1.959964
-"""97.5 % quantile of the normal distribution."""
 
 _RETURNS = 2
 """Number of times that undetermined combinations of numbers are moved back to their first values."""
@@ -243,7 +241,7 @@ def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted
         if not axes.size or not fitted.converged:
             break
         away = np.concatenate([fitted.x[:moved], np.log(known.values[moved:] / first)])
-        start = fitted.x.copy()
+        start = fitted.x[: problem.unknowns.count].copy()
         start[:moved] -= (axes @ (axes.T @ away))[:moved]
         back = fit_from(problem, [start])
         if not back.converged:
@@ -262,13 +260,19 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     modes = propagate(
         fitted_to, known.names, known.covariance, known.undetermined, known.errors, lambda scene: np.concatenate(natural(scene))
     )
+    estimates = list(map(_estimate, known.values, known.scale, known.logarithmic, _spreads(known), known.determined))
+    ends = profile_intervals(fitted, known) if bool(status != FitStatus.not_converged) else {}
+    for name, (low, high) in ends.items():
+        i = known.names.index(name)
+        estimates[i] = _with_ends(estimates[i], known.scale[i], bool(known.logarithmic[i]), low, high)
+        notes.append(f"the interval of {name} follows from its profile likelihood, because the cost is not quadratic about it")
     return MachineFit(
         status=status,
         notes=(*problem.notes, *notes),
         scene=fitted_to,
         names=known.names,
         units=tuple(find_number(scene, name, "unknown").unit for name in known.names),
-        estimates=tuple(map(_estimate, known.values, known.scale, known.logarithmic, _spreads(known), known.determined)),
+        estimates=tuple(estimates),
         covariance=known.covariance,
         information=combined_information(fitted),
         undetermined=undetermined,
@@ -309,6 +313,13 @@ def _estimate(value: float, scale: float, logarithmic: bool, spread: float, dete
     if logarithmic:
         return Estimate(value, error, value * math.exp(-QUANTILE * spread), value * math.exp(QUANTILE * spread))
     return Estimate(value, error, value - QUANTILE * error, value + QUANTILE * error)
+
+
+def _with_ends(estimate: Estimate, scale: float, logarithmic: bool, low: float, high: float) -> Estimate:
+    """Return an estimate with the ends of its interval in its coordinate, relative to its value."""
+    if logarithmic:
+        return estimate._replace(low=estimate.value * math.exp(low), high=estimate.value * math.exp(high))
+    return estimate._replace(low=estimate.value + scale * low, high=estimate.value + scale * high)
 
 
 def _gains(fitted: Fitted) -> tuple[Estimate, ...]:

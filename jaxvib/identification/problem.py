@@ -10,16 +10,19 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
-from jaxvib.identification.response import GAUSS_POINTS, STRETCH, Samples, Unknowns, rotor_force, rows_of_channel, state_count
+from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import GravityField
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
+from jaxvib.numerics.noise import Noise, bounded, limited
+from jaxvib.runtime.programs import cached
 from jaxvib.units import Bounds, Number
 
 MOTIONS = ("acceleration", "velocity", "displacement", "force")
@@ -61,11 +64,13 @@ class Problem(NamedTuple):
     - `scene` with the known values; `unknowns`, see `Unknowns`
     - `runs`: the samples of each run, padded to whole stretches
     - of each run, without the padding: `masks` (n, C), True for samples that count; `raw` (n, C), readings without a filter;
-      `times` (n,), s; `angles` of the rotors (n, E), rad
+      `bounds` (n, C), 1 for readings clipped from above, -1 from below, otherwise 0; `times` (n,), s; `angles` of the rotors
+      (n, E), rad
+    - `rotors`: of each run, the angles of the rotors as functions of time
     - `means` and `precisions` (p,): known values of x, and 1/error^2, 0 for a free number
     - `marked`: True if the zero of the rotor's angle is the same mark in all runs
     - `unbalances`: for each exciter its known value, None if it is free
-    - `angle_errors`, rad: standard error of the rotor's angle in each run
+    - `angle_errors`, rad: standard error of the rotor's angle in each run, without the errors that are unknowns
     - `notes`: sentences for the reader
     """
 
@@ -74,8 +79,10 @@ class Problem(NamedTuple):
     runs: tuple[Samples, ...]
     masks: tuple[np.ndarray, ...]
     raw: tuple[np.ndarray, ...]
+    bounds: tuple[np.ndarray, ...]
     times: tuple[np.ndarray, ...]
     angles: tuple[np.ndarray, ...]
+    rotors: tuple[tuple[RotorAngle, ...], ...]
     means: np.ndarray
     precisions: np.ndarray
     marked: bool
@@ -161,7 +168,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     unknowns = Unknowns(tuple(moved), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns))
     cases = enumerate(zip(runs, angles, strict=True))
     prepared = [_samples(scene, run, angle, turns.index(k) if k in turns else None) for k, (run, angle) in cases]
-    samples, masks, raw, times, turned = zip(*prepared, strict=True)
+    samples, masks, raw, bounds, times, turned = zip(*prepared, strict=True)
     errors = np.concatenate([errors, list(gains.values()), np.full(len(turns), np.inf)])
     return Problem(
         scene,
@@ -169,8 +176,10 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
         samples,
         masks,
         raw,
+        bounds,
         times,
         turned,
+        tuple(map(tuple, angles)),
         means=np.concatenate([means, np.zeros(len(gains) + len(turns))]),
         precisions=1.0 / errors**2,
         marked=all(marked),
@@ -240,10 +249,29 @@ def _changed(scene: Scene, run: MeasuredRun) -> Scene:
     return scene
 
 
+def with_angle_errors(problem: Problem, runs: Sequence[bool]) -> Problem:
+    """Return the problem with the errors of the rotor's angle in the marked `runs` as further unknowns, standard normal."""
+    first, samples, left_out = problem.unknowns.count, list(problem.runs), list(problem.angle_errors)
+    count = 0
+    for k, (of_run, rotors, is_marked) in enumerate(zip(problem.runs, problem.rotors, runs, strict=True)):
+        if is_marked:
+            place, errors = first + count, max(rotor.errors for rotor in rotors)
+            drives = tuple(rotor.drive for rotor in rotors)
+            samples[k] = dataclasses.replace(of_run, drives=drives, errors=(place, errors))
+            left_out[k], count = max(rotor.left_out for rotor in rotors), count + errors
+    return problem._replace(
+        unknowns=dataclasses.replace(problem.unknowns, errors=count),
+        runs=tuple(samples),
+        means=np.concatenate([problem.means, np.zeros(count)]),
+        precisions=np.concatenate([problem.precisions, np.ones(count)]),
+        angle_errors=tuple(left_out),
+    )
+
+
 def _samples(
     scene: Scene, run: MeasuredRun, angles: Sequence[RotorAngle], turn: int | None
-) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the samples of a run, the mask, the readings, the times and the angles of the rotors."""
+) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the samples of a run, the mask, the readings, their bounds, the times and the angles of the rotors."""
     channels = run.of_kind(*MOTIONS)
     if not channels:
         raise InputError(run.source, f"has no channel of a motion; add a channel of kind {', '.join(MOTIONS)}")
@@ -259,9 +287,11 @@ def _samples(
         raise InputError(
             run.source, f"has {max(count, 0)} samples while the angle of the rotor is known; record more, or check the times"
         )
-    length = -(-count // STRETCH) * STRETCH
-    time = origin + step * (first + np.arange(length))
-    raw, mask = np.zeros((length, len(channels))), np.zeros((length, len(channels)), bool)
+    stretch = min(STRETCH, max(BLOCK, 2 ** math.ceil(math.log2(count))))
+    stretches = -(-count // stretch)
+    time = origin + step * (first + np.arange(count))
+    raw, mask = np.zeros((count, len(channels))), np.zeros((count, len(channels)), bool)
+    bounds = np.zeros((count, len(channels)), np.int8)
     for k, channel in enumerate(channels):
         values, clipped = run.values[channel.name], run.clipped[channel.name]
         place = (run.times[channel.name] - origin) / step - first
@@ -271,20 +301,17 @@ def _samples(
                 f"{run.source}: channel {channel.name!r}",
                 f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
             )
-        counts = np.isfinite(values) & ~clipped & (index >= 0) & (index < count)
-        raw[index[counts], k], mask[index[counts], k] = values[counts], True
-    force, turned = np.zeros((length, 4, 2 * len(angles))), np.zeros((length, len(angles)))
-    nodes = time[:count, None] + step * np.array([0.0, *GAUSS_POINTS])
-    nodes[-1] = np.minimum(nodes[-1], nodes[-1, 0])  # the last step begins at the last sample, and its force is not used
-    for k, (angle, exciter) in enumerate(zip(angles, scene.exciters, strict=True)):
-        theta, rate, acceleration = angle.at(nodes)
-        force[:count, :, 2 * k : 2 * k + 2] = rotor_force(theta, rate, acceleration, exciter.direction)
-        turned[:count, k] = theta[:, 0]
+        counts = np.isfinite(values) & (index >= 0) & (index < count)
+        raw[index[counts], k], mask[index[counts], k] = values[counts], ~clipped[counts]
+        bounded_by = index[counts & clipped]
+        bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(raw[:, k]))
     numbers, actions, amounts = _changes(scene, run)
     samples = Samples(
-        force=jnp.asarray(force.reshape(-1, STRETCH, *force.shape[1:])),
-        readings=jnp.zeros((length // STRETCH, STRETCH, len(channels))),
-        weights=jnp.zeros((length // STRETCH, STRETCH, len(channels))),
+        drives=tuple(angle.without_errors() for angle in angles),
+        begin=jnp.asarray(time[0]),
+        end=jnp.asarray(time[-1]),
+        readings=jnp.zeros((stretches, stretch, len(channels))),
+        weights=jnp.zeros((stretches, stretch, len(channels))),
         taps=jnp.ones((1, len(channels))),
         step=jnp.asarray(step),
         amounts=jnp.asarray(np.array(amounts)),
@@ -293,34 +320,47 @@ def _samples(
         actions=tuple(actions),
         turn=turn,
     )
-    return samples, mask[:count], raw[:count], time[:count], turned[:count]
+    return samples, mask, raw, bounds, time, np.stack([angle.at(time) for angle in angles], axis=1)
 
 
-def with_noise(problem: Problem, filters: Sequence[Sequence[np.ndarray]], noise: Sequence[np.ndarray]) -> Problem:
+def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: Sequence[np.ndarray] | None = None) -> Problem:
     """Return the problem with readings and models filtered such that the noise of the readings is white.
 
-    **Arguments**: for each run and channel, the `filters` (1, a_1, ...), and the standard deviation of the white noise.
+    **Arguments**: `noise` of the channels of each run; `differences` (n, C) of each run: readings minus model at the last
+    values, from which the influence of outliers and of clipped readings follows; None if there are no last values.
     """
     runs = []
-    for samples, mask, raw, own, deviations in zip(problem.runs, problem.masks, problem.raw, filters, noise, strict=True):
+    for r, (samples, mask, raw, own) in enumerate(zip(problem.runs, problem.masks, problem.raw, noise, strict=True)):
         delayed = any(channel.delay != 0.0 for channel in samples.channels)
-        data, model = [], []
-        for channel, taps in zip(samples.channels, own, strict=True):
+        filters = []
+        for channel, each in zip(samples.channels, own, strict=True):
             shift, lag = (np.ones(1), np.ones(1)) if not delayed else _delay_taps(channel.delay / float(samples.step))
-            data.append(np.convolve(taps, shift))
-            model.append(np.convolve(taps, lag))
-        longest = next(n for n in _FILTER_LENGTHS if n >= max(map(len, [*data, *model])))
+            filters.append((np.convolve(each.taps, shift), np.convolve(each.taps, lag)))
+        longest = next(n for n in _FILTER_LENGTHS if n >= max(len(taps) for pair in filters for taps in pair))
         shape, n = samples.readings.shape, raw.shape[0]
         readings, weights = np.zeros((shape[0] * shape[1], raw.shape[1])), np.zeros((shape[0] * shape[1], raw.shape[1]))
-        for k, (taps, deviation) in enumerate(zip(data, deviations, strict=True)):
-            readings[:n, k] = np.convolve(raw[:, k], taps)[:n]
+        for k, ((data, model), each) in enumerate(zip(filters, own, strict=True)):
+            readings[:n, k] = np.convolve(raw[:, k], data)[:n]
             valid = mask[:, k].copy()
-            for j in np.flatnonzero(taps):
+            for j in np.flatnonzero(data):
                 if j:
                     valid[j:] &= mask[:-j, k]
-            valid[: max(len(data[k]), len(model[k])) - 1] = False
-            weights[:n, k] = valid / deviation
-        padded = np.stack([np.pad(taps, (0, longest - len(taps))) for taps in model], axis=1)
+            valid[: max(len(data), len(model)) - 1] = False
+            weights[:n, k] = valid / each.deviation
+            if differences is None:
+                continue
+            if each.outliers:
+                white = np.convolve(differences[r][:, k], data)[:n] / each.deviation
+                moved, factor = limited(white, valid, each.outliers, each.width)
+                readings[:n, k] += np.where(valid, each.deviation * (moved - white), 0.0)
+                weights[:n, k] /= factor
+            if longest == 1:  # the bound of a reading says little if the noise has a memory
+                at = np.flatnonzero(problem.bounds[r][:, k])
+                side = problem.bounds[r][at, k]
+                moved, weight = bounded(side * differences[r][at, k] / each.deviation)
+                readings[at, k] += side * each.deviation * moved - differences[r][at, k]
+                weights[at, k] = weight / each.deviation
+        padded = np.stack([np.pad(taps, (0, longest - len(taps))) for _, taps in filters], axis=1)
         runs.append(
             dataclasses.replace(
                 samples,
@@ -346,10 +386,16 @@ def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
     return np.eye(_DELAY_MARGIN + 1)[-1], np.concatenate([np.zeros(base), weights])
 
 
+@cached
+def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
+    """Return the matrices of mass, damping and stiffness."""
+    model = linear_model(scene)
+    return model.mass, model.carrier.damping, model.carrier.stiffness
+
+
 def natural(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return the natural frequencies (k,) rad/s and damping ratios (k,) of the damped modes with complex eigenvalues."""
-    model = linear_model(scene)
-    mass, damping, stiffness = (np.asarray(each) for each in (model.mass, model.carrier.damping, model.carrier.stiffness))
+    mass, damping, stiffness = (np.asarray(each) for each in _matrices(scene))
     nd = mass.shape[0]
     flow = np.block([[np.zeros((nd, nd)), np.eye(nd)], [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)]])
     poles = np.linalg.eigvals(flow)

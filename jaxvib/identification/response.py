@@ -11,7 +11,8 @@ the state at the samples is exact for the machine; three Gauss points per step i
 The steps are computed in blocks: all blocks of a stretch of the record at once from zero, then the starts of the blocks from
 one another, then their contributions. Readings are linear in the unknowns of `LINEAR` order: the state at the first sample,
 the two components (a, b) of each unbalance, and the offsets. Derivatives by all other unknowns are forward derivatives of the
-same steps. The normal equations of a whole record are summed over stretches, which bounds the memory.
+same steps; those by errors of a rotor's angle (`RecordedDrive`) are responses to the changes of the force. The normal equations
+of a whole record are summed over stretches, which bounds the memory.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.model import assemble
+from jaxvib.identification.angle import RecordedDrive
 from jaxvib.identification.records.channel import Channel
+from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.numbers.named import NamedNumber, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
@@ -36,9 +39,9 @@ GAUSS_POINTS = 0.5 + np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.15)
 _GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 STRETCH = 4096
-"""Number of samples whose derivatives are in memory at once."""
+"""Largest number of samples whose derivatives are in memory at once."""
 
-_BLOCK = 64
+BLOCK = 64
 """Number of steps of a block."""
 
 
@@ -49,7 +52,7 @@ class Unknowns(eqx.Module):
 
     **Attributes**: `numbers` of the scene; `first` and `scale` (n,) of each single number, `positive` (n,); `gains`: names of
     the channels whose gains are unknown, exp(x) each, behind the numbers; `turns`: number of runs whose rotor angle has an
-    unknown zero, rad, behind the gains.
+    unknown zero, rad, behind the gains; `errors`: number of errors of rotor angles, in standard errors, behind the turns.
     """
 
     numbers: tuple[NamedNumber, ...] = eqx.field(static=True)
@@ -58,11 +61,12 @@ class Unknowns(eqx.Module):
     positive: Array
     gains: tuple[str, ...] = eqx.field(static=True)
     turns: int = eqx.field(static=True)
+    errors: int = eqx.field(static=True, default=0)
 
     @property
     def count(self) -> int:
         """Number of all unknowns."""
-        return self.first.shape[0] + len(self.gains) + self.turns
+        return self.first.shape[0] + len(self.gains) + self.turns + self.errors
 
     def values(self, x: Array | np.ndarray) -> Array:
         """Return the values (n,) of the scene's numbers, SI."""
@@ -83,16 +87,20 @@ class Samples(eqx.Module):
 
     **Attributes** (N stretches of n samples, C channels, E exciters)
 
-    - `force` (N, n, 4, 2 E): F of each exciter, (horizontal, up), at the sample and at the three Gauss points after it
+    - `drives`: for each exciter the drive that turns its rotor in this run
+    - `begin` and `end`, s: times of the first and the last sample
     - `readings` (N, n, C): readings after the filter `data_filter` of `whitened`
     - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
     - `taps` (m + 1, C): filter of the model's readings
     - `step` h, s
     - `amounts`: what the run adds to, sets or multiplies the numbers `changed` of the scene by
     - `channels` that are compared, `changed` and `actions`, `turn`: index of the run's unknown zero of the angle, or None
+    - `errors`: place of the first error of the rotor's angle among the unknowns, and their number
     """
 
-    force: Array
+    drives: tuple[Drive, ...]
+    begin: Array
+    end: Array
     readings: Array
     weights: Array
     taps: Array
@@ -102,6 +110,7 @@ class Samples(eqx.Module):
     changed: tuple[NamedNumber, ...] = eqx.field(static=True)
     actions: tuple[str, ...] = eqx.field(static=True)
     turn: int | None = eqx.field(static=True)
+    errors: tuple[int, int] = eqx.field(static=True, default=(0, 0))
 
     def scene(self, scene: Scene) -> Scene:
         """Return the scene as it was in this run."""
@@ -120,14 +129,6 @@ class _Steps(NamedTuple):
     inputs: Array
     outputs: Array
     through: Array
-
-
-def rotor_force(angle: Any, speed: Any, acceleration: Any, direction: int) -> Any:
-    """Return F = -p'' (..., 2), horizontal and up, per unit of the unbalance, from NumPy or JAX arrays (...) of its motion."""
-    xp = np if isinstance(angle, np.ndarray) else jnp
-    cos, sin = xp.cos(direction * angle), xp.sin(direction * angle)
-    turned = direction * acceleration
-    return xp.stack([speed**2 * cos + turned * sin, speed**2 * sin - turned * cos], axis=-1)
 
 
 def state_count(scene: Scene, channels: tuple[Channel, ...]) -> int:
@@ -206,17 +207,17 @@ def _march(power: Array, forcing: Array, start: Array) -> tuple[Array, Array]:
     **Arguments**: `forcing` (n, ns, m), `start` (ns, m); n is a multiple of the length of a block.
     """
     n, ns, m = forcing.shape
-    blocks = jnp.moveaxis(forcing.reshape(n // _BLOCK, _BLOCK, ns, m), 1, 0)
+    blocks = jnp.moveaxis(forcing.reshape(n // BLOCK, BLOCK, ns, m), 1, 0)
 
     def within(x: Array, w: Array) -> tuple[Array, Array]:
         return jnp.einsum("ij,bjm->bim", power, x) + w, x
 
-    ends, local = jax.lax.scan(within, jnp.zeros((n // _BLOCK, ns, m)), blocks)
+    ends, local = jax.lax.scan(within, jnp.zeros((n // BLOCK, ns, m)), blocks)
 
     def multiplied(p: Array, _: None) -> tuple[Array, Array]:
         return power @ p, p
 
-    whole, powers = jax.lax.scan(multiplied, jnp.eye(ns), None, length=_BLOCK)
+    whole, powers = jax.lax.scan(multiplied, jnp.eye(ns), None, length=BLOCK)
 
     def between(x: Array, end: Array) -> tuple[Array, Array]:
         return whole @ x + end, x
@@ -263,10 +264,37 @@ def _filtered(taps: Array, before: Array, values: Array) -> tuple[Array, Array]:
 def _built(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Steps:
     """Return the steps of a run, with the gains of its channels, at the unknowns `x`."""
     own = samples.scene(unknowns.scene(scene, x))
-    turn = 0.0 if samples.turn is None else x[x.shape[0] - unknowns.turns + samples.turn]
+    turn = 0.0 if samples.turn is None else x[unknowns.first.shape[0] + len(unknowns.gains) + samples.turn]
     steps = _steps(own, samples.channels, samples.step, turn)
     gains = jnp.stack([jnp.asarray(unknowns.gain(x, channel.name)) for channel in samples.channels])
     return steps._replace(outputs=gains[:, None] * steps.outputs, through=gains[:, None, None, None] * steps.through)
+
+
+def _forces(samples: Samples, scene: Scene, x: Array, stretch: Array) -> tuple[Array, Array]:
+    """Return F (n, 4, 2 E) of each exciter, (horizontal, up), at the samples of a stretch and at the three Gauss points after
+    each, and its derivatives (m, n, 4, 2) by the errors of the rotor's angle."""
+    first, count = samples.errors
+    n = samples.readings.shape[1]
+    places = (stretch * n + jnp.arange(n))[:, None] + jnp.asarray([0.0, *GAUSS_POINTS])[None]
+    times = jnp.minimum(samples.begin + samples.step * places, samples.end).ravel()
+    forces, changes = [], jnp.zeros((0, n, 4, 2))
+    for drive, exciter in zip(samples.drives, scene.exciters, strict=True):
+        own = drive.with_errors(x[first : first + count]) if count and isinstance(drive, RecordedDrive) else drive
+        theta = jax.vmap(lambda t, own=own: own.rotor_angle(t, None))(times)
+        rate = jax.vmap(lambda t, own=own: own.rotor_speed(t, None))(times)
+        acceleration: Any = jax.vmap(own.rotor_acceleration)(times)
+        turning = 1j * exciter.direction
+        unit = jnp.exp(turning * theta)
+        forces.append((rate**2 - turning * acceleration) * unit)
+        if count and isinstance(own, RecordedDrive):  # the scene has one exciter
+            error, error_rate, error_acceleration = (
+                jax.vmap(lambda t, k=k, own=own: own.columns_at(t, k)[1:], out_axes=1)(times) for k in range(3)
+            )
+            change = 2.0 * rate[None] * error_rate - turning * error_acceleration
+            found = change * unit[None] + turning * error * forces[0][None]
+            changes = jnp.stack([found.real, found.imag], axis=-1).reshape(count, n, 4, 2)
+    both = [part for force in forces for part in (force.real, force.imag)]
+    return jnp.stack(both, axis=-1).reshape(n, 4, len(both)), changes
 
 
 def _linear_columns(steps: _Steps, samples: Samples):
@@ -292,13 +320,14 @@ def linear_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
     first, columns = _linear_columns(_built(unknowns, samples, scene, x), samples)
 
     def stretch(carry, part):
-        (state, total), (force, readings, weights) = carry, part
-        state, found = columns(state, force)
+        (state, total), (k, readings, weights) = carry, part
+        state, found = columns(state, _forces(samples, scene, x, k)[0])
         z = (jnp.concatenate([found, readings[:, :, None]], axis=2) * weights[:, :, None]).reshape(-1, found.shape[2] + 1)
         return (state, total + z.T @ z), None
 
     size = first[0].shape[1] + len(samples.channels) + 1
-    (_, total), _ = jax.lax.scan(stretch, (first, jnp.zeros((size, size))), (samples.force, samples.readings, samples.weights))
+    parts = jnp.arange(samples.readings.shape[0]), samples.readings, samples.weights
+    (_, total), _ = jax.lax.scan(stretch, (first, jnp.zeros((size, size))), parts)
     return total
 
 
@@ -310,33 +339,42 @@ def normal_equations(unknowns: Unknowns, samples: Samples, scene: Scene, x: Arra
     """
     steps = _built(unknowns, samples, scene, x)
     first, columns = _linear_columns(steps, samples)
-    state, unbalance, _ = _split(steps, linear)
-    unit = jnp.eye(x.shape[0])
+    _, unbalance, _ = _split(steps, linear)
+    place, errors = samples.errors
+    moved = x.shape[0] - unknowns.errors
 
     def tangent(direction: Array) -> _Steps:
         return jax.jvp(lambda at: _built(unknowns, samples, scene, at), (x,), (direction,))[1]
 
-    changes = jax.vmap(tangent)(unit)
+    changes = jax.vmap(tangent)(jnp.eye(x.shape[0])[:moved])
 
     def stretch(carry, part):
-        (linear_state, (at, moved, before), total), (force, readings, weights) = carry, part
+        (linear_state, (moving, turning, before), total), (k, readings, weights) = carry, part
+        force, pushes = _forces(samples, scene, x, k)
+        at = linear_state[0] @ linear[: linear_state[0].shape[1]]
         linear_state, found = columns(linear_state, force)
 
-        def along(change: _Steps, start: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-            return jax.jvp(lambda steps, start: _response(steps, force, start, unbalance), (steps, at), (change, start))
+        def along(change: _Steps, start: Array) -> tuple[Array, Array]:
+            return jax.jvp(lambda steps, start: _response(steps, force, start, unbalance), (steps, at), (change, start))[1]
 
-        (_, ends), (slopes, turned) = jax.vmap(along)(changes, moved)
+        slopes, moving = jax.vmap(along)(changes, moving)
+        if errors:
+            by_error, turning = jax.vmap(lambda push, start: _response(steps, push, start, unbalance))(pushes, turning)
+            others = jnp.zeros((unknowns.errors, *slopes.shape[1:]))
+            slopes = jnp.concatenate([slopes, others.at[place - moved : place - moved + errors].set(by_error)])
+        elif unknowns.errors:
+            slopes = jnp.concatenate([slopes, jnp.zeros((unknowns.errors, *slopes.shape[1:]))])
         slopes, after = _filtered(samples.taps, before, jnp.moveaxis(slopes, 0, 2))
         left = readings - found @ linear
         z = jnp.concatenate([slopes, found, left[:, :, None]], axis=2) * weights[:, :, None]
         z = z.reshape(-1, z.shape[2])
-        return (linear_state, (ends[0], turned, after), total + z.T @ z), None
+        return (linear_state, (moving, turning, after), total + z.T @ z), None
 
-    count, size = x.shape[0], x.shape[0] + linear.shape[0] + 1
+    count, size, states = x.shape[0], x.shape[0] + linear.shape[0] + 1, steps.power.shape[0]
     before = jnp.zeros((samples.taps.shape[0] - 1, len(samples.channels), count))
-    start = (first, (state, jnp.zeros((count, state.shape[0])), before), jnp.zeros((size, size)))
+    start = (first, (jnp.zeros((moved, states)), jnp.zeros((errors, states)), before), jnp.zeros((size, size)))
     # Reverse derivatives compute each stretch again and keep only the states between the stretches.
-    parts = samples.force, samples.readings, samples.weights
+    parts = jnp.arange(samples.readings.shape[0]), samples.readings, samples.weights
     (_, _, total), _ = jax.lax.scan(jax.checkpoint(stretch), start, parts)
     return total
 
@@ -347,11 +385,11 @@ def model_readings(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array,
     steps = _built(unknowns, samples, scene, x)
     state, unbalance, offsets = _split(steps, linear)
 
-    def stretch(state: Array, force: Array) -> tuple[Array, Array]:
-        readings, state = _response(steps, force, state, unbalance)
+    def stretch(state: Array, k: Array) -> tuple[Array, Array]:
+        readings, state = _response(steps, _forces(samples, scene, x, k)[0], state, unbalance)
         return state, readings
 
-    _, found = jax.lax.scan(stretch, state, samples.force)
+    _, found = jax.lax.scan(stretch, state, jnp.arange(samples.readings.shape[0]))
     return found.reshape(-1, found.shape[2]) + offsets[None]
 
 

@@ -1,10 +1,157 @@
-"""Noise of measured samples: autoregressive models of it, and uncertainties of least-squares fits under coloured noise."""
+"""Noise of measured samples: its autoregressive models, outliers, bounds, and uncertainties of fits under coloured noise.
+
+Outliers and bounds enter a least-squares fit by other residuals. With the score psi of a residual e (derivative of its
+logarithmic probability), a fit of the residuals psi(e)/mean(psi') with the standard deviation sqrt(mean(psi^2))/mean(psi') has
+the minimum of the largest probability, and the covariance of a fit with this score (Huber 1981).
+"""
 
 from __future__ import annotations
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 
 _MAX_ORDER = 40
+
+_EXPECTATIONS = 40
+"""Number of iterations of expectation and maximization for the distribution of outliers."""
+
+_MAX_COMPARED = 100_000
+"""Largest number of residuals whose distribution is compared."""
+
+_OUTLIER_DISTANCE = 6.0
+"""Distance of an outlier from the samples around it, in standard deviations."""
+
+_NEIGHBORS = 2
+"""Number of samples on each side of an outlier with which it is compared."""
+
+
+class Noise(NamedTuple):
+    """Noise of the readings of a channel: the filter `taps` (1, a_1, ...) that turns it into white noise of the standard
+    `deviation`, but for a share of `outliers` whose standard deviation is larger by the factor `width`."""
+
+    taps: np.ndarray
+    deviation: float
+    outliers: float = 0.0
+    width: float = 1.0
+
+
+def noise_of(residual: np.ndarray) -> Noise:
+    """Return the noise of residuals (n,), NaN for samples to leave out.
+
+    >>> rng = np.random.default_rng(0)
+    >>> noise = rng.normal(size=8000)
+    >>> noise_of(noise).outliers
+    0.0
+    >>> noise[::50] += rng.normal(size=160) * 20.0
+    >>> found = noise_of(noise)
+    >>> found.taps.tolist(), round(found.outliers, 2), bool(0.95 < found.deviation < 1.05)
+    ([1.0], 0.02, True)
+    """
+    taps, deviation = autoregression(residual, ~is_outlier(residual))
+    white = np.convolve(np.where(np.isfinite(residual), residual, 0.0), taps)[: residual.size]
+    valid = np.convolve(~np.isfinite(residual), np.ones(len(taps)))[: residual.size] < 0.5
+    core, share, width = outliers_of(white[valid][len(taps) - 1 :])
+    return Noise(taps, core, share, width) if share > 0.0 else Noise(taps, deviation)
+
+
+def is_outlier(residual: np.ndarray) -> np.ndarray:
+    """Return True for samples (n,) far from the median of the samples around them.
+
+    >>> residual = np.random.default_rng(0).normal(size=1000)
+    >>> residual[[200, 500]] = 50.0
+    >>> np.flatnonzero(is_outlier(residual)).tolist()
+    [200, 500]
+    """
+    known = np.where(np.isfinite(residual), residual, 0.0)
+    if np.max(np.abs(known), initial=0.0) <= _OUTLIER_DISTANCE * _spread(known):
+        return np.zeros(residual.size, bool)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(known, _NEIGHBORS, mode="edge"), 2 * _NEIGHBORS + 1)
+    away = known - np.median(around, axis=1)
+    return np.abs(away) > _OUTLIER_DISTANCE * max(_spread(away), 1e-300)
+
+
+def _spread(values: np.ndarray) -> float:
+    """Return the standard deviation that normal values with this median of their sizes have."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def outliers_of(white: np.ndarray) -> tuple[float, float, float]:
+    """Return the standard deviation of white noise without outliers, the share of the outliers, and their standard deviation
+    relative to that of the others; a share of 0 if the normal distribution is as probable.
+
+    >>> rng = np.random.default_rng(0)
+    >>> white = rng.normal(size=4000)
+    >>> outliers_of(white)[1]
+    0.0
+    >>> white[:80] *= 20.0
+    >>> deviation, share, width = outliers_of(white)
+    >>> bool(abs(deviation - 1.0) < 0.05), bool(0.015 < share < 0.025), bool(15.0 < width < 25.0)
+    (True, True, True)
+    """
+    white = white[:: -(-white.size // _MAX_COMPARED) or 1]
+    variance = float(np.mean(white**2)) if white.size else 0.0
+    if variance == 0.0 or float(np.mean(white**4)) < (3.0 + 3.0 * math.sqrt(24.0 / white.size)) * variance**2:
+        return math.sqrt(variance), 0.0, 1.0
+    plain = -0.5 * white.size * (1.0 + math.log(variance)) + math.log(white.size)
+    core, share, width = max(_spread(white), 1e-3 * math.sqrt(variance)), 0.05, 5.0
+    for _ in range(_EXPECTATIONS):
+        outlying = _outlying(white / core, share, width)
+        share = float(np.mean(outlying))
+        core = math.sqrt(float(np.sum((1.0 - outlying) * white**2)) / (white.size * (1.0 - share)))
+        width = max(math.sqrt(float(np.sum(outlying * white**2)) / (white.size * max(share, 1e-12))) / core, 1.5)
+    square = (white / core) ** 2
+    mixed = np.logaddexp(math.log(1.0 - share) - 0.5 * square, math.log(max(share, 1e-300) / width) - 0.5 * square / width**2)
+    if float(np.sum(mixed)) - white.size * math.log(core) < plain:
+        return math.sqrt(variance), 0.0, 1.0
+    return core, share, width
+
+
+def _outlying(relative: np.ndarray, share: float, width: float) -> np.ndarray:
+    """Return the probabilities (n,) that residuals, relative to the standard deviation of the others, are outliers."""
+    exponent = 0.5 * relative**2 * (1.0 - 1.0 / width**2)
+    return 1.0 / (1.0 + (1.0 - share) / max(share, 1e-300) * width * np.exp(-np.minimum(exponent, 700.0)))
+
+
+def limited(relative: np.ndarray, counts: np.ndarray, share: float, width: float) -> tuple[np.ndarray, float]:
+    """Return residuals (n,) for a least-squares fit in which outliers have little influence, and their standard deviation.
+
+        psi(e) = e (1 - c P(e)),      c = 1 - 1/width^2
+
+    P(e) is the probability that a residual is an outlier.
+
+    **Arguments**: `relative` e, residuals relative to the standard deviation of those that are no outliers; `counts` (n,):
+    False for samples to leave out; `share` and `width` of the outliers, see `outliers_of`.
+
+    >>> moved, deviation = limited(np.array([-1.0, 0.1, 1.0, 50.0]), np.ones(4, bool), 0.02, 20.0)
+    >>> bool(abs(moved[3]) < 0.2), bool(moved[2] > 1.0)
+    (True, True)
+    """
+    outlying, factor = _outlying(relative, share, width), 1.0 - 1.0 / width**2
+    score = relative * (1.0 - factor * outlying)
+    slope = 1.0 - factor * outlying - (factor * relative) ** 2 * outlying * (1.0 - outlying)
+    mean = float(np.mean(slope[counts]))
+    return score / mean, math.sqrt(float(np.mean(score[counts] ** 2))) / mean
+
+
+def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals (n,) and weights (n,) of readings that are known to lie above a bound.
+
+        psi = phi(z)/Phi(z),      -psi' = psi (psi + z),      z = -excess
+
+    **Arguments**: `excess` of the bound over the model, in standard deviations of the normal noise.
+
+    >>> moved, weight = bounded(np.array([-8.0, 0.0, 40.0]))
+    >>> np.round(moved * weight**2, 1).tolist(), np.round(weight, 2).tolist()    # scores and weights
+    ([0.0, 0.8, 40.0], [0.0, 0.8, 1.0])
+    """
+    from scipy.special import log_ndtr  # slow to import
+
+    z = -np.maximum(np.asarray(excess, float), -30.0)
+    ratio = np.exp(-0.5 * z**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(z))
+    sum_of = np.where(z < -20.0, 1.0 / np.maximum(-z, 1.0), ratio + z)
+    return 1.0 / sum_of, np.sqrt(ratio * sum_of)
 
 
 def autoregression(residual: np.ndarray, counts: np.ndarray | None = None, most: int = _MAX_ORDER) -> tuple[np.ndarray, float]:

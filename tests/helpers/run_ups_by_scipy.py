@@ -1,7 +1,10 @@
 """Run-ups of two masses with one unbalance, integrated by SciPy, with noise: records for identification."""
 
+import functools
+
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 import jaxvib as jv
 from jaxvib.identification.run import parse_change
@@ -52,6 +55,85 @@ def accelerations(times, cases, phase=0.4, turning=ramp):
     return np.moveaxis(slopes.reshape(4, len(cases), -1)[2:], 0, -1)
 
 
+def motor_run_up(times, case, stall=1.6, no_load=120.0, inertia=0.1, phase=0.4):
+    """Return accelerations (n, 2) of both masses, and the angle, speed and acceleration of the rotor as a function of time.
+
+    A motor with a straight line of torque over speed drives the rotor; its speed dips at the resonances.
+    """
+    m1, m2, k1, k2, c1, c2, k, c, s = case.values()
+
+    def rates(t, y):
+        x1, x2, theta, v1, v2, speed = y
+        link = k * (x1 - x2) + c * (v1 - v2)
+        cos, sin = s * np.cos(theta + phase), s * np.sin(theta + phase)
+        # m2 a + cos theta'' = sin speed^2 - supports;  cos a + inertia theta'' = torque
+        right = speed**2 * sin - k2 * x2 - c2 * v2 + link, stall * (1.0 - speed / no_load)
+        change = (m2 * right[1] - cos * right[0]) / (m2 * inertia - cos**2)
+        return np.array([v1, v2, speed, (-k1 * x1 - c1 * v1 - link) / m1, (right[0] - cos * change) / m2, change])
+
+    run = solve_ivp(rates, (times[0], times[-1]), np.zeros(6), "DOP853", dense_output=True, rtol=1e-10, atol=1e-12)
+    slopes = np.array([rates(t, y) for t, y in zip(times, run.sol(times).T, strict=True)])
+
+    def turning(t):
+        states = run.sol(t)
+        change = (
+            rates(t, states)[5] if np.ndim(t) == 0 else np.array([rates(*each)[5] for each in zip(t, states.T, strict=True)])
+        )
+        return states[2], states[5], change
+
+    return slopes[:, 3:5], turning
+
+
+def free_motions(times, case):
+    """Return the accelerations (n, 2) of free motions from each unit state."""
+    m1, m2, k1, k2, c1, c2, k, c, _ = case.values()
+    flow = np.zeros((4, 4))
+    flow[:2, 2:] = np.eye(2)
+    flow[2:] = -np.array([[k1 + k, -k, c1 + c, -c], [-k, k2 + k, -c, c2 + c]]) / np.array([[m1], [m2]])
+    poles, shapes = np.linalg.eig(flow)
+    free = np.einsum("ij,tj,jk->tik", shapes, np.exp(times[:, None] * poles), np.linalg.inv(shapes))
+    return list(np.einsum("ai,tik->kta", flow[2:], free).real)
+
+
+def bound(times, names, noise, color=0.0, gain_error=0.0, turning=ramp, phase=0.4):
+    """Return the Cramer-Rao bound of the relative standard errors of numbers `names`.
+
+    The derivatives are differences of SciPy's run-ups. The states at the first sample, the offsets and the phase of the
+    unbalance are free. The noise is that of `record`.
+    """
+    step = 1e-4
+    cases = [TRUTH | {name: TRUTH[name] * (1.0 + s * step)} for name in names for s in (1.0, -1.0)]
+    both = accelerations(times, cases, phase, turning).reshape(len(names), 2, times.size, 2)
+    columns = [(high - low) / (2.0 * step) for high, low in both]
+    turned = accelerations(times, [TRUTH], phase + step, turning) - accelerations(times, [TRUTH], phase - step, turning)
+    columns.append(turned[0] / (2.0 * step))
+    columns += free_motions(times, TRUTH)
+    columns += [np.tile([1.0, 0.0], (times.size, 1)), np.tile([0.0, 1.0], (times.size, 1))]
+    readings = accelerations(times, [TRUTH], phase, turning)[0]
+    columns += [readings * each for each in np.eye(2)] if gain_error else []
+    slopes = np.stack(columns, axis=-1)
+    slopes[1:] -= color * slopes[:-1]
+    slopes[0] *= np.sqrt(1.0 - color**2)
+    slopes = slopes.reshape(-1, slopes.shape[-1]) / (noise * np.sqrt(1.0 - color**2))
+    information = slopes.T @ slopes
+    if gain_error:
+        information[-2:, -2:] += np.eye(2) / gain_error**2
+    return np.sqrt(np.diagonal(np.linalg.inv(information))[: len(names)])
+
+
+def noise_like(size, noise, rng, color=0.0, outliers=0.0):
+    """Return noise of a standard deviation with the correlation `color` of neighbours, and a share of `outliers`.
+
+    The outliers are normal with twenty times the standard deviation.
+    """
+    found = rng.normal(size=size)
+    if color:
+        found = np.asarray(lfilter([np.sqrt(1.0 - color**2)], [1.0, -color], np.concatenate([rng.normal(size=200), found])))[
+            200:
+        ]
+    return noise * (found + 20.0 * rng.normal(size=size) * (rng.random(size) < outliers))
+
+
 def scene_of(numbers):
     """Return the scene with numbers as `TRUTH`, under a motor whose speed is not known."""
     mass, stiffness, damping = ([numbers[f"machine.{name}[{k}]"] for k in (0, 1)] for name in ("mass", "stiffness", "damping"))
@@ -63,23 +145,43 @@ def scene_of(numbers):
     return jv.Scene(machine, exciters=[jv.Exciter(drive=motor, unbalance=numbers["exciters[0].unbalance"], at=2)])
 
 
-def record(times, clean, noise, rng, gain_error=0.0, pulses=24, jitter=0.0, turning=ramp, change=None):
-    """Return a run of two accelerometers with white `noise`, m/s^2, and a tachometer with `pulses` per turn."""
-    channels = [jv.Channel(f"a{k + 1}", "acceleration", at=k + 1, gain_error=gain_error) for k in (0, 1)]
-    fine = np.linspace(times[0], times[-1], 200001)
+@functools.cache
+def pulse_times(turning, end, pulses):
+    """Return the numbers and the times of the pulses until the time `end` of a rotor that starts at the angle 0."""
+    fine = np.linspace(0.0, end, 20001)
     angle = turning(fine)[0]
-    numbers = np.arange(np.ceil(angle[0] * pulses / (2 * np.pi)), np.floor(angle[-1] * pulses / (2 * np.pi)) + 1)
-    edges = np.interp(numbers * 2 * np.pi / pulses, angle, fine) + jitter * rng.normal(size=numbers.size)
+    numbers = np.arange(1.0, np.floor(angle[-1] * pulses / (2.0 * np.pi)) + 1.0)
+    edges = np.interp(numbers * 2.0 * np.pi / pulses, angle, fine)
+    for _ in range(3):
+        theta, speed = turning(edges)[:2]
+        edges = edges - (theta - numbers * 2.0 * np.pi / pulses) / speed
+    return numbers, edges
+
+
+def record(
+    times, clean, noise, rng, gain_error=0.0, pulses=24, resolution=0.0, turning=ramp, change=None, color=0.0, outliers=0.0,
+    full_scale=None,
+):  # fmt: skip
+    """Return a run of two accelerometers with noise, m/s^2, see `noise_like`, and a tachometer with `pulses` per turn.
+
+    `gain_error`: gains are drawn with this relative error. `resolution`, s: the times of the pulses are rounded to multiples of
+    it. Readings beyond `full_scale` are clipped.
+    """
+    channels = [jv.Channel(f"a{k + 1}", "acceleration", at=k + 1, gain_error=gain_error) for k in (0, 1)]
+    numbers, edges = pulse_times(turning, float(times[-1]), pulses)
+    if resolution:
+        edges = resolution * np.round(edges / resolution + rng.random() - 0.5)
     gains = 1.0 + gain_error * rng.normal(size=2)
-    data = {f"a{k + 1}": gains[k] * clean[:, k] + noise * rng.normal(size=times.size) + 0.1 for k in (0, 1)}
-    values = {**data, "tacho": numbers}
-    clipped = {name: np.zeros(len(each), bool) for name, each in values.items()}
+    readings = [gains[k] * clean[:, k] + noise_like(times.size, noise, rng, color, outliers) + 0.1 for k in (0, 1)]
+    most = np.inf if full_scale is None else full_scale
+    data = {f"a{k + 1}": np.clip(each, -most, most) for k, each in enumerate(readings)}
+    clipped = {name: np.abs(each) >= most for name, each in data.items()}
     channels = (*channels, jv.Channel("tacho", "pulses", per_turn=pulses))
     return jv.MeasuredRun(
         channels,
         {"a1": times, "a2": times, "tacho": edges},
-        values,
-        clipped,
+        {**data, "tacho": numbers},
+        {**clipped, "tacho": np.zeros(numbers.size, bool)},
         {name: parse_change(each, name) for name, each in (change or {}).items()},
         (),
         "run",

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_ups_by_scipy import TOP, TRUTH, accelerations, ramp, record, scene_of
+from run_ups_by_scipy import TOP, TRUTH, accelerations, bound, free_motions, ramp, record, scene_of
 
 import jaxvib as jv
 
@@ -65,25 +65,9 @@ def test_model_agrees_with_scipy_without_noise():
 
 
 def test_errors_are_those_of_the_cramer_rao_bound():
-    """The derivatives are differences of SciPy's run-ups; states at the first sample and offsets are free."""
-    fit, step = fitted(), 1e-4
-    cases = [TRUTH | {name: TRUTH[name] * (1.0 + s * step)} for name in fit.names for s in (1.0, -1.0)]
-    both = accelerations(T, cases).reshape(len(fit.names), 2, T.size, 2)
-    columns = [((high - low) / (2.0 * step)).ravel() for high, low in both]
-    turned = accelerations(T, [TRUTH], phase=0.4 + step) - accelerations(T, [TRUTH], phase=0.4 - step)
-    columns.append((turned[0] / (2.0 * step)).ravel())
-    m1, m2, k1, k2, c1, c2, k, c, _ = TRUTH.values()
-    flow = np.zeros((4, 4))
-    flow[:2, 2:] = np.eye(2)
-    flow[2:] = -np.array([[k1 + k, -k, c1 + c, -c], [-k, k2 + k, -c, c2 + c]]) / np.array([[m1], [m2]])
-    poles, shapes = np.linalg.eig(flow)
-    free = np.einsum("ij,tj,jk->tik", shapes, np.exp(T[:, None] * poles), np.linalg.inv(shapes))
-    columns += list(np.einsum("ai,tik->kta", flow[2:], free).real.reshape(4, -1))
-    columns += [np.tile([1.0, 0.0], T.size), np.tile([0.0, 1.0], T.size)]
-    slopes = np.stack(columns, axis=1) / NOISE
-    bound = np.sqrt(np.diagonal(np.linalg.inv(slopes.T @ slopes))[: len(fit.names)])
+    fit = fitted()
     found = [each.error / each.value for each in fit.estimates]
-    np.testing.assert_allclose(found, bound, rtol=0.05)
+    np.testing.assert_allclose(found, bound(T, fit.names, NOISE), rtol=0.05)
 
 
 @pytest.mark.slow
@@ -156,15 +140,49 @@ def test_wrong_direction_of_a_sensor_is_no_fit():
     assert fit.status_name in ("not_converged", "patterned")
 
 
-def test_coarse_angle_is_named_and_the_fit_converges():
-    """The samples of a tachometer with one pulse per turn give the times of its edges to half a step."""
+@pytest.mark.slow
+def test_angle_of_one_pulse_per_turn_is_fitted_too():
+    """The samples of the tachometer give the times of its edges to half a step, which is 20 times the noise of the readings."""
     channels = [jv.Channel("a1", "acceleration", at=1, gain_error=0.0), jv.Channel("tacho", "pulses")]
     readings = clean()[:, 0] + 1e-3 * np.random.default_rng(0).normal(size=T.size)
     data = {"a1": readings, "tacho": np.clip(50.0 * np.sin(ramp(T)[0]), 0.0, 5.0)}
     fit = jv.identify(start(1.04, 1.2), jv.MeasuredRun.from_arrays(channels, T, data), unknown=NAMES[:4])
-    assert fit.status_name == "patterned"
-    assert any("use more pulses per turn, or sample them faster" in note for note in fit.notes)
-    np.testing.assert_allclose(fit.scene.machine.stiffness, [5e4, 6e4], rtol=0.02)
+    assert fit.status_name == "found"
+    assert np.max(np.abs(distances(fit))) < 4.0
+    np.testing.assert_allclose(fit.noise[0], 1e-3, rtol=0.03)
+    np.testing.assert_allclose(fit.scene.machine.damping, [160.0, 120.0], rtol=0.1)
+    assert any("one pulse to the next" in note and "use more pulses per turn" in note for note in fit.notes)
+
+
+def test_profile_likelihood_gives_the_interval_of_a_weak_damping():
+    """Reference: the sum of squares over the damping by SciPy; states, offsets and unbalance are free at each value."""
+    times, noise = T[::8], 2.5
+    rng = np.random.default_rng(5)
+    run = record(times, clean()[::8], noise, rng)
+    name = "machine.damping[0]"
+    fit = jv.identify(start(), run, unknown=[name, "exciters[0].unbalance"])
+    assert any(f"the interval of {name} follows from its profile likelihood" in note for note in fit.notes)
+    estimate, value = fit.estimate(name), np.array([run.values["a1"], run.values["a2"]]).T.ravel()
+    grid = estimate.value * np.exp(np.linspace(-6.0, 4.0, 41) * estimate.error / estimate.value)
+    cases = [TRUTH | {name: each} for each in grid]
+    both = [accelerations(times, cases, phase) for phase in (0.0, np.pi / 2)]
+    costs = []
+    for case, *waves in zip(cases, *both, strict=True):
+        columns = [*waves, *free_motions(times, case), *(np.tile(each, (times.size, 1)) for each in np.eye(2))]
+        basis = np.stack([each.ravel() for each in columns], axis=1)
+        left = value - basis @ np.linalg.lstsq(basis, value, rcond=None)[0]
+        costs.append(left @ left / float(fit.noise[0][0] * fit.noise[0][1]))
+    rise = np.array(costs) - min(costs) - 1.959964**2
+    ends = np.flatnonzero(np.diff(np.sign(rise)))
+    low, high = (float(np.interp(0.0, *_sorted(rise[k : k + 2], grid[k : k + 2]))) for k in ends[[0, -1]])
+    np.testing.assert_allclose([estimate.low, estimate.high], [low, high], rtol=0.01)
+    quadratic = estimate.value * np.exp(np.array([-1.96, 1.96]) * estimate.error / estimate.value)
+    assert np.min(np.abs(np.log([low, high] / quadratic))) > 0.02
+
+
+def _sorted(x, y):
+    order = np.argsort(x)
+    return x[order], y[order]
 
 
 def test_contradicted_mass_is_said():

@@ -17,6 +17,7 @@ from jaxvib.identification.problem import MOTIONS, Problem, build_problem, with_
 from jaxvib.identification.records.channel import UNITS, Channel
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.drives.drive import Drive
+from jaxvib.numerics.noise import Noise
 from jaxvib.units import Number, number
 
 
@@ -117,7 +118,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
         raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
     scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(None, planned.drive))
     problem = build_problem(scene, [run], fit.names, {})
-    problem = with_noise(problem, [[np.ones(1) for _ in moving]], [np.array([deviations[c.name] for c in moving])])
+    problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name])) for c in moving]])
     problem = problem._replace(precisions=own_precisions(fit, problem))
     size = float(np.asarray(exciter.unbalance, float))
     fitted = information_at(problem, size * np.array([np.cos(fit.phase[0]), np.sin(fit.phase[0])]))

@@ -11,12 +11,12 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
 from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
-from jaxvib.identification.fit import linear_at, residuals_of, run_equations
+from jaxvib.identification.fit import differences_of, linear_at, run_equations
 from jaxvib.identification.further_runs.planned import own_precisions, shared_places
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, with_noise
 from jaxvib.identification.run import MeasuredRun
-from jaxvib.numerics.noise import autoregression
+from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 
@@ -168,16 +168,16 @@ def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
             x[first + k] = math.log(fit.gains[fit.gain_names.index(name)].value)
     fixed = pairs if has_mark or len(sizes) > 1 else None
 
-    def with_filters(taps: list[np.ndarray], noise: np.ndarray) -> tuple[Problem, np.ndarray, np.ndarray]:
-        filtered = with_noise(problem, [taps], [np.where(noise > 0.0, noise, 1.0)])
+    def with_filters(noise: list[Noise], differences: list[np.ndarray] | None) -> tuple[Problem, np.ndarray, np.ndarray]:
+        filtered = with_noise(problem, [[each._replace(deviation=each.deviation or 1.0) for each in noise]], differences)
         linear = linear_at(filtered, x, fixed)
-        return filtered, linear, residuals_of(filtered, x, linear)[0]
+        return filtered, linear, differences_of(filtered, x, linear)[0]
 
-    _, _, left = with_filters([np.ones(1)] * problem.raw[0].shape[1], np.std(problem.raw[0], axis=0))
-    models = [autoregression(each) for each in left.T]
-    taps = [each for each, _ in models]
-    filtered, linear, left = with_filters(taps, np.array([each for _, each in models]))
-    return _Predicted(filtered, x, linear, left, taps, has_mark)
+    _, _, left = with_filters([Noise(np.ones(1), float(np.std(each))) for each in problem.raw[0].T], None)
+    mask = problem.masks[0]
+    noise = [noise_of(each) for each in np.where(mask, left, np.nan).T]
+    filtered, linear, left = with_filters(noise, [left])
+    return _Predicted(filtered, x, linear, np.where(mask, left, np.nan), [each.taps for each in noise], has_mark)
 
 
 def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:

@@ -17,7 +17,7 @@ from jaxvib.identification.directions import elimination, in_polar_unbalances, p
 from jaxvib.identification.fit import linear_places
 from jaxvib.identification.further_runs.planned import Expected, PlannedRun
 from jaxvib.identification.identify import MachineFit
-from jaxvib.identification.response import GAUSS_POINTS, Samples, Unknowns, normal_equations, rotor_force
+from jaxvib.identification.response import Samples, Unknowns, normal_equations
 from jaxvib.machine.drives.controlled import SpeedProfile
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
@@ -111,8 +111,7 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
 
     def of_run(speeds: Array) -> Array:
         x, linear = jnp.asarray(fitted.x), jnp.asarray(fitted.linear[place])
-        start = float(problem.times[0][0])
-        return _information(problem.unknowns, problem.runs[0], problem.scene, x, linear, start, jnp.asarray(times), speeds)
+        return _information(problem.unknowns, problem.runs[0], problem.scene, x, linear, jnp.asarray(times), speeds)
 
     found, pull = jax.vjp(of_run, jnp.asarray(speeds))
     run = np.zeros_like(fitted.information)
@@ -135,12 +134,8 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
 
 @cached
 def _information(
-    unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array, start: float, times: Array, speeds: Array
+    unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, linear: Array, times: Array, speeds: Array
 ) -> Array:
     """Return the normal equations of a run whose rotor has these `speeds` at these `times`."""
-    drive, shape = SpeedProfile(times, speeds), samples.force.shape[:3]
-    sample = start + samples.step * jnp.arange(shape[0] * shape[1])
-    nodes = (sample[:, None] + samples.step * jnp.asarray([[0.0, *GAUSS_POINTS]])).ravel()
-    angle, speed, acceleration = (jax.vmap(f)(nodes) for f in (drive.angle_at, drive.speed_at, drive.acceleration_at))
-    force = rotor_force(angle, speed, acceleration, scene.exciters[0].direction).reshape(*shape, 2)
-    return normal_equations(unknowns, dataclasses.replace(samples, force=force), scene, x, linear)
+    driven = dataclasses.replace(samples, drives=(SpeedProfile(times, speeds),))
+    return normal_equations(unknowns, driven, scene, x, linear)

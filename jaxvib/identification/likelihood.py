@@ -1,0 +1,117 @@
+"""Profile likelihood: intervals of numbers about which the cost of a fit is not quadratic.
+
+A number is held at a distance from its fitted value while all other unknowns are fitted again. The rise of the cost is
+compared with the quadratic form, (distance/error)^2. If they differ by more than 10 % at two standard errors, the ends of the
+interval are the values at which the cost rises by 1.96^2.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxvib.identification.directions import Information, eliminate, free_unbalances, in_polar_unbalances
+from jaxvib.identification.fit import Fitted, minimize, project
+from jaxvib.identification.problem import Known, Problem
+
+QUANTILE = 1.959964
+"""97.5 % quantile of the normal distribution."""
+
+_COMPARED_DISTANCE = 2.0
+"""Distance at which the cost is compared with the quadratic form, in standard errors."""
+
+_MAX_DIFFERENCE = 0.1
+"""Relative difference from the quadratic form above which an interval follows from the profile."""
+
+_TIGHT_ERROR = 1e-3
+"""Error of a held number, in standard errors."""
+
+_MAX_DISTANCE = 20.0
+"""Distance in standard errors beyond which an interval counts as unbounded."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Profile:
+    """Profile of one number of a fit.
+
+    **Attributes**: the `fitted` problem; `index` of the number in x, or of an exciter if `is_unbalance`; its `center` and
+    standard error `spread` in its coordinate; `slopes` (p,): change of x with the number; `floor`: the least cost.
+    """
+
+    fitted: Fitted
+    index: int
+    is_unbalance: bool
+    center: float
+    spread: float
+    slopes: np.ndarray
+    floor: float
+
+    def rise(self, distance: float, is_exact: bool) -> float:
+        """Return the rise of the cost at a `distance` in standard errors. The others are fitted if `is_exact`, otherwise they
+        follow the quadratic form, but for the linear ones."""
+        target = self.center + distance * self.spread
+        problem, own_cost = self._held(target)
+        x = self.fitted.x + distance * self.spread * self.slopes
+        trial = minimize(problem, x)[0] if is_exact else project(problem, x)
+        return trial.cost + own_cost - self.floor
+
+    def _held(self, target: float) -> tuple[Problem, float]:
+        """Return the problem with the number held at `target`, and the cost of its own known value there."""
+        problem, tight = self.fitted.problem, _TIGHT_ERROR * self.spread
+        if self.is_unbalance:
+            known, value = problem.unbalances[self.index], math.exp(target)
+            unbalances = list(problem.unbalances)
+            unbalances[self.index] = Known(value, tight * value)
+            own_cost = 0.0 if known is None else ((known.value - value) / known.error) ** 2
+            return problem._replace(unbalances=tuple(unbalances)), own_cost
+        means, precisions = problem.means.copy(), problem.precisions.copy()
+        own_cost = float(precisions[self.index] * (target - means[self.index]) ** 2)
+        means[self.index], precisions[self.index] = target, 1.0 / tight**2
+        return problem._replace(means=means, precisions=precisions), own_cost
+
+    def end(self, side: float) -> float:
+        """Return the end of the interval on one side, in standard errors from the center; infinite without an end.
+
+        The root of the rise is nearly proportional to the distance, and the secant method finds its end in a few steps.
+        """
+        last, root, distance = 0.0, 0.0, _COMPARED_DISTANCE
+        for _ in range(8):
+            new = math.sqrt(max(self.rise(side * distance, is_exact=True), 0.0))
+            if abs(new - QUANTILE) < 0.01 * QUANTILE:
+                return distance
+            slope = (new - root) / (distance - last)
+            last, root = distance, new
+            distance += (QUANTILE - new) / slope if slope > 0.0 else math.inf
+            if not 0.0 < distance < _MAX_DISTANCE:
+                return math.inf
+        return math.inf
+
+
+def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[float, float]]:
+    """Return the ends of the intervals, in the coordinates of the numbers relative to their values, by the names of the numbers
+    whose cost is not quadratic.
+
+    **Arguments**: `fitted`, and what is `known` about its numbers. Undetermined numbers are left out.
+    """
+    problem, p, moved = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
+    data, prior, sizes = in_polar_unbalances(fitted)
+    free = free_unbalances(problem)
+    own = np.array([*range(p), *(p + 2 * k for k in free)], int)
+    covariance = np.linalg.pinv(eliminate(data + prior, own), rcond=1e-13, hermitian=True)
+    floor, found = project(problem, fitted.x).cost, {}
+    for i, name in enumerate(known.names):
+        if not known.determined[i]:
+            continue
+        is_unbalance = i >= moved
+        place = p + i - moved if is_unbalance else i
+        index = free[i - moved] if is_unbalance else i
+        center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
+        slopes = covariance[:p, place] / covariance[place, place]
+        profile = _Profile(fitted, index, is_unbalance, center, math.sqrt(covariance[place, place]), slopes, floor)
+        rises = [profile.rise(side * _COMPARED_DISTANCE, is_exact=False) for side in (-1.0, 1.0)]
+        if max(abs(rise / _COMPARED_DISTANCE**2 - 1.0) for rise in rises) > _MAX_DIFFERENCE:
+            found[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)
+    return found

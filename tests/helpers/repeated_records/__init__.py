@@ -1,0 +1,1 @@
+"""Repeated records of one machine by SciPy, and fits to them."""

@@ -1,0 +1,31 @@
+"""Table of repeated records of one machine (docs/identification.md): intervals that hold the truth, errors, wrong minima.
+
+PYTHONPATH=tests/helpers python -m repeated_records 400
+PYTHONPATH=tests/helpers python -m repeated_records 400 "white noise"
+"""
+
+import sys
+import time
+
+import jax
+import numpy as np
+
+from repeated_records.fits import CASES, repeated
+
+
+def main(count: int, names: list[str]) -> None:
+    print(
+        "| case | records | intervals that hold the truth | largest standard deviation / bound | wrong minima | called found |"
+    )
+    for name in names:
+        begin = time.process_time()
+        found = repeated(count, **CASES[name])
+        print(f"| {name} | {found.row} |", flush=True)
+        counts = zip(*np.unique(found.statuses, return_counts=True), strict=True)
+        print(f"  {time.process_time() - begin:.0f} s of the processor; {', '.join(f'{n} {name}' for name, n in counts)}")
+        print(f"  held {found.held.round(3).tolist()}, ratio {found.ratio.round(2).tolist()}")
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    main(int(sys.argv[1]), sys.argv[2:] or list(CASES))

@@ -1,0 +1,101 @@
+"""Repeated records of one machine, each fitted from wrong first values: share of intervals that hold the truth, and errors.
+
+One run-up by SciPy serves all records of a case; noise, gains and first values are drawn for each record.
+"""
+
+import dataclasses
+import functools
+
+import numpy as np
+from run_ups_by_scipy import TRUTH, accelerations, bound, motor_run_up, ramp, record, scene_of
+
+import jaxvib as jv
+
+TIMES = 0.016 * np.arange(1000)
+NOISE = 0.05
+NAMES = ("machine.stiffness", "machine.damping", "machine.link_stiffness", "machine.link_damping", "exciters[0].unbalance")
+SINGLE = tuple(name for name in TRUTH if "mass" not in name)
+
+CASES = {
+    "white noise": {},
+    "coloured noise, correlation 0.9": {"color": 0.9},
+    "2 % outliers, 20 times the noise": {"outliers": 0.02},
+    "gains drawn, 1 %": {"gain_error": 0.01},
+    "motor that dips at the resonances": {"motor": True},
+    "one pulse per turn, times rounded to 1 ms": {"pulses": 1, "resolution": 1e-3},
+    "readings clipped at 60 % of the largest": {"full_scale": 0.6},
+}
+"""Options of `record` by the name of a case; `motor`: run-up of a motor in place of the prescribed speed."""
+
+
+@dataclasses.dataclass
+class Repeated:
+    """Fits of repeated records.
+
+    **Attributes** (r records, p numbers): `away` (r, p), distances from the truth relative to the standard error; `relative`
+    (r, p), relative errors; `bound` (p,), Cramer-Rao bound; `statuses` (r,).
+    """
+
+    away: np.ndarray
+    relative: np.ndarray
+    bound: np.ndarray
+    statuses: np.ndarray
+
+    @property
+    def wrong(self):
+        """True (r,) for fits that are not near the truth: wrong minima."""
+        return np.max(np.abs(self.relative / self.bound), axis=1) > 8.0
+
+    @property
+    def held(self):
+        """Share (p,) of the intervals that hold the truth, wrong minima left out."""
+        return np.mean(np.abs(self.away[~self.wrong]) < 1.96, axis=0)
+
+    @property
+    def ratio(self):
+        """Standard deviation (p,) of the errors relative to the Cramer-Rao bound, wrong minima left out."""
+        return np.sqrt(np.mean(self.relative[~self.wrong] ** 2, axis=0)) / self.bound
+
+    @property
+    def row(self):
+        """Row of a table: intervals that hold the truth, standard deviation, wrong minima, and those of them called found."""
+        found = int(np.sum(self.wrong & (self.statuses == "found")))
+        held, share = self.held, np.mean(self.statuses == "found")
+        return (
+            f"{len(self.wrong)} | {min(held):.1%} to {max(held):.1%} | {max(self.ratio):.2f} | {int(np.sum(self.wrong))} | "
+            f"{found} | {share:.0%}"
+        )
+
+
+@functools.cache
+def run_up(motor):
+    """Return the accelerations (n, 2) and the turning of the rotor."""
+    return motor_run_up(TIMES, TRUTH) if motor else (accelerations(TIMES, [TRUTH])[0], ramp)
+
+
+def repeated(count, seed=0, motor=False, **options):
+    """Return the fits of `count` records from stiffnesses 10 % off and dampings 50 % off, in random directions."""
+    clean, turning = run_up(motor)
+    if "full_scale" in options:
+        options = options | {"full_scale": options["full_scale"] * np.max(np.abs(clean))}
+    away, relative, statuses = [], [], []
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        run = record(TIMES, clean, NOISE, rng, turning=turning, **options)
+        factor = {"stiffness": 1.1, "damping": 1.5}
+        first = {
+            name: value * next((f for word, f in factor.items() if word in name), 1.0) ** rng.choice([-1.0, 1.0])
+            for name, value in TRUTH.items()
+        }
+        fit = jv.identify(scene_of(first), run, unknown=NAMES, throw=False)
+        found = np.array([[each.value, each.error] for each in fit.estimates]).T
+        truth = np.array([TRUTH[name] for name in fit.names])
+        away.append((found[0] - truth) / found[1])
+        relative.append(found[0] / truth - 1.0)
+        statuses.append(fit.status_name)
+    return Repeated(np.array(away), np.array(relative), _bound(turning, **options), np.array(statuses))
+
+
+def _bound(turning, color=0.0, gain_error=0.0, outliers=0.0, full_scale=None, **_):
+    """Return the Cramer-Rao bound of a record with known places of outliers, a known angle, and without clipping."""
+    return bound(TIMES, SINGLE, NOISE / np.sqrt(1.0 - outliers), color, gain_error, turning)
