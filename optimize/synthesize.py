@@ -55,6 +55,9 @@ _SAME_MOTION = 1e-2
 
 Progress = Callable[[str, float], None]
 
+_SEARCH_SHARE = 0.4
+"""Share of the search in the time of a search with verification, measured for the antiphase machine."""
+
 
 @validated
 def synthesize(
@@ -126,9 +129,13 @@ def synthesize(
     options = _options(starts, seed, iterations, polishing, rate, searcher)
     demands = _validate_demands(space, objective, subject_to)
 
+    searching = _SEARCH_SHARE if verify else 0.9
+
     def report(what: str, share: float) -> None:
+        """Report the share of the whole time; 0.9 of the steps are the search."""
         if progress is not None:
-            call_user(progress, "progress", what, share)
+            shown = share * searching / 0.9 if share <= 0.9 else searching + (share - 0.9) / 0.1 * (1.0 - searching)
+            call_user(progress, "progress", what, shown)
 
     if begin is not None:
         options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
@@ -157,10 +164,11 @@ def synthesize(
         raise failure(
             SynthesisStatus.contradictory, f" (not met by the nearest machine: {unmet}); widen the bounds or relax a demand"
         )
-    report("checking", 0.9)
+    report("integrating the best machine" if verify else "computing quantities", 0.9)
     verify = verify and bool(kept[best]) and not found.interrupted
     unfinished = "the search was interrupted" if found.interrupted else "the machine does not meet all demands"
     run, unverified = _run(scene, motion, verify) if kept[best] and not found.interrupted else (None, unfinished)
+    report("computing the exact motion", 0.96)
     other = _other_tiers(scene, [q for _, q in named], verify, run, motion)
     rows = _table(space, scene, named, reports[:2, : len(named)], other)
     n = len(_standard_rows(scene, motion, objective.of))
