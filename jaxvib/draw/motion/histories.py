@@ -153,8 +153,12 @@ def _equal_loads(whole: np.ndarray, end: np.ndarray) -> list[tuple[int, str | No
     >>> t = np.linspace(0.0, 1.0, 9)[:, None]
     >>> _equal_loads(np.hstack([t, t, -t]), np.hstack([t, t, -t]))
     [(0, 'loads 1 and 2'), (2, 'load 3')]
+    >>> _equal_loads(np.zeros((9, 0)), np.zeros((9, 0)))      # rotors with unbalances only
+    []
     """
     count, signals = whole.shape[1], (whole, end)
+    if count == 0:
+        return []
     rooms = [_EQUAL * float(np.ptp(values)) + 1e-9 * float(np.max(np.abs(values), initial=0.0)) for values in signals]
     groups: list[list[int]] = []
     for k in range(count):

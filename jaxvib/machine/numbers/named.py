@@ -109,6 +109,8 @@ class NamedNumber(NamedTuple):
             return [f"{words} of link {'-'.join(map(str, links[k])) if k < len(links) else k + 1}" for k in which]
         if each:
             return [f"{words} of {each} {k + 1}" if np.size(leaf) > 1 else f"{words} of the {each}" for k in which]
+        if np.shape(leaf) == (2,) and self.spec.unit == "m":
+            return [f"{'xy'[k]} of the {words}" for k in which]
         return [f"{words} {k + 1}" if several else words for k in which]
 
     def _numbered(self, scene: Scene, words: str) -> str:
