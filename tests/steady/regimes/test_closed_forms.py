@@ -109,6 +109,26 @@ def test_three_exciters_on_a_triangle_leave_the_body_at_rest():
     assert found.speed.size == 4  # mirror images and exchanges are listed once
 
 
+@pytest.mark.parametrize("share", (0.95, 1.05))
+def test_three_in_phase_are_least_beyond_the_closed_form(share):
+    """Blekhman's function of three exciters on a triangle on soft supports is least in phase if M l^2 > 4 J."""
+    distance = np.sqrt(4.0 * share * INERTIA / MASS)
+    angles = 2 * np.pi * np.arange(3) / 3
+    places = [(float(distance * np.cos(a)), float(distance * np.sin(a))) for a in angles]
+    regime = jv.synchronous_regimes(scene_of(places, (1, 1, 1), body(3e3, 15.0)), near=(99.9, jnp.zeros(3)))
+    np.testing.assert_allclose(np.exp(1j * regime.phases), 1.0, atol=1e-9)
+    assert (float(regime.quasi_static) < 0.0) == (share > 1.0)
+
+
+@pytest.mark.parametrize(("stiffness", "middle"), [(3e3, np.pi), (4e6, 0.0)])
+def test_middle_of_three_on_a_line_opposes_above_resonances(stiffness, middle):
+    """The outer ones are far from each other, M l^2 > J; below all resonances all turn in phase."""
+    found = jv.synchronous_regimes(scene_of([(-2.0, 0.0), (0.0, 0.0), (2.0, 0.0)], (1, 1, 1), body(stiffness, 150.0, 2.0)))
+    stable = [r for r in map(found.select, range(found.speed.size)) if bool(r.stable)]
+    assert len(stable) == 1
+    assert abs(apart(stable[0], 2)) < 0.05 and abs(abs(apart(stable[0], 1)) - middle) < 0.05
+
+
 def roots_of_balance(torque, machine_numbers, slope, working):
     """Speeds at which torque (1 - w/working) + slope terms equal the braking of a circular translation, from a polynomial."""
     mass, stiffness, damping = machine_numbers
