@@ -1,6 +1,6 @@
 """Every printed number, paper by paper."""
 
-from papers import antiphase, bearing, criterion, rotor, torus
+from papers import antiphase, bearing, criterion, motors, rotor, torus
 from papers.printed import PrintedNumber
 
 PAPERS = {
@@ -9,6 +9,8 @@ PAPERS = {
     "rotor": "rotor with four pendulums",
     "torus": "rotor with two balls in a torus",
     "bearing": "bearing of a pendulum",
+    "two motors": "frame with two motors",
+    "dual-frequency": "one-mass machine with balls",
 }
 """The papers by name, and their machines."""
 
@@ -18,5 +20,6 @@ NUMBERS: tuple[PrintedNumber, ...] = (
     *rotor.NUMBERS,
     *torus.NUMBERS,
     *bearing.NUMBERS,
+    *motors.NUMBERS,
 )
 """Every printed number."""
