@@ -169,7 +169,9 @@ def by_jaxvib(bodies, springs, turning, share):
     return np.asarray(ends.displacement[-1]), np.concatenate(angles)
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize(
+    "name", ["one body", pytest.param("two bodies with motors", marks=pytest.mark.slow), "inclined springs and auto-balancer"]
+)
 def test_difference_to_mujoco_falls_with_the_squared_rotation(name):
     """Half the unbalance halves the rotation of the body and leaves a quarter of the difference."""
     away = []

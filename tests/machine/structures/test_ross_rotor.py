@@ -4,6 +4,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxvib as jv
 
@@ -48,6 +49,7 @@ def test_jams_of_an_auto_balancer_meet_the_torque_balance():
         np.testing.assert_allclose(braking(omega, phases, SPEED), drag, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_jam_and_balance_of_the_rotor_are_simulated():
     scene = scene_of(SPEED, 12)
     found = jv.phase_jams(scene, starts=8)

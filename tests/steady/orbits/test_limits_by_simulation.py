@@ -37,7 +37,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=() if c == "friction" else pytest.mark.slow) for c in CASES])
 def test_motion_stays_inside_the_limit_and_is_lost_outside(case):
     over, end, drive, ways = CASES[case]
     scene = scene_of([MOTOR, drive], ways)
