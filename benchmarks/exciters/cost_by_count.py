@@ -1,6 +1,6 @@
 """Cost of the equations of motion with 1 to 64 exciters.
 
-    python benchmarks/exciters.py
+    python benchmarks/exciters/cost_by_count.py
 
 Times are those of the processor. The first call includes tracing and compilation.
 """
