@@ -12,7 +12,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxvib.equations.dynamics import vector_field
-from jaxvib.equations.linear import circular_loads, linear_model
+from jaxvib.equations.linear import linear_model, turning_loads
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -66,7 +66,7 @@ def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
     scene = at_constant_speed(scene)
     field = vector_field(scene)
     speed = scene.drive.speed
-    radius = jnp.mean(circular_loads(scene).radius)
+    radius = jnp.mean(turning_loads(scene).radius)
     nd, n = field.stiffness.shape[0], angles.shape[0]
     sizes = jnp.concatenate([jnp.full((nd,), 1.0) * radius, jnp.ones(n)])
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import itertools
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from jax.typing import ArrayLike
 
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import vector_field
-from jaxvib.equations.linear import circular_loads, natural_frequencies
+from jaxvib.equations.linear import natural_frequencies, turning_loads
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
@@ -47,7 +48,10 @@ class BalanceStatus(eqx.Enumeration):
     unique = "the loads cancel in one arrangement, apart from a common rotation and a mirror image"
     family = "the loads cancel in a family of arrangements, with neutral directions in addition to the common rotation"
     alone = "a single load has no other load to cancel it"
-    outweighed = "one load's m R, or the rotor's imbalance, is larger than all others together and cannot be cancelled"
+    outweighed = (
+        "one load's m R, or the rotor's imbalance in the plane of the loads, is larger than all others together and cannot be "
+        "cancelled"
+    )
 
 
 class BalancedStates(Result):
@@ -61,9 +65,10 @@ class BalancedStates(Result):
     - `angles` (k, N), rad: one arrangement in each row, with load 1 at angle 0 unless the rotor has an imbalance; no rows if
       the loads cannot cancel
     - `dimension` of the set of arrangements, including the common rotation: N - 2, but 1 for two loads on a rotor without
-      imbalance
+      imbalance; for loads in two planes the sum for both planes
     - `neutral` (k, N, d): orthonormal changes of the angles that keep each arrangement balanced to first order
-    - `names` (d,) of these changes: "turn of all loads" first (not if the rotor has an imbalance), then "shape 1", ...
+    - `names` (d,) of these changes: "turn of all loads" first (not if the rotor has an imbalance), then "shape 1", ...; for
+      loads in two planes "turn in plane 1", "shape 1 in plane 1", ...
     - `scene`
 
     Loads in one line have one neutral direction more than the family has dimensions.
@@ -129,17 +134,20 @@ class BalancedStates(Result):
         """Plot the arrangements in the rotor's frame, each on a circle. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import phase_circles  # slow import
 
-        sides = _sides(circular_loads(self.scene))
+        sides = _sides(turning_loads(self.scene))
         named = [(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)]
         whole = float(np.sum(sides))
-        return phase_circles(named, weights=sides / whole, imbalance=_imbalance(self.scene) / whole, ax=ax)
+        return phase_circles(named, weights=sides / whole, imbalance=_imbalances(self.scene)[0] / whole, ax=ax)
 
 
 @validated
 def balanced_states(scene: Scene) -> BalancedStates:
-    """Return all arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`.
+    """Return all arrangements in which the scene's loads cancel each other and the rotor's imbalance.
 
-        sum_j m_j R_j exp(i alpha_j) + M e exp(i angle) = 0
+        sum_j m_j R_j exp(i alpha_j) + U = 0,    sum_j m_j R_j s_j exp(i alpha_j) + W = 0
+
+    U is the `StaticImbalance` and W the `MomentImbalance` of the rotor, s_j the distance of a load along the axis from the mass
+    centre of the rotor. For loads in one plane the first equation is sufficient.
 
     - Two loads cancel if they are equal and opposite each other
     - Three loads cancel in one triangle and its mirror image
@@ -147,15 +155,19 @@ def balanced_states(scene: Scene) -> BalancedStates:
       image, is the most spread one: m_j R_j are the sides of a polygon inscribed in a circle, so that equal loads are evenly
       spaced. `neutral` gives the directions of the family
     - An imbalance of the rotor is an additional side of the polygon; the loads then cannot rotate together
+    - Loads in two planes at s_1 and s_2 cancel in each plane the part of the imbalance that acts there, (W - s_2 U)/(s_1 - s_2)
+      and (W - s_1 U)/(s_2 - s_1). The arrangements of both planes are combined
 
     Each arrangement has its `stability()`, its `growth(speeds)` and the stable `intervals(low, high)` of rotor speed.
 
-    **Arguments**: `scene` with loads on a circle at one point; typical: 2 to 4 loads, an imbalance up to the sum of m_j R_j.
+    **Arguments**: `scene` with loads on a circle in one plane or in two planes; typical: 2 to 4 loads in each plane, an
+    imbalance up to the sum of m_j R_j.
 
     **Returns** `BalancedStates`.
 
-    **Raises** `InputError` for loads that do not run on a circle at one point, and for an imbalance that tilts the rotor,
-    which they cannot cancel: a moment imbalance, or a static imbalance at another point of the axis.
+    **Raises** `InputError` for loads that do not run on a circle, for loads in more than two planes, and for loads in one plane
+    with an imbalance that tilts the rotor, which they cannot cancel: a moment imbalance, or a static imbalance at another point
+    of the axis.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -175,19 +187,55 @@ def balanced_states(scene: Scene) -> BalancedStates:
     neutral directions: none
 
     Source: Filimonikhin et al. 2022, section 2 (families of three or more loads, including the common rotation); derived here.
+    For two planes Rodrigues et al. 2008, Int. J. Non-Linear Mechanics 43.
     """
     scene = validate_scene(scene)
-    loads = _sides(circular_loads(scene))
-    n = loads.size
-    imbalance = _imbalance(scene)
-    free = imbalance == 0.0
+    sides, planes = _sides(turning_loads(scene)), _planes(scene)
+    found = [_arrangements(sides[plane.loads], plane.imbalance) for plane in planes]
+    n, failed = sides.size, [each.status for each in found if not len(each.angles)]
+    if failed:
+        return BalancedStates(_status(failed), np.zeros((0, n)), 0, [], (), scene)
+    angles, neutral = [], []
+    for chosen in itertools.product(*(range(len(each.angles)) for each in found)):
+        row, directions = np.zeros(n), []
+        for plane, each, k in zip(planes, found, chosen, strict=True):
+            row[plane.loads] = each.angles[k]
+            within = np.zeros((n, each.neutral[k].shape[1]))
+            within[plane.loads] = each.neutral[k]
+            directions.append(within)
+        angles.append(row)
+        neutral.append(np.concatenate(directions, axis=1))
+    names = [name if len(planes) == 1 else f"{name} in plane {k + 1}" for k, each in enumerate(found) for name in each.names]
+    names = [name.replace("turn of all loads in", "turn in") for name in names]
+    dimension = sum(each.dimension for each in found)
+    return BalancedStates(_status([each.status for each in found]), np.array(angles), dimension, neutral, tuple(names), scene)
+
+
+def _status(names: list[str]) -> BalanceStatus:
+    """Return the status of loads in several planes: that of the plane with the most important one."""
+    order = ("alone", "outweighed", "family", "unique")
+    return getattr(BalanceStatus, min(names, key=order.index))
+
+
+class _Arrangements(NamedTuple):
+    """Arrangements of the loads of one plane: the name of their `BalanceStatus`, and fields as in `BalancedStates`."""
+
+    status: str
+    angles: np.ndarray
+    dimension: int
+    neutral: list[np.ndarray]
+    names: tuple[str, ...]
+
+
+def _arrangements(loads: np.ndarray, imbalance: complex) -> _Arrangements:
+    """Return the arrangements of loads (N,) kg m that cancel each other and an imbalance, kg m, in their plane."""
+    n, free = loads.size, imbalance == 0.0
     sides = loads if free else np.append(loads, abs(imbalance))
     largest = sides.max()
     rest = sides.sum() - largest
     rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
     if largest > rest + rounding:
-        status = BalanceStatus.alone if sides.size == 1 else BalanceStatus.outweighed
-        return BalancedStates(status, np.zeros((0, n)), 0, [], (), scene)
+        return _Arrangements("alone" if sides.size == 1 else "outweighed", np.zeros((0, n)), 0, [], ())
     if largest > rest - rounding:
         # All loads are on one line, the largest opposite all others.
         one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
@@ -198,29 +246,52 @@ def balanced_states(scene: Scene) -> BalancedStates:
     neutral = [_neutral(loads, row, turns=free) for row in angles]
     turn = ("turn of all loads",) if free else ()
     names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
-    status = BalanceStatus.unique if sides.size <= 3 else BalanceStatus.family
-    dimension = max(n - 2, 1 if free else 0)
-    return BalancedStates(status, angles, dimension, neutral, names, scene)
+    return _Arrangements("unique" if sides.size <= 3 else "family", angles, max(n - 2, 1 if free else 0), neutral, names)
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:
     return np.broadcast_to(np.asarray(loads.mass) * np.asarray(loads.radius), (loads.count,))
 
 
-def _imbalance(scene: Scene) -> complex:
-    """Return the imbalance of the rotor, kg m, in its frame. **Raises** `InputError` if loads at one point cannot cancel it."""
+class _Plane(NamedTuple):
+    """Loads of one plane: their indices, and the imbalance of the rotor that they must cancel, kg m."""
+
+    loads: np.ndarray
+    imbalance: complex
+
+
+def _imbalances(scene: Scene) -> tuple[complex, complex, np.ndarray]:
+    """Return the static imbalance of the rotor, kg m, its moment about the mass centre, kg m^2, and the distance of each load
+    from the mass centre, (N,) m."""
     imbalances = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
-    static = [complex(*map(float, each.static)) for each in imbalances]
-    moment = [complex(*map(float, each.moment)) for each in imbalances]
-    levers = scene.mount().rotor_levers[1:] if static else ()
-    moment += [float(lever) * each for lever in levers if lever is not None for each in static]
-    if abs(sum(moment)) > _rounding() * max(map(abs, moment), default=0.0):
-        problem = (
-            "tilt the rotor: loads at one point cannot cancel a moment imbalance, or a static imbalance at another point "
-            "(it acts at the mass centre of the rotor); leave it out, or simulate"
-        )
-        raise InputError("effects", problem)
-    return sum(static, 0j)
+    static = sum((complex(*map(float, each.static)) for each in imbalances), 0j)
+    moment = sum((complex(*map(float, each.moment)) for each in imbalances), 0j)
+    return static, moment, np.asarray(scene.mount().distances(scene.loads.count))
+
+
+def _planes(scene: Scene) -> list[_Plane]:
+    """Return the planes of the loads. **Raises** `InputError` for more than two, and if loads in one plane cannot cancel the
+    imbalance."""
+    static, moment, distances = _imbalances(scene)
+    places = np.unique(distances)
+    if places.size > 2:
+        problem = f"are in {places.size} planes; this function needs loads in one plane or two, use simulate for others"
+        raise InputError("machine.stations", problem)
+    if places.size == 1:
+        tilting = moment - places[0] * static
+        if abs(tilting) > _rounding() * max(abs(moment), abs(places[0] * static)):
+            problem = (
+                "tilt the rotor: loads at one point cannot cancel a moment imbalance, or a static imbalance at another point "
+                "(it acts at the mass centre of the rotor); give loads at two stations, or leave it out"
+            )
+            raise InputError("effects", problem)
+        return [_Plane(np.arange(distances.size), static)]
+    planes = []
+    for here, other in (places, places[::-1]):
+        imbalance = (moment - other * static) / (here - other)
+        is_zero = abs(imbalance) <= _rounding() * (abs(static) + abs(moment) / abs(here - other))
+        planes.append(_Plane(np.flatnonzero(distances == here), 0j if is_zero else imbalance))
+    return planes
 
 
 def _inscribed_polygon(sides: np.ndarray) -> np.ndarray:
@@ -396,7 +467,7 @@ def _rounding() -> float:
 
 def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
     """Return validated angles at which the loads cancel each other, and the number of their neutral directions."""
-    sides, imbalance = _sides(circular_loads(scene)), _imbalance(scene)
+    sides = _sides(turning_loads(scene))
     if not np.min(np.asarray(natural_frequencies(scene))) > 0.0:
         problem = "lets the machine drift; this neutral motion hides the growth or decay of the loads, add a support"
         raise InputError("machine.stiffness", problem)
@@ -406,10 +477,19 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
             raise failure(states.status)
         angles = states.angles[0]
     angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
-    if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > _rounding() * sides.sum():
+    static, moment, distances = _imbalances(scene)
+    tilting, arms = moment - distances[0] * static, distances - distances[0]
+    forces = sides * np.exp(1j * angles)
+    left = abs(np.sum(forces) + static) > _rounding() * sides.sum()
+    tilts = abs(np.sum(arms * forces) + tilting) > _rounding() * max(float(np.sum(np.abs(arms) * sides)), abs(moment))
+    if left or tilts:
         raise InputError("angles", "leave an unbalance; use angles from balanced_states(scene).angles")
     _require_undisturbed(scene, angles)
-    return angles, _neutral(sides, angles, turns=imbalance == 0.0).shape[1]
+    length = np.max(np.abs(arms))
+    levers = [np.ones(sides.size)] + ([arms / length] if length > 0.0 else [])
+    change = np.concatenate([lever * sides * np.stack([-np.sin(angles), np.cos(angles)]) for lever in levers]) / sides.max()
+    rank = int(np.sum(np.linalg.svd(change, compute_uv=False) > 1e-6))
+    return angles, sides.size - rank
 
 
 def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: int) -> np.ndarray:
