@@ -55,7 +55,7 @@ _SAME_MOTION = 1e-2
 
 Progress = Callable[[str, float], None]
 
-_SEARCH_SHARE = 0.4
+_SEARCH_SHARE = 0.25
 """Share of the search in the time of a search with verification, measured for the antiphase machine."""
 
 
@@ -168,7 +168,7 @@ def synthesize(
     verify = verify and bool(kept[best]) and not found.interrupted
     unfinished = "the search was interrupted" if found.interrupted else "the machine does not meet all demands"
     run, unverified = _run(scene, motion, verify) if kept[best] and not found.interrupted else (None, unfinished)
-    report("computing the exact motion", 0.96)
+    report("computing the exact motion", 0.99)
     other = _other_tiers(scene, [q for _, q in named], verify, run, motion)
     rows = _table(space, scene, named, reports[:2, : len(named)], other)
     n = len(_standard_rows(scene, motion, objective.of))

@@ -144,7 +144,7 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     shown = "".join(str(getattr(output, "text", "")) for output in outputs)
     images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', shown)
     diagram, machine = (base64.b64decode(image).decode() for image in images)
-    assert "mode 3: Omega" in shown and "foundation force, N" in diagram
+    assert "yes, if they stay together" in shown and "foundation force, N" in diagram
     assert found["mode"].value == 1 and "jam mode 1, stable by slope" in machine
     assert found["controls"].value == {each.name: each.start for each in sliders_of(one_mass)}
     assert jv.scene_to_toml(found["machine"].value) == jv.scene_to_toml(one_mass)
@@ -152,7 +152,7 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     moved = scene_at(one_mass, {**found["controls"].value, "machine.stiffness[0]": 200.0})
     before, after = jv.jam_modes(one_mass), jv.jam_modes(moved)
     assert float(after.resonances[0] / before.resonances[0]) == pytest.approx(2.0, rel=1e-12)
-    resonance = f"{30.0 / np.pi * float(after.resonances[0]):.6g} rpm"
+    resonance = f"{30.0 / np.pi * float(after.resonances[0]):.5g} rpm"
     assert resonance in pictures.text(lambda: pictures.readings(moved), SceneOrProblem(moved, ""))
     drawn = pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed))
     assert max(map(len, _drawn_lines(diagram))) > 40 and _drawn_lines(drawn) != _drawn_lines(diagram)
