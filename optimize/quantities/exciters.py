@@ -322,7 +322,7 @@ def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
         raise InputError("scene", "has an ideal drive, which passes every resonance; this quantity needs motors")
 
     def ratio(speed: Array, given: TorqueBalance = balance) -> Array:
-        influence = influence_of(given, speed)[0]
+        influence = influence_of(given, speed)
         resisting = magnitude((influence.conj().T - influence) / 2j)
         needed = speed**4 / 2.0 * (given.unbalance @ resisting @ given.unbalance)
         return needed / jnp.sum(given.driving_torque(speed))

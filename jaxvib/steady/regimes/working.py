@@ -145,7 +145,7 @@ def _fastest_starts(balance: TorqueBalance, sets: np.ndarray) -> Array:
     if balance.is_prescribed.any():
         return jnp.full(len(sets), balance.speed)
     speeds = balance.speed * np.linspace(_LOWEST_SPEED, _HIGHEST_SPEED, _SPEEDS, dtype=sets.dtype)
-    influence, torque = jax.vmap(lambda w: (influence_of(balance, w)[0], balance.driving_torque(w)))(speeds)
+    influence, torque = jax.vmap(lambda w: (influence_of(balance, w), balance.driving_torque(w)))(speeds)
     forces = balance.unbalance[None] * np.exp(1j * sets)
     vibration = jnp.einsum("ai,gik,ak->ag", forces.conj(), influence, forces).imag * (speeds**4 / 2.0)[None]
     total = jnp.sum(torque, axis=1)[None] + vibration
@@ -160,5 +160,5 @@ def _fastest_starts(balance: TorqueBalance, sets: np.ndarray) -> Array:
 def _potential(balance: TorqueBalance, omega: Array, phase: Array) -> Array:
     """Return Blekhman's function Lambda, N m; infinite if it is not a number."""
     forces = balance.unbalance * jnp.exp(1j * phase)
-    value = -(omega**4) / 4.0 * (forces.conj() @ influence_of(balance, omega)[0] @ forces).real
+    value = -(omega**4) / 4.0 * (forces.conj() @ influence_of(balance, omega) @ forces).real
     return jnp.nan_to_num(value, nan=jnp.inf)
