@@ -212,7 +212,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
 
 def _status(names: list[str]) -> BalanceStatus:
-    """Return the status of loads in several planes: that of the plane with the most important one."""
+    """Return the status of loads in several planes: of the statuses of the planes, the first one in `order` below."""
     order = ("alone", "outweighed", "family", "unique")
     return getattr(BalanceStatus, min(names, key=order.index))
 
