@@ -28,6 +28,9 @@ The share is small because these errors change slowly and do not average out lik
 _COARSE_ANGLE = 0.3
 """Standard error of the rotor's angle, rad, above which the response is not linear in it."""
 
+_DECAY_TIMES = 2.0
+"""Duration of a run, in decay times of the slowest mode, below which a note says that it is short."""
+
 _UNEXPLAINED = 0.5
 """Share of a channel's standard deviation in the residuals above which a fit counts as none."""
 
@@ -131,6 +134,31 @@ def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found
     total, known = float(np.sum(white[place] ** 2)), max(columns - found, 1)
     free = place.size - columns
     return float(fdtrc(known, free, explained / known / ((total - explained) / free)))
+
+
+def coverage_notes(fitted: Fitted, frequency: np.ndarray, damping_ratio: np.ndarray) -> Iterator[str]:
+    """Yield sentences about runs that pass no resonance, and about runs that are too short.
+
+    **Arguments**: natural frequencies, rad/s, and damping ratios (m,) of the fitted machine.
+    """
+    problem, spans = fitted.problem, []
+    for time, angle in zip(problem.times, problem.angles, strict=True):
+        speed = np.abs(np.diff(angle, axis=0) / np.diff(time)[:, None])
+        spans.append((float(np.min(speed)), float(np.max(speed))))
+    if frequency.size and not any(low < w < high for low, high in spans for w in frequency):
+        low, high, modes = min(spans)[0], max(each for _, each in spans), ", ".join(f"{w:.4g}" for w in frequency)
+        yield (
+            f"no run passes a resonance: the rotors turn at {low:.3g} to {high:.3g} rad/s, and the natural frequencies are "
+            f"{modes} rad/s; record a run through a resonance"
+        )
+    decay = 1.0 / np.maximum(damping_ratio * frequency, 1e-300)
+    for k, time in enumerate(problem.times):
+        lasts, longest = float(time[-1] - time[0]), float(np.max(decay, initial=0.0))
+        if lasts < _DECAY_TIMES * longest:
+            yield (
+                f"run {k + 1} lasts {lasts:.3g} s, less than two decay times of the slowest mode ({longest:.3g} s each): its "
+                "response is not distinguished from the motion at its start; record a longer run"
+            )
 
 
 def _contradictions(fitted: Fitted) -> Iterator[str]:

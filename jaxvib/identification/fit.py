@@ -100,6 +100,11 @@ def _linear_count(problem: Problem) -> int:
     return int(max(place.max() for place in linear_places(problem))) + 1
 
 
+def unknown_count(problem: Problem) -> int:
+    """Return the number of all unknowns, with the states, the unbalances and the offsets of the runs."""
+    return problem.unknowns.count + _linear_count(problem)
+
+
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solution of scaled normal equations."""
     size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.identification.checks import FitStatus, status_of
+from jaxvib.identification.checks import FitStatus, coverage_notes, status_of
 from jaxvib.identification.directions import (
     Direction,
     Information,
@@ -22,7 +22,7 @@ from jaxvib.identification.directions import (
     in_polar_unbalances,
     information_of,
 )
-from jaxvib.identification.fit import Fitted, fit_from
+from jaxvib.identification.fit import Fitted, fit_from, unknown_count
 from jaxvib.identification.likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.problem import Problem, build_problem, natural
 from jaxvib.identification.run import MeasuredRun
@@ -222,6 +222,9 @@ def identify(
         raise InputError("records", f"is {quoted(records)}; it must be a list of runs of read_run or MeasuredRun.from_arrays")
     scene = validate_scene(subject)
     problem = build_problem(scene, runs, unknown, known or {})
+    free, readings = unknown_count(problem), sum(int(np.count_nonzero(mask)) for mask in problem.masks)
+    if free >= readings:
+        raise InputError("unknown", f"has {free} unknowns with those of the runs, for {readings} readings; record longer runs")
     fitted = fit_from(problem, [np.zeros(problem.unknowns.count), track_orders(problem)])
     found = _interpret(scene, _near_first_values(scene, problem, fitted))
     if throw and bool(found.status == FitStatus.not_converged):
@@ -268,7 +271,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         notes.append(f"the interval of {name} follows from its profile likelihood, because the cost is not quadratic about it")
     return MachineFit(
         status=status,
-        notes=(*problem.notes, *notes),
+        notes=(*problem.notes, *notes, *coverage_notes(fitted, *natural(fitted_to))),
         scene=fitted_to,
         names=known.names,
         units=tuple(find_number(scene, name, "unknown").unit for name in known.names),

@@ -1,6 +1,7 @@
 """Runs after a fit: planned ones, and held-out ones; SciPy integrates the run-ups."""
 
 import functools
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ import pytest
 from run_ups_by_scipy import TOP, TRUTH, accelerations, ramp, record, scene_of
 
 import jaxvib as jv
+from jaxvib.identification.checks import coverage_notes
 from jaxvib.identification.further_runs.planned import expected_run
 from jaxvib.identification.further_runs.profile import _spread
 
@@ -191,3 +193,31 @@ def test_records_of_different_machines_are_contradicted():
     assert any("run 2 deviates from the others" in note for note in fit.notes)
     same = jv.identify(first_scene(), [run_of(0), run_of(5)], unknown=NAMES)
     assert same.status_name == "found", same.notes
+
+
+ONE = jv.one_mass(mass=50.0, stiffness=4e4, damping=20.0)
+FRAME = jv.Channel("frame", "acceleration", at=1, gain_error=0.0)
+
+
+def notes_of(top, duration):
+    """Return the notes about a run-up to `top`, rad/s, of a machine with 28 rad/s and a decay time of 5 s."""
+    time = np.linspace(0.0, duration, 1001)
+    problem = SimpleNamespace(times=(time,), angles=((0.5 * top / duration * time**2)[:, None],))
+    return list(coverage_notes(SimpleNamespace(problem=problem), np.array([28.0]), np.array([1.0 / 28.0 / 5.0])))
+
+
+def test_run_below_the_resonance_and_a_short_run_are_named():
+    (low,) = notes_of(20.0, 12.0)
+    assert "no run passes a resonance: the rotors turn at" in low and "the natural frequencies are 28 rad/s" in low
+    (short,) = notes_of(60.0, 9.0)
+    assert "run 1 lasts 9 s, less than two decay times of the slowest mode (5 s each)" in short
+    assert notes_of(60.0, 12.0) == []
+
+
+def test_more_unknowns_than_readings_are_refused():
+    scene = jv.Scene(ONE, exciters=[jv.Exciter(drive=jv.RunUp(60.0, acceleration=7.5), unbalance=0.05)])
+    t = 0.01 * np.arange(800)
+    run = jv.MeasuredRun.from_arrays([FRAME], t, {"frame": np.random.default_rng(0).normal(size=t.size)})
+    run.values["frame"][6:] = np.nan
+    with pytest.raises(jv.InputError, match="unknown has 7 unknowns with those of the runs, for 6 readings"):
+        jv.identify(scene, run, unknown=["machine.stiffness", "machine.damping"])
