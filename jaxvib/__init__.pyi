@@ -76,6 +76,7 @@ from jaxvib.steady.shapes import ModeShapes, mode_shapes
 from jaxvib.steady.response import Response, ResponseStatus, response
 
 # Synchronous regimes
+from jaxvib.steady.regimes.partitions import RegimePartitions, regime_partitions
 from jaxvib.steady.regimes.synchronous import (
     RegimeSearchStatus,
     RegimeStatus,
@@ -282,6 +283,8 @@ __all__ = [
     "SynchronousRegime",
     "RegimeStatus",
     "RegimeSearchStatus",
+    "regime_partitions",
+    "RegimePartitions",
     # Exact jams
     "jam_orbit",
     "Orbit",

@@ -14,6 +14,9 @@ Source: the averaged equations (`jaxvib.equations.averaged`) at rest; I. I. Blek
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -193,9 +196,40 @@ def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
 
 
 @cached
-def assemble_for_search(scene: Scene) -> TorqueBalance:
-    """Assemble the torque balance of a validated scene in the form for searches, see `TorqueBalance.decomposed`."""
-    return assemble_torque_balance(scene).decomposed()
+def assemble_for_search(scene: Scene, masses: tuple[int, ...] | None = None) -> TorqueBalance:
+    """Assemble the torque balance of a validated scene in the form for searches, see `TorqueBalance.decomposed`.
+
+    `masses`: numbers of the rotating masses, see `balance_of_group`; None for all.
+    """
+    balance = assemble_torque_balance(scene)
+    return (balance if masses is None else balance_of_group(balance, masses)).decomposed()
+
+
+def balance_of_group(balance: TorqueBalance, masses: tuple[int, ...]) -> TorqueBalance:
+    """Return the balance of some rotating masses, by number. The others move with the machine, but exert no force."""
+    field, kept = balance.averaged, np.asarray(masses)
+    owner = owners_of(field.counts)[kept]
+    exciters = sorted(set(owner.tolist()))
+    rows = np.flatnonzero(np.isin(field.owners, exciters))
+    averaged = dataclasses.replace(
+        field,
+        input_matrix=field.input_matrix[rows],
+        port=field.port[rows],
+        levers=field.levers[np.ix_(rows, kept)],
+        unbalance=field.unbalance[kept],
+        inertia=field.inertia[kept],
+        drag=field.drag[kept],
+        drives=tuple(field.drives[k] for k in exciters),
+        counts=tuple(int(np.sum(owner == k)) if field.counts[k] else 0 for k in exciters),
+        directions=tuple(field.directions[k] for k in exciters),
+        owners=tuple(exciters.index(field.owners[row]) for row in rows),
+    )
+    return TorqueBalance(balance.model, averaged, balance.direction[kept], balance.motor_torque[kept])
+
+
+def owners_of(counts: Sequence[int]) -> np.ndarray:
+    """Return the exciter of each rotating mass from the numbers of loads of the exciters, 0 for an unbalance."""
+    return np.repeat(np.arange(len(counts)), [max(count, 1) for count in counts])
 
 
 def _motor_torque(averaged: Averaged) -> Array:

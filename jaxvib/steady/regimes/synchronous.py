@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, overload
 
 import equinox as eqx
@@ -18,9 +19,11 @@ from jaxvib.equations.torque_balance import (
     TorqueBalance,
     assemble_for_search,
     assemble_torque_balance,
+    balance_of_group,
     balance_residuals,
     can_start,
     motion_of,
+    owners_of,
     response_of,
     torques_at,
     unknowns_of,
@@ -205,16 +208,20 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
 @validated
 @overload
-def synchronous_regimes(scene: Scene) -> SynchronousRegimes: ...
+def synchronous_regimes(scene: Scene, *, masses: Sequence[int] | None = None) -> SynchronousRegimes: ...
 
 
 @validated
 @overload
-def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array]) -> SynchronousRegime: ...
+def synchronous_regimes(
+    scene: Scene, *, masses: Sequence[int] | None = None, near: tuple[Number, Array]
+) -> SynchronousRegime: ...
 
 
 @validated
-def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = None) -> SynchronousRegimes | SynchronousRegime:
+def synchronous_regimes(
+    scene: Scene, *, masses: Sequence[int] | None = None, near: tuple[Number, Array] | None = None
+) -> SynchronousRegimes | SynchronousRegime:
     """Return all synchronous regimes of a scene, in which all rotating masses turn at one speed, by averaging over a turn.
 
         L_i(Omega) + V_i(Omega, alpha) = 0 for every mass i
@@ -228,13 +235,15 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = Non
     - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
     - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; phases are off by tenths of a
       radian close to where two regimes exchange stability
-    - One common speed is assumed. Exciters of different speeds do not act on each other at this order; the search leaves such
-      motions out
+    - Exciters of different speeds do not act on each other at this order, see `masses`; `regime_partitions` returns all motions
+      of such groups
 
     **Arguments**
 
     - `scene`, with gravity as its only effect or without effects; exciters have an unbalance, or loads and an ideal drive;
       typical: 2 to 6 rotating masses
+    - `masses`: numbers, from 0, of the rotating masses that turn at the common speed; the result contains only these and their
+      exciters. The others turn at different speeds and only move with the machine. Default: all
     - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime. The function can then be used
       under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem; `growth`, `quasi_static`
       and `stable` have none
@@ -259,34 +268,59 @@ def synchronous_regimes(scene: Scene, *, near: tuple[Number, Array] | None = Non
     """
     scene = validate_scene(scene)
     require_rotating_masses(scene)
-    require_one_speed(scene)
-    count = sum(1 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters)
+    owners = mass_owners(scene)
+    group = _read_group(masses, owners.size)
+    require_one_speed(scene, owners if group is None else owners[list(group)])
+    count = owners.size if group is None else len(group)
     if near is not None:
         if not isinstance(near, (tuple, list)) or len(near) != 2 or np.shape(near[1]) != (count,):
             raise InputError("near", f"must be (speed, phases) with one phase for each of the {count} rotating masses")
         speed, phases = number(near[0], "rad/s", "near[0]", low=0.0, open_low=True), numbers(near[1], "rad", "near[1]", count)
-        return outcome(_regime_near(scene, speed, phases), scene)
-    omega, phases = all_regimes(assemble_for_search(scene))
-    found = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a), omega, phases)
+        return outcome(_regime_near(scene, speed, phases, group), scene)
+    omega, phases = all_regimes(assemble_for_search(scene, group))
+    found = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
     kept = np.flatnonzero(status_names(found["status"]) != "not_converged")
     kept = kept[np.lexsort((-found["speed"][kept], ~found["stable"][kept]))]
     search = RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none
     return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[kept], found)), scene=scene, search=search)
 
 
-@cached
-def _regimes_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
-    return jax.vmap(lambda w, a: _fields_near(scene, w, a))(omega, phases)
+def mass_owners(scene: Scene) -> np.ndarray:
+    """Return the exciter of each rotating mass."""
+    return owners_of([0 if exciter.loads is None else exciter.loads.count for exciter in scene.exciters])
+
+
+def _read_group(masses: Sequence[int] | None, count: int) -> tuple[int, ...] | None:
+    """Return the numbers of some masses in ascending order, or None for all."""
+    if masses is None:
+        return None
+    numbers = list(masses) if isinstance(masses, (list, tuple)) else []
+    whole = all(isinstance(k, (int, np.integer)) and not isinstance(k, bool) and 0 <= k < count for k in numbers)
+    if not numbers or not whole or len(set(numbers)) < len(numbers):
+        raise InputError("masses", f"is {quoted(masses)}; give different numbers of rotating masses, 0 to {count - 1}")
+    return tuple(sorted(int(k) for k in numbers)) if len(numbers) < count else None
 
 
 @cached
-def _regime_near(scene: Scene, omega: Array, phases: Array) -> SynchronousRegime:
-    return SynchronousRegime(**_fields_near(scene, omega, phases), scene=scene)
+def _regimes_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> dict[str, Any]:
+    return jax.vmap(lambda w, a: _fields_near(scene, w, a, group))(omega, phases)
 
 
-def _fields_near(scene: Scene, omega: Array, phases: Array) -> dict[str, Any]:
-    """Return the fields of the regime to which a start leads, without the scene."""
+@cached
+def _regime_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> SynchronousRegime:
+    return SynchronousRegime(**_fields_near(scene, omega, phases, group), scene=scene)
+
+
+def _fields_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> dict[str, Any]:
+    """Return the fields of the regime of a group of masses (None: all) to which a start leads, without the scene."""
     balance = assemble_torque_balance(scene)
+    if group is not None:
+        fields = _fields_of(balance_of_group(balance, group), omega, phases)
+        return {**fields, "can_start": fields["can_start"][np.unique(mass_owners(scene)[list(group)])]}
+    return _fields_of(balance, omega, phases)
+
+
+def _fields_of(balance: TorqueBalance, omega: Array, phases: Array) -> dict[str, Any]:
     frozen = jax.lax.stop_gradient(balance)
     x = jax.lax.stop_gradient(unknowns_of(frozen, omega, phases))
     if x.size == 0:
@@ -348,7 +382,7 @@ def fields_at(balance: TorqueBalance, x: Array, slopes: Slopes | None, growth: A
 def _power(balance: TorqueBalance, omega: Array, driving: Array) -> Array:
     """Return the power of each drive, (exciters,) W: the driving torque of its masses times the speed of its rotor."""
     averaged, rate = balance.averaged, jnp.full_like(driving, omega)
-    each = np.repeat(np.arange(len(averaged.counts)), [max(count, 1) for count in averaged.counts])
+    each = owners_of(averaged.counts)
     torque = jnp.zeros(len(averaged.counts), driving.dtype).at[each].add(driving)
     return torque * jnp.stack(balance.rotor_speeds(rate))
 
@@ -363,9 +397,10 @@ def _has_one_speed(balance: TorqueBalance) -> Array:
     return jnp.all(jnp.stack([speed == speeds[0] for speed in speeds])) if speeds else jnp.asarray(True)
 
 
-def require_one_speed(scene: Scene) -> None:
+def require_one_speed(scene: Scene, exciters: Iterable[int] | None = None) -> None:
     """**Raises** `InputError` if ideal drives turn unbalances at different speeds. Traced speeds are not checked."""
-    ideal = [k for k, exciter in enumerate(scene.exciters) if exciter.loads is None and exciter.drive.ideal]
+    chosen = range(len(scene.exciters)) if exciters is None else exciters
+    ideal = [k for k in chosen if scene.exciters[k].loads is None and scene.exciters[k].drive.ideal]
 
     def check(*speeds: float) -> None:
         for k, speed in zip(ideal, speeds, strict=True):

@@ -1,0 +1,278 @@
+"""Motions of rotating masses in groups: each group turns at one speed, different groups at different speeds.
+
+The mean torque between masses of different speeds is zero. The torque of mass k on mass i alternates at the difference of their
+speeds, with the amplitude
+
+    T_ik = (S_i S_k / 2) w_k^4 |H_ik(w_k)|
+
+and changes the speed of mass i, whose inertia is I_i and whose driving torque has the slope L_i', by T_ik/|i d I_i - L_i'| at
+the difference d = w_k - w_i. The groups are independent if this change is small compared with d. The sum of the ratios over k
+is the `interaction` of a motion.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.display import speed_text
+from jaxvib.equations.averaged import require_rotating_masses
+from jaxvib.equations.torque_balance import assemble_torque_balance, influence_of
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.runtime.parallel import in_chunks
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.regimes.search import exchanges_in
+from jaxvib.steady.regimes.synchronous import (
+    RegimeSearchStatus,
+    SynchronousRegime,
+    SynchronousRegimes,
+    mass_owners,
+    synchronous_regimes,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxvib.draw.style import Drawn
+
+_MAX_MASSES = 6
+"""Largest number of rotating masses; 6 have 63 possible groups and 203 partitions."""
+
+_LARGEST_INTERACTION = 1.0
+"""Interaction above which groups are not independent."""
+
+_EQUAL_SPEEDS = 1e-9
+"""Relative difference of speeds below which two groups are not different."""
+
+_MOTIONS_PER_PROGRAM = 64
+"""Number of motions whose interaction is computed in one program."""
+
+
+class RegimePartitions(Result):
+    """Motions of rotating masses in groups, each with one speed. Returned by `regime_partitions`.
+
+    Stable motions come first, then motions with few groups.
+
+    **Attributes** (n motions)
+
+    - `status`: a `RegimeSearchStatus`
+    - `group` (n, mass): number of the group of each rotating mass, from 0
+    - `speed` (n, mass), rad/s, and `phases` (n, mass), rad, of each rotating mass; the phases are those of a
+      `SynchronousRegime` of its group
+    - `growth` (n,), 1/s: the largest of all groups; `stable` (n,): True if it is negative
+    - `interaction` (n,): estimated relative error of the differences of the speeds, because groups act on each other; 0 for a
+      single group; typical: 1e-4 to 0.3
+    - `scene`
+    """
+
+    status: RegimeSearchStatus
+    group: np.ndarray = eqx.field(metadata=in_unit("", "motion", "mass"))
+    speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "motion", "mass"))
+    phases: np.ndarray = eqx.field(metadata=in_unit("rad", "motion", "mass"))
+    growth: np.ndarray = eqx.field(metadata=in_unit("1/s", "motion"))
+    stable: np.ndarray = eqx.field(metadata=in_unit("", "motion"))
+    interaction: np.ndarray = eqx.field(metadata=in_unit("", "motion"))
+    scene: Scene = eqx.field(metadata=SCENE)
+
+    @validated
+    def select(self, index: int) -> list[SynchronousRegime]:
+        """Return the regime of each group of the motion with an `index`, counted from 0.
+
+        **Raises** `InputError` if there are fewer motions.
+        """
+        n = self.speed.shape[0]
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
+            raise InputError("index", f"is {quoted(index)}; there are {n} motions, counted from 0")
+        regimes = []
+        for number in range(int(np.max(self.group[index])) + 1):
+            masses = np.flatnonzero(self.group[index] == number)
+            near = float(self.speed[index, masses[0]]), jnp.asarray(self.phases[index, masses])
+            regimes.append(synchronous_regimes(self.scene, masses=masses.tolist(), near=near))
+        return regimes
+
+    def summary(self) -> str:
+        """Return a line of text for each motion: the masses of each group and its speed."""
+        lines = []
+        for group, speed, stable, growth, interaction in zip(
+            self.group, self.speed, self.stable, self.growth, self.interaction, strict=True
+        ):
+            named = []
+            for number in range(int(np.max(group)) + 1):
+                masses = np.flatnonzero(group == number)
+                named.append(f"{', '.join(map(str, masses))}: {speed_text(speed[masses[0]], 6)}")
+            judged = f"{'stable' if stable else 'unstable'} ({growth:.3g} 1/s), interaction {interaction:.2g}"
+            lines.append(f"{'; '.join(named)}; {judged}")
+        return "\n".join(lines) or RegimeSearchStatus[RegimeSearchStatus.none]
+
+    @validated
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """Plot the speed of each mass over the number of the motion. **Returns** a matplotlib figure, or the given `ax`."""
+        from jaxvib.draw.results import points_chart  # slow import
+
+        return points_chart(self.speed, x_label="motion", y_label="speed, rad/s", ax=ax)
+
+
+@validated
+def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
+    """Return the motions in which rotating masses turn in groups of different speeds, by averaging over a turn.
+
+    Unbalances or loads that cannot synchronise, or of which a resonance catches only some, turn at different speeds. At this
+    order of the averaging, groups of different speeds do not act on each other. A motion is therefore a partition of the
+    masses into groups, and a synchronous regime of each group. Motions of a single group are included.
+
+    - The groups are independent if the torques between them change the differences of their speeds little; the ratio is
+      `interaction`. Motions whose interaction is above 1 are left out
+    - Motions that differ by an exchange of equal exciters are listed once
+
+    **Arguments**
+
+    - `scene` as for `synchronous_regimes`, with 1 to 6 rotating masses
+    - `stable`: True (the default) for motions whose groups are all stable; False for all motions, which can be thousands
+
+    **Returns** `RegimePartitions`.
+
+    **Raises** `InputError` as `synchronous_regimes`, and for more than 6 rotating masses.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> springs = [jv.support(at=(x, 0.0), stiffness=(3e4, 3e4), damping=(300.0, 300.0)) for x in (-0.6, 0.6)]
+    >>> screen = jv.plane_body(mass=300.0, inertia=75.0, supports=springs)
+    >>> motors = [jv.DCMotor(n, stall_torque=60.0, inertia=0.05) for n in (100.0, 60.0)]
+    >>> exciters = [jv.Exciter(drive=m, unbalance=0.4, at=(x, 0.0)) for m, x in zip(motors, (-0.3, 0.3))]
+    >>> found = jv.regime_partitions(jv.Scene(screen, exciters=exciters))
+    >>> found.group.tolist(), found.speed.round().tolist()
+    ([[0, 1]], [[100.0, 60.0]])
+
+    Source: Blekhman 1988, Synchronization in Science and Technology.
+    """
+    scene = validate_scene(scene)
+    require_rotating_masses(scene)
+    owners = mass_owners(scene)
+    count = owners.size
+    if count > _MAX_MASSES:
+        raise InputError("scene", f"has {count} rotating masses; at most {_MAX_MASSES} are possible, which have 63 groups")
+    subsets = [each for size in range(1, count + 1) for each in itertools.combinations(range(count), size)]
+    regimes = {subset: _members(scene, subset, stable=stable) for subset in subsets if _can_share(scene, owners[list(subset)])}
+    motions = [_motion(parts, count) for parts in _products(tuple(range(count)), regimes)]
+    rows = _Rows(*map(np.array, zip(*motions, strict=True))) if motions else _no_rows(count)
+    interaction = in_chunks(_MOTIONS_PER_PROGRAM, _interactions, rows.speed, rows.group, shared=(scene,))
+    balance = cached(assemble_torque_balance)(scene)
+    kept = np.flatnonzero(interaction <= _LARGEST_INTERACTION)
+    kept = kept[np.lexsort((np.max(rows.group[kept], axis=1, initial=0), ~rows.stable[kept]))]
+    orders = np.array([exchange.order for exchange in exchanges_in(balance)])
+    kept = kept[_distinct(rows.speed[kept], rows.torque[kept], orders)]
+    return RegimePartitions(
+        status=RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none,
+        group=rows.group[kept],
+        speed=rows.speed[kept],
+        phases=rows.phases[kept],
+        growth=rows.growth[kept],
+        stable=rows.stable[kept],
+        interaction=interaction[kept],
+        scene=scene,
+    )
+
+
+class _Rows(NamedTuple):
+    """Motions: `group`, `speed`, `phases`, `torque` (n, masses); `growth` and `stable` (n,)."""
+
+    group: np.ndarray
+    speed: np.ndarray
+    phases: np.ndarray
+    torque: np.ndarray
+    growth: np.ndarray
+    stable: np.ndarray
+
+
+def _no_rows(masses: int) -> _Rows:
+    empty = np.zeros((0, masses))
+    return _Rows(empty.astype(int), empty, empty, empty, np.zeros(0), np.zeros(0, bool))
+
+
+def _can_share(scene: Scene, owners: np.ndarray) -> bool:
+    """Return False if ideal drives turn unbalances of the exciters `owners` at different speeds."""
+    exciters = [scene.exciters[k] for k in owners]
+    return len({float(each.drive.speed) for each in exciters if each.loads is None and each.drive.ideal}) < 2
+
+
+def _members(scene: Scene, subset: tuple[int, ...], *, stable: bool) -> list[SynchronousRegime]:
+    """Return the regimes of a group of masses."""
+    found: SynchronousRegimes = synchronous_regimes(scene, masses=subset)
+    finite = np.isfinite(np.asarray(found.growth))
+    wanted = np.flatnonzero(finite & np.asarray(found.stable) if stable else finite)
+    numpy = jax.tree.map(np.asarray, eqx.filter(found, eqx.is_array))
+    found = eqx.combine(numpy, found)
+    return [found.select(int(k)) for k in wanted]
+
+
+_Group = tuple[tuple[int, ...], SynchronousRegime]
+
+
+def _products(left: tuple[int, ...], regimes: dict[tuple[int, ...], list[SynchronousRegime]]) -> Iterator[list[_Group]]:
+    """Yield all partitions of the masses `left` into groups, with each combination of their regimes."""
+    if not left:
+        yield []
+        return
+    for subset, found in regimes.items():
+        if subset[0] == left[0] and set(subset) <= set(left):
+            rest = tuple(k for k in left if k not in subset)
+            for others in _products(rest, regimes):
+                yield from ([(subset, regime), *others] for regime in found)
+
+
+def _motion(parts: list[_Group], count: int) -> tuple:
+    """Return the fields of `_Rows` of a motion."""
+    group, (speed, phases, torque) = np.zeros(count, int), np.zeros((3, count))
+    for number, (subset, regime) in enumerate(parts):
+        masses = list(subset)
+        group[masses] = number
+        speed[masses], phases[masses], torque[masses] = regime.speed, regime.phases, regime.torque
+    growth = max(float(regime.growth) for _, regime in parts)
+    return group, speed, phases, torque, growth, all(bool(regime.stable) for _, regime in parts)
+
+
+@cached
+def _interactions(speed: Array, group: Array, scene: Scene) -> Array:
+    """Return the interaction (n,) of motions whose masses turn at `speed` (n, masses) in their `group` (n, masses)."""
+    balance = assemble_torque_balance(scene)
+    unbalance, inertia = balance.unbalance, balance.averaged.inertia
+
+    def one(speed: Array, group: Array) -> Array:
+        influence = jax.vmap(lambda w: magnitude(influence_of(balance, w)))(speed)
+        from_each = jnp.diagonal(influence, axis1=0, axis2=2)  # (i, k): at the speed of mass k
+        torque = 0.5 * unbalance[:, None] * unbalance[None] * speed[None] ** 4 * from_each
+        slope = jnp.diagonal(jax.jacfwd(balance.driving_torques)(speed))
+        difference = speed[None] - speed[:, None]
+        resistance = jnp.abs(difference) * jnp.sqrt((difference * inertia[:, None]) ** 2 + slope[:, None] ** 2)
+        acts = (group[None] != group[:, None]) & (torque > 0.0) & jnp.isfinite(inertia)[:, None]
+        equal = (group[None] != group[:, None]) & (jnp.abs(difference) <= _EQUAL_SPEEDS * jnp.abs(speed)[None])
+        found = jnp.max(jnp.sum(jnp.where(acts, torque / resistance, 0.0), axis=1))
+        return jnp.where(jnp.any(equal), jnp.inf, found)
+
+    return jax.vmap(one)(speed, group)
+
+
+def _distinct(speed: np.ndarray, torque: np.ndarray, orders: np.ndarray) -> np.ndarray:
+    """Return indices of motions (n,) of which no two differ only by an exchange of masses, `orders` (exchanges, masses)."""
+    numbers = np.stack([speed, torque], axis=-1)
+    scale = 1e-5 * np.max(np.abs(numbers), axis=(0, 1), initial=1e-300)
+    kept: list[int] = []
+    for k, own in enumerate(numbers):
+        forms = own[orders]
+        if not any(np.any(np.all(np.abs(forms - numbers[i]) <= scale, axis=(1, 2))) for i in kept):
+            kept.append(k)
+    return np.asarray(kept, dtype=int)
