@@ -147,6 +147,16 @@ RESULTS = {
     "PhaseJam": lambda: RESULTS["PhaseJams"]().select(0),
     "SynchronousRegimes": cached(lambda: jv.synchronous_regimes(SCREEN)),
     "SynchronousRegime": lambda: RESULTS["SynchronousRegimes"]().select(0),
+    "RegimePartitions": lambda: jv.RegimePartitions(
+        status=jv.RegimeSearchStatus.done,
+        group=np.array([[0, 1]]),
+        speed=np.array([[100.0, 60.0]]),
+        phases=np.zeros((1, 2)),
+        growth=np.array([-1.0]),
+        stable=np.array([True]),
+        interaction=np.array([0.1]),
+        scene=SCREEN,
+    ),
     "Deck": lambda: RESULTS["SynchronousRegime"]().deck([(-1.0, 0.2), (1.0, 0.2)]),
     "SynchronousOrbit": cached(lambda: jv.synchronous_orbit(SCREEN, RESULTS["SynchronousRegime"]())),
     "SynchronizationLimit": lambda: jv.synchronization_limit(
