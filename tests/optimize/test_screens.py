@@ -14,13 +14,9 @@ from optimize import (
     hold,
     load_design,
     motion_spread,
-    pareto,
-    power,
     recipes,
-    synchronization_margin,
     synthesize,
     throw_angle,
-    throw_stroke,
 )
 from optimize.files import SCREEN_TEMPLATES
 
@@ -72,36 +68,6 @@ def test_straight_throw_is_that_of_a_dense_scan():
 
 
 @pytest.mark.slow
-def test_256_starts_find_the_scan_and_verify_it():
-    space, objective = DesignSpace(screen(), place()), straight_at_45()
-    best = synthesize(space, objective)
-    _, least = scan(space, objective)
-    assert best.status_name == "done" and best.starts == 256 and best.same > 128
-    np.testing.assert_allclose(best.values.min(), least, rtol=1e-4)
-    assert best.verified is not None, best.unverified
-    for row in best.table[2:6]:
-        np.testing.assert_allclose(row.time, row.exact, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_margin_and_force_constrain_the_design():
-    """Unequal motors; the springs are free too. The demands are met in the complete search for regimes."""
-    space = DesignSpace(
-        screen(breakdown_torque=60.0),
-        {**place(), "machine.supports[0].stiffness[1]": (3e5, 7e5), "machine.supports[1].stiffness[1]": (3e5, 7e5)},
-    )
-    free = synthesize(space, straight_at_45(), starts=32, verify=False)
-    margin, force = (float(q(free.scene)) for q in (synchronization_margin(), foundation_force()))
-    demands = [synchronization_margin() > 1.2 * margin, foundation_force() < 0.95 * force]
-    best = synthesize(space, straight_at_45(), subject_to=demands, starts=32)
-    assert best.status_name == "done" and best.values.min() > free.values.min()
-    assert any(limit.active for limit in best.limits[:2]) and all(limit.violation == 0.0 for limit in best.limits)
-    regime = jv.synchronous_regimes(best.scene).select(0)
-    assert float(regime.margin) > 1.2 * margin * (1.0 - 1e-6)
-    assert float(regime.foundation_force) < 0.95 * force * (1.0 + 1e-6)
-
-
-@pytest.mark.slow
 def test_designs_without_a_regime_end_in_a_named_status():
     """A light unbalance does not couple motors of 1000 and at least 2000 rpm."""
     light = eqx.tree_at(lambda s: s.exciters[0].unbalance, screen(), jnp.asarray(0.05))
@@ -142,31 +108,6 @@ def test_wrong_recipes_in_files_are_refused(text, says, tmp_path):
     (tmp_path / "design.toml").write_text(f'scene = "screen.toml"\n{text}\n')
     with pytest.raises(jv.InputError, match=says):
         load_design(tmp_path / "design.toml")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "angle"), [("linear_screen", 45.0), ("feeder", 25.0), ("circular_screen", None)])
-def test_recipes_improve_the_templates(kind, angle):
-    scene = jv.scene_from_toml(SCREENS[kind])
-    points = [(-0.8, 0.1), (0.8, 0.1)] if kind == "feeder" else DECK
-    design = getattr(recipes, kind)(scene, points=points)
-    best = design.run(starts=8)
-    assert best.status_name == "done" and best.verified is not None, best.unverified
-    middle = tuple(np.mean(points, axis=0).tolist())
-    np.testing.assert_allclose(throw_stroke(at=middle)(best.scene), throw_stroke(at=middle)(scene), rtol=1e-6)
-    assert best.values.min() < float(design.objective(scene))
-    if angle is not None:
-        np.testing.assert_allclose(np.rad2deg(throw_angle(at=middle)(best.scene)), angle, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_front_of_throw_and_power():
-    space = DesignSpace(
-        screen(), {"exciters[0].unbalance": (2.0, 6.0)}, ties={"exciters[1].unbalance": "exciters[0].unbalance"}
-    )
-    front = pareto(space, -throw_stroke(), power(), points=3, starts=4)
-    assert len(front.values) == 3 and np.all(np.diff(front.values[:, 1]) < 0.0)
-    assert len(front.scene(0).exciters) == 2
 
 
 @pytest.mark.slow
