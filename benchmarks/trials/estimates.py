@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, with_nearest_turns
 
 jv.prepare_cpu()
 
@@ -108,7 +108,7 @@ def true_error(scene: jv.Scene, run: jv.Run, best: jv.Run) -> float:
         return x + np.gradient(x, times, axis=0) * late.reshape(-1, *[1] * (x.ndim - 1))
 
     theirs = jax.tree.map(moved, theirs)
-    return float(scaled_error(turned(ours, theirs), theirs, error_scale(theirs, natural_units(scene))))
+    return float(scaled_error(with_nearest_turns(ours, theirs), theirs, error_scale(theirs, natural_units(scene))))
 
 
 def measured(kind: str, seed: int, dtype: type) -> dict[str, float | str | int]:

@@ -187,8 +187,8 @@ def shares_chart(
 
     >>> import numpy as np
     >>> share = np.array([0.1, 0.5])
-    >>> len(shares_chart(np.arange(2.0), {"mode 3": (share, share - 0.1, share + 0.1)}, x_label="x").axes[0].lines)
-    1
+    >>> shares_chart(np.arange(2.0), {"mode 3": (share, share - 0.1, share + 0.1)}, x_label="x").axes[0].get_ylabel()
+    'share of the cases, % (95 % confidence)'
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     for k, (colour, (name, (share, low, high))) in enumerate(zip(_label_colors([*shares]), shares.items(), strict=True)):

@@ -76,7 +76,7 @@ def drag_of(
     >>> import jaxvib as jv
     >>> speeds = dict(radius="120 mm", load_speed="780 rpm", rotor_speed="1500 rpm")
     >>> round(float(jv.drag_of("oil", ball_radius="20 mm", viscosity="0.1 Pa s", density=870.0, **speeds)), 2)
-    1.95
+    1.91
     >>> round(float(jv.drag_of("bearing", mass="0.8 kg", friction=0.0015, diameter="12 mm", **speeds)), 4)
     0.0053
 

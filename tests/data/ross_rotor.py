@@ -11,12 +11,13 @@ them.
 from pathlib import Path
 
 import numpy as np
-import ross as rs
 
 LATERAL = [6 * node + k for node in range(7) for k in (0, 1, 3, 4)]
 
 
 def main() -> None:
+    import ross as rs  # needed only to write the file anew
+
     steel = rs.Material(name="steel", rho=7810, E=211e9, G_s=81.2e9)
     shaft = [rs.ShaftElement(L=0.25, idl=0.0, odl=0.05, material=steel) for _ in range(6)]
     discs = [rs.DiskElement.from_geometry(n=n, material=steel, width=0.07, i_d=0.05, o_d=0.28) for n in (2, 4)]

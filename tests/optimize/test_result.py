@@ -116,4 +116,4 @@ def test_figures_show_what_was_found(searched, monkeypatch):
     front.plot()
     (across, up), how = shown["front_chart"]
     np.testing.assert_allclose([across, up], [[20.0, 30.0], [500.0, 250.0]])
-    assert how == {"across": "two, kN", "up": "one, mm", "ax": None}
+    assert how == {"x_label": "two, kN", "y_label": "one, mm", "ax": None}

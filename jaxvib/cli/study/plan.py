@@ -9,7 +9,6 @@ import click
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.cli.output import fields_of
-from jaxvib.display import speed_text
 from jaxvib.errors import InputError
 
 
@@ -24,6 +23,7 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     sensors, numbers that are changed. With the table [limits], the speed of the best candidate is improved."""
     import numpy as np  # slow imports, which --help does not need
 
+    from jaxvib.display import speed_text
     from jaxvib.exchange.recordings.fit_file import fit_from_tables
     from jaxvib.machine.files import read_toml
 
