@@ -253,7 +253,7 @@ def response(
     >>> [round(float(w), 2) for w in found.operating.speed[found.operating.exists]]          # caught below 604 rpm, or passed
     [62.69, 63.96, 156.2]
     >>> [round(float(f), 3) for f in found.folds.factor]
-    [1.447, 0.097]
+    [1.179, 0.019]
 
     Source: Sommerfeld 1902; I. I. Blekhman, Vibrational Mechanics, 2000, for the torque; the folds are those of `branches`.
     """
