@@ -24,7 +24,7 @@ FAST = {
     ("damping 1e-8 of critical", "float64"),
     ("three platforms alike, weak links", "float64"),
     ("one load", "float64"),
-    ("watch of 1e-9 kg, run", "float64"),
+    ("micromachine of 1e-9 kg, run", "float64"),
     ("energy over 1e4 turns", "float64"),
     ("drag 0, exact jam", "float64"),
 }

@@ -15,7 +15,8 @@ from repeated_records.fits import CASES, repeated
 
 def main(count: int, names: list[str]) -> None:
     print(
-        "| case | records | intervals that hold the truth | largest standard deviation / bound | wrong minima | called found |"
+        "| case | records | intervals that hold the truth | largest standard deviation / bound | wrong minima | "
+        "of these with status found |"
     )
     for name in names:
         begin = time.process_time()

@@ -20,7 +20,7 @@ CASES = {
     "white noise": {},
     "coloured noise, correlation 0.9": {"color": 0.9},
     "2 % outliers, 20 times the noise": {"outliers": 0.02},
-    "gains drawn, 1 %": {"gain_error": 0.01},
+    "random gains, standard deviation 1 %": {"gain_error": 0.01},
     "motor that dips at the resonances": {"motor": True},
     "one pulse per turn, times rounded to 1 ms": {"pulses": 1, "resolution": 1e-3},
     "readings clipped at 60 % of the largest": {"full_scale": 0.6},
@@ -58,7 +58,7 @@ class Repeated:
 
     @property
     def row(self):
-        """Row of a table: intervals that hold the truth, standard deviation, wrong minima, and those of them called found."""
+        """Row of a table: intervals that hold the truth, standard deviation, wrong minima, those with status `found`."""
         found = int(np.sum(self.wrong & (self.statuses == "found")))
         held, share = self.held, np.mean(self.statuses == "found")
         return (

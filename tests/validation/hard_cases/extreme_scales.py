@@ -1,4 +1,4 @@
-"""Hard cases of numbers: loads heavy and light, one and a thousand, drag none and huge, a watch and a quarry screen."""
+"""Hard cases of numbers: loads heavy and light, one and a thousand, drag none and huge, a micromachine and a quarry screen."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ CASES = (
         case
         for name, hard, mass, length, time in (
             (
-                "watch of 1e-9 kg",
+                "micromachine of 1e-9 kg",
                 "displacements of 1e-10 m and angles of 10 rad: absolute tolerances fail",
                 1e-9,
                 1e-6,
