@@ -17,7 +17,7 @@ class Design:
     """Design task: `space`, `objective`, the arguments of `synthesize` in `search`, and the demands
     `subject_to`.
 
-    Returned by `load_design` and by recipes.
+    Returned by `load_design` and by the functions of `optimize.recipes`.
     """
 
     space: DesignSpace

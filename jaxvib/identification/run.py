@@ -24,7 +24,7 @@ _FULL = 0.999
 
 
 _QUANTITIES = {"acceleration": "a", "velocity": "v", "displacement": "d", "force": "f"}
-"""Names of kinds by SEP-005."""
+"""Names that the format SEP-005 gives to the kinds of channels."""
 
 
 class Change(NamedTuple):
@@ -118,7 +118,7 @@ class MeasuredRun(eqx.Module):
         change: Mapping[str, Number] | None = None,
         source: str = "run",
     ) -> MeasuredRun:
-        """Return a run from dictionaries by SEP-005, the form in which the packages of SDyPy exchange measurements.
+        """Return a run from dictionaries in the format SEP-005, in which the packages of SDyPy exchange measurements.
 
         **Arguments**
 
@@ -138,7 +138,8 @@ class MeasuredRun(eqx.Module):
         return cls.from_arrays(channels, times, values, change, source)
 
     def to_sep005(self) -> list[dict[str, Any]]:
-        """Return the channels as dictionaries by SEP-005, in SI units: `name`, `data`, `unit_str`, `fs` (Hz) and `quantity`.
+        """Return the channels as dictionaries in the format SEP-005, in SI units: `name`, `data`, `unit_str`, `fs` (Hz) and
+        `quantity`.
 
         Channels of pulses, and channels that do not begin at 0 s, have a list `time` (s).
         """

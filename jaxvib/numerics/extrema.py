@@ -22,7 +22,8 @@ def _hermite() -> tuple[np.ndarray, np.ndarray]:
     """Return matrices (4, 3) and (4, 4) that give the even and the odd coefficients of `_polynomial`.
 
     They are multiplied by sums and differences of the values, and of the slopes, at the two inner points (-1/2 and 1/2) and at
-    the two outer points (-3/2 and 3/2). The sum of the inner values is omitted, because all values are relative to it.
+    the two outer points (-3/2 and 3/2). All values are relative to the mean of the two inner values; the sum of the inner
+    values is therefore 0 and is omitted.
     """
     nodes, even = np.asarray([[0.5], [1.5]]), np.asarray([0, 2, 4, 6])
 

@@ -31,7 +31,7 @@ class Result(eqx.Module):
     - as data: plain values `as_dict()`, a table `to_pandas()`, a labelled dataset `to_xarray()`
     - in a file: `save(path)`, `load(path)`
 
-    Data and files follow from the fields: the metadata of each states its unit and the names of its axes
+    The contents of data and files follow from the fields: the metadata of each field contain its unit and the names of its axes
     (`jaxvib.results.fields`). A result class is final: no other class inherits from it.
 
     >>> import jaxvib as jv
@@ -45,7 +45,7 @@ class Result(eqx.Module):
     outer_axes = ()
     """Names of the axes that replace "*" in the metadata of fields."""
 
-    if TYPE_CHECKING:  # for a type checker an abstract field is one that is no argument of the constructor
+    if TYPE_CHECKING:  # type checkers see the abstract field as a field that is not an argument of the constructor
         status: Any = eqx.field(init=False)
     else:
         status: eqx.AbstractVar[eqx.Enumeration]

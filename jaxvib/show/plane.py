@@ -26,7 +26,7 @@ _SPRING = 1.6
 _TURN: Look = {"color": COLORS[1], "zorder": 3.7}
 
 _STEEP_SPRING_SINE = np.sin(np.radians(40.0))
-"""Sine of the angle above which a spring is drawn downward, otherwise sideways."""
+"""Sine of the angle to the horizontal above which a spring is drawn downward; a flatter one is drawn sideways."""
 
 
 class _Strut(NamedTuple):

@@ -25,7 +25,7 @@ _OPTIONS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_p
 
 
 PYTHON = "calls Python"
-"""First words of the digest of a program that cannot be compared with other programs."""
+"""First words of the digest of a program that calls Python; such a program cannot be compared with other programs."""
 
 
 class CaseStatus(eqx.Enumeration):

@@ -85,7 +85,7 @@ def _grid(scene: Scene, axes: Mapping[str, AxisSpec], samples: int, sampling: st
     grid = Grid(found, samples, seed, sampling, ())
     if math.prod(grid.shape) > _MAX_CASES:
         problem = f"make {math.prod(grid.shape):.3g} cases; a study has {_MAX_CASES:.0e} at most"
-        raise InputError("axes", f"{problem}: take fewer values, or samples")
+        raise InputError("axes", f"{problem}: give fewer values, or give ranges without a count and draw samples")
     return grid
 
 
@@ -135,7 +135,7 @@ def _traced(study: Study) -> Study:
     for name, m, form in zip(study.names, study.measures, forms, strict=True):
         axes_count = 1 if isinstance(m, RunMeasure) and m.axis else 0
         if len(form.shape) != axes_count:
-            needed = "a scalar is needed" + (", with one axis" * axes_count)
+            needed = "an array with one axis is needed" if axes_count else "a scalar is needed"
             raise InputError(f"measure.{name}", f"has shape {form.shape}; {needed}")
     return dataclasses.replace(study, forms=tuple(forms), program=program)
 

@@ -138,8 +138,9 @@ def static_deflection(of: int | None = None) -> Quantity:
 
     **Arguments**: `of`: the platform; typical: 1 to 3; default: the largest deflection of all platforms.
 
-    **Returns** `Quantity`, NaN for a platform without a support of its own or, by links, of another platform; typical: 2 to
-    50 mm. A machine without platforms, or without this platform, raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN for a platform that neither has a support nor is linked, directly or through other platforms, to
+    one that has; typical: 2 to 50 mm. A machine without platforms, or without this platform, raises `InputError` when the
+    quantity is computed.
 
     >>> import jaxvib as jv
     >>> from optimize import static_deflection

@@ -48,8 +48,8 @@ class SearchResult(NamedTuple):
     """Results of searches.
 
     **Attributes**: those of `Polished`; `drawn`: number of random designs; `existing`: number of these for which the objective
-    exists; `interrupted`: True if the user interrupted the search; `bounds` (d,) of the best design, SI; `nodes`: number of
-    bounded problems that branch and bound solved.
+    exists; `interrupted`: True if the user interrupted the search; `bounds`: lower and upper bounds (d,) of the d parameters in
+    the problem from which the best design comes, SI; `nodes`: number of bounded problems that branch and bound solved.
     """
 
     point: Point
@@ -116,7 +116,7 @@ def _in_small_batches(problem: Problem, space: DesignSpace) -> Problem:
 
 
 def _has_tolerances(problem: Problem) -> bool:
-    """Return True if a quantity is taken over tolerances."""
+    """Return True if a quantity is a statistic over tolerances (`Robust`)."""
     every = [problem.objective, *(q for d in problem.demands for q in (d.quantity, d.limit))]
     return any(isinstance(part, Robust) for q in every for part in walk(q))
 
@@ -172,7 +172,7 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
         interrupted = True
         polished = polish(problem, last, 0, lambda *_: None)
     history.append(polished.history)
-    # A followed jam may have another mode number by now; this shows only on the whole branch.
+    # The jam that was followed may have another mode number now, which can be determined only from the whole branch.
     point, violations, remaining_decrease, optimal = (
         _with_requested_modes(problem, polished.point),
         polished.violation,

@@ -20,7 +20,7 @@ _MIN_SHARE_AT_KINK = 1e-4
 """Share above which a piece of the objective counts as one of those that meet at a kink."""
 
 _SMALL_OBJECTIVE_SHARE = 1e-4
-"""Smallest scale of the objective, relative to the change over the bounds that its slope predicts."""
+"""Smallest scale of the objective, relative to the change of the objective over the bounds that is predicted from its slope."""
 
 
 class Step(NamedTuple):

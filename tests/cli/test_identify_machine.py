@@ -140,12 +140,12 @@ def test_candidate_runs_are_ranked_from_the_command_line(typed, tmp_path):
     document = json.loads(out)
     assert (code, err) == (0, "")
     assert {"again", "heavier"} < set(document["candidates"]) and len(document["candidates"]) == 3
-    assert document["gain"] == sorted(document["gain"], reverse=True) and document["minutes"] == [0.2] * 3
+    assert document["benefit"] == sorted(document["benefit"], reverse=True) and document["minutes"] == [0.2] * 3
     assert len(document["profile"]["speeds"]) == 9 and max(document["profile"]["speeds"]) <= 100.0
     assert len(document["errors"]) == 3 and all(0.0 < error < 0.05 for row in document["errors"] for error in row)
     assert (tmp_path / "o" / "plan.png").stat().st_size > 5_000
     code, out, _ = typed("plan", "fit.toml", "--fit", "o/fit.npz")
-    assert code == 0 and "improved speed" in out and "(1) machine.stiffness[0]" in out
+    assert code == 0 and "optimized speed" in out and "(1) machine.stiffness[0]" in out
 
 
 @pytest.mark.parametrize(

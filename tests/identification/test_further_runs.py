@@ -128,7 +128,7 @@ LIMITS = {"speed": 110.0, "acceleration": 15.0}
 def test_speed_is_improved_within_the_limits():
     candidate = jv.PlannedRun("ramp", jv.RunUp(100.0, 12.0), 16.0, run_of(0).channels, rate=250.0)
     plan = jv.plan_runs(fitted(), [candidate], limits=LIMITS)
-    assert plan.candidates == ("ramp, improved speed", "ramp") and "improved speed:" in plan.summary()
+    assert plan.candidates == ("ramp, optimized speed", "ramp") and "optimized speed:" in plan.summary()
     times, speeds = (np.asarray(each) for each in (plan.profile.times, plan.profile.speeds))
     assert np.all(speeds >= 0.0) and np.all(speeds <= 110.0) and times[-1] == 16.0
     assert np.max(np.abs(np.diff(speeds) / np.diff(times))) < 15.0 * (1.0 + 1e-6)

@@ -17,10 +17,12 @@ from jaxvib.errors import InputError
 @click.option("--fit", type=click.Path(path_type=Path), help="A fit.npz of `jaxvib identify`, in place of a new fit.")
 @shared
 def plan(identification: Path, fit: Path | None, output: Output) -> None:
-    """Rank the candidate runs of an IDENTIFICATION file by the expected errors of its unknown numbers, per minute of test.
+    """Rank the candidate runs of an IDENTIFICATION file by how much they reduce the expected errors of its unknown numbers, per
+    minute of test.
 
     The file names the runs so far, as for `identify`, and each [[candidate]]: a ramp, a dwell or a coast-down, other places of
-    sensors, numbers that are changed. With the table [limits], the speed of the best candidate is improved."""
+    sensors, numbers that are changed. With the table [limits], the speed of the best candidate is varied over time until the
+    expected errors are smallest."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.display import speed_text
@@ -38,7 +40,7 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     output.keep("plan.npz", plan)
     profile = plan.profile
     document = {"status": plan.status_name, "message": plan.message}
-    document |= fields_of(plan, "candidates", "numbers", "errors", "now", "minutes", "gain")
+    document |= fields_of(plan, "candidates", "numbers", "errors", "now", "minutes", "benefit")
     document["profile"] = None if profile is None else fields_of(profile, "times", "speeds")
 
     def text() -> str:
@@ -46,15 +48,15 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
             return f"{error:.2g}" if np.isfinite(error) else "none"
 
         rows = [["so far", "", "", *map(shown, plan.now)]]
-        for name, minutes, gain, errors in zip(plan.candidates, plan.minutes, plan.gain, plan.errors, strict=True):
-            rows.append([name, f"{minutes:.3g}", f"{gain:.3g}", *map(shown, errors)])
-        heads = ["run", "minutes", "gain per minute", *(f"({k + 1})" for k in range(len(plan.numbers)))]
+        for name, minutes, benefit, errors in zip(plan.candidates, plan.minutes, plan.benefit, plan.errors, strict=True):
+            rows.append([name, f"{minutes:.3g}", f"{benefit:.3g}", *map(shown, errors)])
+        heads = ["run", "minutes", "benefit per minute", *(f"({k + 1})" for k in range(len(plan.numbers)))]
         lines = [f"({k + 1}) {name}" for k, name in enumerate(plan.numbers)]
         lines.append(table("expected relative standard errors; none: not determined", heads, rows))
         if profile is not None:
             points = zip(np.asarray(profile.times), np.asarray(profile.speeds), strict=True)
             parts = [[f"{t:.4g}", speed_text(float(n), 4)] for t, n in points]
-            lines.append(table("improved speed, linear between these times", ["time, s", "speed"], parts))
+            lines.append(table("optimized speed, linear between these times", ["time, s", "speed"], parts))
         return "\n".join(lines)
 
     output.done(document, text, "plan", plan)

@@ -9,7 +9,8 @@ from jaxvib.draw.style import COLORS, GUIDE, Drawn, panels
 
 
 def ellipses(points: np.ndarray, amplitude: np.ndarray, magnify: float) -> list[np.ndarray]:
-    """Return the path (97, 2) of each point (n, 2) with its complex amplitudes (n, 2), magnified; the first is at phase 0.
+    """Return the path (97, 2) of each point (n, 2) with its complex amplitudes (n, 2), magnified; the first point of each path
+    is at phase 0.
 
     >>> ellipses(np.array([[1.0, 0.0]]), np.array([[0.01, -0.01j]]), 10.0)[0][0].tolist()
     [1.1, 0.0]

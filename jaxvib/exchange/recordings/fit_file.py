@@ -182,7 +182,7 @@ unknown = ["machine.stiffness", "machine.damping"]
 # [candidate.noise]
 # deck = "0.05 m/s^2"
 
-# [limits]                  # of an improved speed of the best candidate
+# [limits]                  # of the optimized speed
 # speed = "1200 rpm"
 # acceleration = "5 rad/s^2"
 """

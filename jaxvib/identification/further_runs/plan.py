@@ -12,7 +12,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError
 from jaxvib.identification.further_runs.planned import PlannedRun, expected_errors, expected_information, expected_run
-from jaxvib.identification.further_runs.profile import improved_profile, read_limits, require_within
+from jaxvib.identification.further_runs.profile import optimized_profile, read_limits, require_within
 from jaxvib.identification.identify import MachineFit
 from jaxvib.machine.drives.controlled import SpeedProfile
 from jaxvib.results.fields import in_unit
@@ -35,9 +35,9 @@ class RunPlan(Result):
     - `errors` (c, k): expected relative standard errors with the runs so far and this one, infinite if not determined
     - `now` (k,): relative standard errors with the runs so far
     - `minutes` (c,): durations
-    - `gain` (c,): sum over the numbers of the logarithm of the ratio of errors before and after, per minute of test. An
+    - `benefit` (c,): sum over the numbers of the logarithm of the ratio of errors before and after, per minute of test. An
       undetermined number counts as an error of 1
-    - `profile`: the `SpeedProfile` of the run with the improved speed; None without limits, and if none is better
+    - `profile`: the `SpeedProfile` of the run with the optimized speed; None without limits, and if none is better
     """
 
     status = Computed.done
@@ -47,17 +47,17 @@ class RunPlan(Result):
     errors: np.ndarray = eqx.field(metadata=in_unit("", "candidate", "number"))
     now: np.ndarray = eqx.field(metadata=in_unit("", "number"))
     minutes: np.ndarray = eqx.field(metadata=in_unit("min", "candidate"))
-    gain: np.ndarray = eqx.field(metadata=in_unit("1/min", "candidate"))
+    benefit: np.ndarray = eqx.field(metadata=in_unit("1/min", "candidate"))
     profile: SpeedProfile | None
 
     def summary(self) -> str:
         """Return the candidates with their expected errors as text, the best one first."""
         lines = [f"errors now: {self._row(self.now)}"]
-        for name, row, minutes, gain in zip(self.candidates, self.errors, self.minutes, self.gain, strict=True):
-            lines.append(f"{name} ({minutes:.3g} min, {gain:.3g} per minute): {self._row(row)}")
+        for name, row, minutes, benefit in zip(self.candidates, self.errors, self.minutes, self.benefit, strict=True):
+            lines.append(f"{name} ({minutes:.3g} min, benefit {benefit:.3g} per minute): {self._row(row)}")
         if self.profile is not None:
             points = zip(np.asarray(self.profile.times), np.asarray(self.profile.speeds), strict=True)
-            lines.append("improved speed: " + ", ".join(f"{speed_text(float(n), 4)} at {t:.4g} s" for t, n in points))
+            lines.append("optimized speed: " + ", ".join(f"{speed_text(float(n), 4)} at {t:.4g} s" for t, n in points))
         return "\n".join(lines)
 
     def _row(self, errors: np.ndarray) -> str:
@@ -95,10 +95,10 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     - `fit` from `identify`
     - `candidates`: a `PlannedRun` each
     - `limits`: {"speed": largest rotor speed, rad/s, "acceleration": largest absolute angular acceleration, rad/s^2}; typical:
-      {"speed": "1500 rpm", "acceleration": "10 rad/s^2"}; default: no run with an improved speed
+      {"speed": "1500 rpm", "acceleration": "10 rad/s^2"}; default: no such run
 
-    **Returns** `RunPlan`, the candidates in the order of their gain per minute of test. **Raises** `InputError` for a channel
-    whose noise is unknown, and for a candidate beyond the limits.
+    **Returns** `RunPlan`, the candidates in the order of their `benefit`. **Raises** `InputError` for a channel whose noise is
+    unknown, and for a candidate beyond the limits.
 
     >>> import numpy as np, jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
@@ -124,31 +124,31 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     runs = [expected_run(fit, each) for each in candidates]
     errors = [expected_errors(fit.information + expected_information(fit, each), k) for each in runs]
     now, minutes = expected_errors(fit.information, k), [each.duration / 60.0 for each in candidates]
-    gain = [_gain(now, *each) for each in zip(errors, minutes, strict=True)]
+    benefit = [_benefit(now, *each) for each in zip(errors, minutes, strict=True)]
     names, profile = [each.name for each in candidates], None
     if bounds is not None:
-        best = int(np.argmax(gain))
-        profile = improved_profile(fit, candidates[best], runs[best], bounds)
+        best = int(np.argmax(benefit))
+        profile = optimized_profile(fit, candidates[best], runs[best], bounds)
         planned = eqx.tree_at(lambda run: run.drive, candidates[best], profile)
         better = expected_errors(fit.information + expected_information(fit, expected_run(fit, planned)), k)
-        if _gain(now, better, minutes[best]) > gain[best]:
-            names.append(f"{names[best]}, improved speed")
+        if _benefit(now, better, minutes[best]) > benefit[best]:
+            names.append(f"{names[best]}, optimized speed")
             errors.append(better)
-            gain.append(_gain(now, better, minutes[best]))
+            benefit.append(_benefit(now, better, minutes[best]))
             minutes.append(minutes[best])
         else:
             profile = None
-    order = np.argsort(-np.array(gain), kind="stable")
+    order = np.argsort(-np.array(benefit), kind="stable")
     return RunPlan(
         tuple(names[i] for i in order),
         fit.names,
         np.array(errors)[order],
         now,
         np.array(minutes)[order],
-        np.array(gain)[order],
+        np.array(benefit)[order],
         profile,
     )
 
 
-def _gain(now: np.ndarray, errors: np.ndarray, minutes: float) -> float:
+def _benefit(now: np.ndarray, errors: np.ndarray, minutes: float) -> float:
     return float(np.sum(np.log(np.minimum(now, 1.0) / np.minimum(errors, 1.0)))) / minutes

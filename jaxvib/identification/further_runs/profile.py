@@ -1,4 +1,4 @@
-"""Speed of a planned run, improved by gradients within limits."""
+"""Speed of a planned run, optimized by gradients within limits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SEGMENTS = 8
 _MAX_ITERATIONS = 30
 
 _SLACK = 1e-6
-"""Relative excess of a limit that rounding explains."""
+"""Relative amount by which rounding errors may exceed a limit."""
 
 
 class Limits(NamedTuple):
@@ -70,10 +70,12 @@ def require_within(planned: PlannedRun, limits: Limits) -> None:
         raise InputError(field, f"has an acceleration of {acceleration:.4g} rad/s^2; {most}")
 
 
-def improved_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, limits: Limits) -> SpeedProfile:
-    """Return the speed, linear between evenly spaced times, with the smallest expected errors near that of a planned run.
+def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, limits: Limits) -> SpeedProfile:
+    """Return the speed profile, linear between evenly spaced times, at the local minimum of the expected errors near the speed
+    of a planned run.
 
-    The objective is half the sum of the logarithms of the variances of the numbers, with an error of 1 known before.
+    The objective is half the sum of the logarithms of the variances of the unknown numbers, with the prior standard error 1 of
+    each.
     """
     from scipy.optimize import minimize  # slow to import
 
@@ -102,8 +104,9 @@ def improved_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, l
 def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.ndarray) -> tuple[float, np.ndarray]:
     """Return half the sum of the logarithms of the expected variances of the numbers, and its gradient by the speeds.
 
-    With fixed projections L onto the numbers that are not eliminated, a change dF of the information changes L^T F L by
-    L^T dF L. The gradient therefore needs one reverse derivative of the information, with the weights W of its entries.
+    F is the Fisher information of the run (the matrix of its normal equations). L, the projection onto the numbers that are not
+    eliminated, is kept fixed, so that a change dF changes L^T F L by L^T dF L. The gradient is therefore one derivative of F in
+    reverse mode, with the derivatives of the objective with respect to the entries of F.
     """
     fitted, k, p = expected.fitted, len(fit.names), expected.fitted.x.size
     problem, place = fitted.problem, linear_places(fitted.problem)[0]

@@ -13,7 +13,8 @@ _LOW, _HIGH = 0.35, 0.65
 """Levels relative to the range of the signal; a pulse begins above the high one after the signal was below the low one."""
 
 _MISSED, _DOUBLED = 1.6, 0.62
-"""Intervals, relative to their neighbours, above which pulses were missed and below which one of two is false."""
+"""Limits of an interval relative to its neighbours: above the first, pulses were missed; below the second, one of its two
+pulses is false."""
 
 _NEIGHBOURS = 5
 """Number of intervals on each side with which an interval is compared."""
@@ -109,7 +110,8 @@ def _usual(steps: np.ndarray) -> np.ndarray:
 
 
 def _false_pulses(time: np.ndarray) -> np.ndarray:
-    """Return the indices of pulses between two others that are one usual interval apart, no two of them neighbours."""
+    """Return the indices of false pulses: the pulses before and after such a pulse are one usual interval apart. No two
+    adjacent pulses are returned."""
     if time.size < MIN_PULSES:
         return np.array([], int)
     steps, usual = np.diff(time), _usual(np.diff(time))

@@ -23,7 +23,7 @@ class Recorded(NamedTuple):
 
 
 def recorded_from_sep005(timeseries: Sequence[Mapping[str, Any]], source: str) -> list[Recorded]:
-    """Return channels from dictionaries by SEP-005: `data`, `name`, `unit_str`, and `fs` (Hz) or `time` (s).
+    """Return channels from dictionaries in the format SEP-005: `data`, `name`, `unit_str`, and `fs` (Hz) or `time` (s).
 
     **Raises** `InputError` for a dictionary without one of these entries.
 

@@ -32,7 +32,7 @@ class RollingFriction(Effect):
       is no friction on a load that does not press
     - With the exact sign, a load does not move if the force on it is the fraction s < 1 of the largest friction. With the
       smooth sign it creeps at the speed width artanh(s), which tends to 0 with the width
-    - The sign of N is that of the motion without this friction
+    - Whether N is positive is decided by the motion without this friction
 
     **Arguments** (SI, or strings with a unit)
 

@@ -59,10 +59,12 @@ def support(
 
     **Arguments** (SI, or strings with a unit)
 
-    - `at` (2,): the point of the body, (x, y) m from its centre of mass without unbalances; typical: 0.2 to 3 m
+    - `at` (2,): the point of the body, (x, y) m from the centre of mass of the body with its exciters, but without their
+      unbalances; typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
-    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). Also a ratio of it with the mass on
-      this support, "5 % of 250 kg", or a loss factor of rubber at a frequency of vibration, "loss factor 0.1 at 16 Hz"
+    - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). Also a percentage of it, with the
+      mass m that this support carries, "5 % of 250 kg", or a loss factor of rubber at a frequency of vibration, "loss factor
+      0.1 at 16 Hz"
     - `angle` of the first spring, rad, anticlockwise from x; typical: 0 (the default)
     - `body`: number of the body in a `plane_network`, from 0; typical: 0 (the default)
     - `to`: number of the body at the other end; default: the foundation
@@ -181,8 +183,9 @@ class _Bodies(Machine):
         on_foundation = [each for each in self.supports if each.to is None]
         bodies = sorted({each.body for each in on_foundation})
         if len(bodies) != 1:
-            standing = " and ".join(map(str, bodies)) if bodies else "none"
-            problem = f"has bodies on the foundation: {standing}; the moment needs one, because it refers to its centre of mass"
+            standing = f"the bodies {' and '.join(map(str, bodies))}" if bodies else "no body"
+            problem = f"has {standing} on the foundation; the foundation moment is defined only for one such body, because its "
+            problem += "point is given from the centre of mass of that body"
             raise InputError("machine.supports", problem)
         found = [jnp.zeros(3 * self.body_count, about.dtype)] * 2
         for each in on_foundation:

@@ -359,8 +359,8 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     **Returns** `BalancedStability`.
 
     **Raises** `InputError` for angles at which the loads do not cancel, for a machine that can drift, for effects that disturb
-    the balanced motion (gravity), for a rotor that turns too slowly for an undamped carrier, and as `balanced_states`;
-    `ComputationError` with its status if the loads cannot cancel.
+    the balanced motion (gravity), for a rotor so slow that the steps of a turn cannot resolve the vibration of a weakly damped
+    carrier, and as `balanced_states`; `ComputationError` with its status if the loads cannot cancel.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

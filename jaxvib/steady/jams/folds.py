@@ -56,10 +56,10 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
     in `omega` and single-valued through the folds. If the rotor speed couples the carrier's coordinates, Y is computed at the
     rotor speed `speed`.
 
-    Dry friction adds the torque mu2 (d/2) N sign(n - w) of each load to the drag; n is then the root of this balance of
-    torques between w and the value above, with N = m R w^2. The weight of the loads is neglected, because its effect on N
-    averages to zero over a turn unless the weight exceeds N. An imbalance of the rotor acts at the frequency n and not at w,
-    and has no effect here.
+    Dry friction with the coefficient mu2 in a bearing of diameter d adds the torque mu2 (d/2) N sign(n - w) of each load to the
+    drag; n is then the root of this balance of torques between w and the value above, with N = m R w^2. The weight of the loads
+    is neglected, because its effect on N averages to zero over a turn unless the weight exceeds N. An imbalance of the rotor
+    acts at the frequency n and not at w, and has no effect here.
 
     **Returns** n, a scalar. **Raises** `InputError` for the same scenes as `jam_modes`.
 
@@ -77,7 +77,8 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 def rotor_speed_at(model: ExcitedModel, omega: Array, speed: Array | None = None) -> Array:
     """Return `jam_rotor_speed` for an assembled scene.
 
-    For unbalances it is the ratio of the torque of the vibration to that of the motors. Its folds have the same meaning.
+    For a model with unbalances instead of loads (`UnbalancedModel`) the value returned is not a speed but the torque of the
+    vibration divided by that of the motors. At its folds, too, two motions merge.
     """
     return _balance(model, omega, speed)[0]
 
@@ -154,7 +155,7 @@ def scanned_slopes(model: ExcitedModel, omegas: Array) -> Array:
 
 @eqx.filter_custom_jvp
 def _fold_speed(model: ExcitedModel, omega: Array) -> Array:
-    """Return `rotor_speed_at` in modal form, with the derivatives of the dense form.
+    """Return `rotor_speed_at` in modal form; its derivatives are those of `rotor_speed_at`, which uses the full matrices.
 
     The derivatives are computed only if they are needed.
     """
@@ -250,24 +251,25 @@ def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
     return jnp.append(jnp.stack([rising, falling], axis=1).ravel(), last)
 
 
-def without_ripples(speeds: Array, count: Array, most: int) -> Array:
-    """Return the indices of the `most` most relevant folds among 2 `most` with rotor speeds `speeds`; the first `count` exist.
+def without_ripples(speeds: Array, count: Array, kept_count: int) -> Array:
+    """Return the indices of the `kept_count` most relevant of 2 `kept_count` folds; `speeds` are their rotor speeds, and the
+    first `count` of them exist.
 
     A branch has one peak for each resonance. If it has additional ripples, the pairs of folds with the smallest ratio of rotor
     speeds are dropped.
     """
-    index = jnp.arange(2 * most)
+    index = jnp.arange(2 * kept_count)
 
     def fewer(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         keep, count = carry
         known = speeds[keep]
         span = jnp.abs(jnp.log(known[1:] / known[:-1]))
         least = jnp.argmin(jnp.where(index[1:] < count, span, jnp.inf))
-        skip = (count > most) & (index >= least)
-        keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * most - 1), index)]
-        return keep, jnp.where(count > most, count - 2, count)
+        skip = (count > kept_count) & (index >= least)
+        keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * kept_count - 1), index)]
+        return keep, jnp.where(count > kept_count, count - 2, count)
 
-    return jax.lax.fori_loop(0, most // 2, fewer, (index, count))[0][:most]
+    return jax.lax.fori_loop(0, kept_count // 2, fewer, (index, count))[0][:kept_count]
 
 
 def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
@@ -299,7 +301,8 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
 def spread_points(crowded: Array, points: int, top: Array) -> Array:
     """Return a number of `points` along a grid of load speeds, ascending, up to `top`.
 
-    They are taken evenly from the dense grid. Points above the range get evenly spaced places in it.
+    They have equal distances in the index of the grid `crowded`. Points that would lie above `top` are replaced by evenly
+    spaced ones below it.
     """
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
     share = jnp.linspace(0.0, 1.0, points)

@@ -86,7 +86,10 @@ class RegimeSearchStatus(eqx.Enumeration):
     """Outcomes of a search for all regimes."""
 
     done = "all regimes were searched for"
-    none = "no regime: at no speed do the vibrational and the driving torque of every mass balance; each turns at its own speed"
+    none = (
+        "no regime: there is no speed at which the vibrational torque balances the driving torque of every mass; "
+        "each mass turns at its own speed"
+    )
 
 
 class AbstractSynchronousRegime(Result):
@@ -110,7 +113,7 @@ class AbstractSynchronousRegime(Result):
     - `torque` (mass,), N m: driving torque, by the motor or by the drag; for an ideal drive the torque that it must exert
     - `vibrational_torque` (mass,), N m: mean torque of the vibration on each mass; it balances `torque`
     - `power` (exciter,), W: mean power of each drive
-    - `can_start` (exciter,): False if gravity keeps an unbalance at the bottom against its motor at rest, S g > T(0)
+    - `can_start` (exciter,): False if the motor cannot lift its unbalance from rest: S g > L(0), with the starting torque L(0)
     - `displacement` (nd,): complex amplitudes, in m, or in rad for rotations; `amplitude` (nd,): their moduli, zero to peak
     - `foundation_force`, N, zero to peak (for two directions the root of the summed squares of their peaks)
     - `residual` of the balance, relative to the largest vibrational torque that is possible
@@ -235,15 +238,15 @@ def synchronous_regimes(
     - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
     - The relative error of the torques is of the order S^2/(2 M I) with the inertia I of a rotor; phases are off by tenths of a
       radian close to where two regimes exchange stability
-    - Exciters of different speeds do not act on each other at this order, see `masses`; `regime_partitions` returns all motions
-      of such groups
+    - In this approximation exciters with different speeds do not act on each other. `masses` selects a group that turns at one
+      speed; `regime_partitions` returns the motions of all divisions into such groups
 
     **Arguments**
 
     - `scene`, with gravity as its only effect or without effects; exciters have an unbalance, or loads and an ideal drive;
       typical: 2 to 6 rotating masses
     - `masses`: numbers, from 0, of the rotating masses that turn at the common speed; the result contains only these and their
-      exciters. The others turn at different speeds and only move with the machine. Default: all
+      exciters. The others turn at different speeds; only their mass affects the result. Default: all
     - `near`: (speed, phases), rad/s and (mass,) rad, from which Newton's method finds one regime. The function can then be used
       under `jit`, `vmap` and `grad`. Derivatives are those of the implicit function theorem; `growth`, `quasi_static`
       and `stable` have none
@@ -260,7 +263,8 @@ def synchronous_regimes(
     >>> motor = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
     >>> exciters = [jv.Exciter(drive=motor, unbalance=0.4, at=(x, 0.0), direction=s) for x, s in ((-0.6, 1), (0.6, -1))]
     >>> found = jv.synchronous_regimes(jv.Scene(screen, exciters=exciters))
-    >>> [round(abs(float(a)), 4) for a in found.phases[:, 1]], found.stable.tolist()    # half a turn apart: a vertical line
+    >>> phases = [round(abs(float(a)), 4) for a in found.phases[:, 1]]
+    >>> phases, found.stable.tolist()    # stable: half a turn apart, the body moves along a vertical line
     ([3.1416, 0.0], [True, False])
 
     Source: I. I. Blekhman, Synchronization in Science and Technology, 1988; the Jacobian of the slow motion in place of his
@@ -312,7 +316,7 @@ def _regime_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ..
 
 
 def _fields_near(scene: Scene, omega: Array, phases: Array, group: tuple[int, ...] | None) -> dict[str, Any]:
-    """Return the fields of the regime of a group of masses (None: all) to which a start leads, without the scene."""
+    """Return the fields, except `scene`, of the regime that is found from a start, for a group of masses (None: all)."""
     balance = assemble_torque_balance(scene)
     if group is not None:
         fields = _fields_of(balance_of_group(balance, group), omega, phases)

@@ -30,7 +30,7 @@ class Unknowns(NamedTuple):
 
     **Attributes**: `angle` rad and `rate` rad/s at the first sample, measured from the rest position, which a constant torque
     shifts from the hanging position; `offset` rad: the recorded angle of the rest position; `frequency` rad/s of small swings;
-    `friction`. With these, the torque is nearly uncorrelated with the others.
+    `friction`. With these parameters, the estimate of the torque is nearly uncorrelated with the estimates of the others.
     """
 
     angle: Array
@@ -41,9 +41,9 @@ class Unknowns(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Result of a fit with p unknowns and n samples: the `unknowns`; their `covariance` (p, p), in their order, from the Fisher
-    information with the estimated noise if it is white; `slopes` (n, p), derivatives of the fitted angles; `residual` (n,) rad,
-    fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
+    """Result of a fit with p unknowns and n samples: the `unknowns`; their `covariance` (p, p), in the same order, from the
+    Fisher information and the estimated noise, valid for white noise; `slopes` (n, p), derivatives of the fitted angles;
+    `residual` (n,) rad, fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
 
     unknowns: Unknowns
     covariance: Array

@@ -67,8 +67,8 @@ class Record(eqx.Module):
         wrong = np.flatnonzero(np.diff(self.time) <= 0.0)
         if wrong.size:
             k = wrong[0]
-            pair = f"{self.time[k + 1]:g} s after {self.time[k]:g} s"
-            raise InputError(name, f"has the time {pair} at sample {k + 2}; times must ascend")
+            pair = f"{self.time[k + 1]:g} s at sample {k + 2}, and {self.time[k]:g} s at the sample before it"
+            raise InputError(name, f"has the time {pair}; times must ascend")
         if np.ptp(self.angle) > 2.0 * np.pi:
             size = f"{np.ptp(self.angle):.3g} rad from end to end"
             raise InputError(
@@ -125,7 +125,7 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
     wrong = np.flatnonzero(np.diff(values[:, 0]) <= 0.0)
     if wrong.size:
         n = int(wrong[0]) + 1
-        pair = f"{values[n, 0]:g} s after {values[n - 1, 0]:g} s"
+        pair = f"{values[n, 0]:g} s, and {values[n - 1, 0]:g} s in the line before it"
         raise InputError(f"{table.path} line {table.line(n)}", f"has the time {pair}; times must ascend")
     return Record(values[:, 0], values[:, 1], str(table.path))
 

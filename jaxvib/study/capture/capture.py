@@ -63,8 +63,8 @@ class Capture(Result):
     - `captured` (S, starts): True if all loads turned with the rotor at the end
     - `finite` (S, starts): True if the motion stayed finite
     - `detached` (S, starts): True if a load lost contact with its wall at some time; the equations keep it on the wall
-    - `threshold`: midpoint between the lowest speed from which all starts at this and all higher speeds were captured, and the
-      next lower computed speed
+    - `threshold`: midpoint of two neighbouring computed speeds: the lowest one such that every start at this speed and at all
+      higher speeds was captured, and the one below it
     - `uncertainty` of the threshold: the largest of half the distance between these two speeds, half the distance from the
       threshold to the highest speed at which half of the starts or more fail, and `last_change`; NaN if there is no threshold
     - `last_change`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN
@@ -177,8 +177,8 @@ def capture(
     - With a `resolution`, the interval between the threshold and the next lower speed is divided by further speeds until it is
       small enough. The range above the first threshold is not refined: failures in an interval that is narrower than the
       distance of the first speeds may remain undetected
-    - The scan is repeated with twice as many steps until the threshold changes by no more than the resolution, or the distance
-      of the `speeds`
+    - The scan is repeated with twice as many steps until the threshold changes by no more than the resolution or, without one,
+      by no more than the spacing of the `speeds`
 
     **Arguments**
 
@@ -194,9 +194,9 @@ def capture(
     - `resolution` of the threshold, relative to the rotor speed; typical: 1e-2 to 1e-4. Each refinement is another scan
     - `rotation`: "rolling", for balls that roll from the start, or "none", for balls that do not rotate at the start and
       therefore slide until they roll; "none" needs the effect `Sliding`
-    - `stepsize_controller`: `EqualSteps(n)` for the whole run, without doubling. By default the first scan has 1 step for each
-      radian of the fastest vibration, 2 for each radian of a faster contact between balls or end of a slip, and 1 step for
-      three time constants of the fastest decay; typical: 200 for each turn
+    - `stepsize_controller`: `EqualSteps(n)` for the whole run, without doubling. By default the first scan has the largest of
+      three numbers of steps: 1 for each radian of the fastest vibration, 2 for each radian at the rate of contacts between
+      balls or of the end of a slip, 1 for every three time constants of the fastest decay; typical: 200 for each turn
     - `doublings`: largest number of times that the default steps are doubled; typical: 2 (the default); 0 for a single scan.
       With one doubling the work is three times that of a single scan
     - `equations`: as for `ensemble`

@@ -36,7 +36,11 @@ def test_readings_are_converted_to_si(unit, factor):
     ("times", "values", "says"),
     [
         (changed(T, 7, T[6]), SIGNAL, "has the time 0.006 s twice, at samples 7 and 8; leave one of them out"),
-        (changed(T, 7, 0.001), SIGNAL, "has the time 0.001 s after 0.006 s at sample 8; times must ascend"),
+        (
+            changed(T, 7, 0.001),
+            SIGNAL,
+            "has the time 0.001 s at sample 8, and 0.006 s at the sample before it; times must ascend",
+        ),
         (changed(T, 7, np.nan), SIGNAL, "has the time nan at sample 8; times must be finite"),
         (T[:9], SIGNAL[:9], "has 9 samples; at least 16 are needed"),
         (T[:-1], SIGNAL, "has 3999 times but 4000 values; each value needs its time"),

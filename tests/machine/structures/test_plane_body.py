@@ -215,7 +215,7 @@ def test_foundation_moment_of_other_machines_is_refused():
     pair = [jv.support(at=(0.0, 0.0), stiffness=(1e5, 1e5), damping=(1e3, 1e3), body=k) for k in (0, 1)]
     network = jv.plane_network([jv.body(mass=100.0, inertia=20.0)] * 2, pair)
     scene = jv.Scene(network, exciters=[exciter])
-    with pytest.raises(jv.InputError, match="bodies on the foundation: 0 and 1"):
+    with pytest.raises(jv.InputError, match="has the bodies 0 and 1 on the foundation"):
         jv.foundation_moment(scene, jv.initial_state(scene))
 
 

@@ -59,7 +59,10 @@ def test_columns_are_named_as_in_the_file(tmp_path, columns):
         (table("").replace("0.300,-0.100", "0.300,oops"), "line 4 has 'oops' where the angle should be"),
         (table("").replace("0.300,-0.100", "0.300,nan"), "line 4 has 'nan' where the angle should be; a finite number"),
         (table("# a\ntime,angle\n").replace("0.300,-0.100", "0.300"), "line 6 has 1 columns; the lines above have 2"),
-        (table("").replace("0.300,", "0.100,"), "line 4 has the time 0.1 s after 0.2 s; times must ascend"),
+        (
+            table("").replace("0.300,", "0.100,"),
+            "line 4 has the time 0.1 s, and 0.2 s in the line before it; times must ascend",
+        ),
         ("0.1\n0.2\n", "has one column; two are needed"),
         ("1,2,3\n", "has 3 columns but no line of names"),
         ("time, x, y\n1,2,3\n", "has no column 'angle' for the angle; its columns are time, x, y"),
@@ -87,7 +90,7 @@ def test_wrong_records(tmp_path):
         ((t, t[:5]), r"has shapes time \(20,\), angle \(5,\)"),
         ((t, ["a"] * 20), "it must be an array of numbers"),
         ((t, np.where(t == 3, np.inf, 0.0)), "has angle inf at sample 4"),
-        ((np.where(t == 3, 1.0, t), t), "has the time 1 s after 2 s at sample 4"),
+        ((np.where(t == 3, 1.0, t), t), "has the time 1 s at sample 4, and 2 s at the sample before it"),
     ]
     for given, says in wrong:
         with pytest.raises(jv.InputError, match=says):
