@@ -251,7 +251,7 @@ name = "circular_screen"
 points = [[-1.3, 0.1], [1.3, 0.1]]   # feed end and discharge end, m from the centre of mass
 stroke = "8 mm"                      # peak to peak
 """,
-    "feeder-design": """# A feeder: least foundation force per throw.
+    "feeder-design": """# A feeder: least foundation force divided by the amplitude of the trough.
 scene = "feeder.toml"
 
 [recipe]

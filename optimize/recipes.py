@@ -216,7 +216,8 @@ def feeder(
     range_: float = 1.5,
     spread: float = 0.1,
 ) -> Design:
-    """Return the design task for a feeder: least foundation force per throw, with a throw of given angle and stroke.
+    """Return the design task for a feeder: least foundation force divided by the amplitude of the trough, with a throw of given
+    angle and stroke.
 
     The mean of the `points` keeps the throw angle and the stroke. The positions of the exciters, their unbalances and the
     stiffness of the supports are free; the unbalances keep their ratios.

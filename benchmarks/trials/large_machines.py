@@ -4,7 +4,7 @@
 
 Milliseconds of the processor: the least of several calls and, in brackets, the first call, which compiles. A step of `simulate`
 follows from two runs of different length; the rest of a run is the time beyond its steps. The error is the largest relative
-difference of the amplitudes of all jam modes from a dense solution.
+difference of the amplitudes of all jam modes from a solution with the full matrices.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def seconds(function: Callable[[], Any], repeats: int = 5) -> tuple[float, float
 
 
 def jam_error(scene: jv.Scene) -> float:
-    """Largest relative difference of the amplitudes of the jam modes from a dense solution."""
+    """Largest relative difference of the amplitudes of the jam modes from a solution with the full matrices."""
     modes, carrier, loads = jv.jam_modes(scene), scene.machine.carrier(), scene.loads
     there = np.flatnonzero(np.isfinite(modes.omega))
     (row,) = np.asarray(scene.mount().rows[0])

@@ -62,7 +62,9 @@ class FrequencyStatus(eqx.Enumeration):
     """Outcomes of a computation of natural frequencies. The value of each member is the message shown to the user."""
 
     done = "the result was computed"
-    lost_digits = "rounding errors hide a natural frequency: use double precision, or stiffnesses and masses that differ less"
+    lost_digits = (
+        "a natural frequency is lost in rounding errors: use double precision, or stiffnesses and masses that differ less"
+    )
 
 
 class LinearModel(Model):
@@ -249,8 +251,8 @@ def natural_frequencies(scene: Scene) -> Array:
     **Returns** an array (nd,), rad/s; typical: 10 to 100 for platforms on springs, 100 to 500 for rotors. Derivatives are
     finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
 
-    **Raises** `ComputationError` (status "lost_digits") if rounding hides a frequency, for example in single precision that of
-    a soft spring next to a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN.
+    **Raises** `ComputationError` (status "lost_digits") if a frequency is lost in rounding errors, for example in single
+    precision that of a soft spring next to a link 1e8 times as stiff. Under a JAX transformation such a frequency is NaN.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -274,7 +276,7 @@ def estimated_frequencies(scene: Scene) -> Array:
 
 @cached
 def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
-    """Return the natural frequencies (nd,) rad/s, and for each True if rounding hides it."""
+    """Return the natural frequencies (nd,) rad/s, and for each True if it is lost in rounding errors."""
     model = linear_model(scene)
     frequencies, shapes = model.modes()
     w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))

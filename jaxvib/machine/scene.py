@@ -388,7 +388,7 @@ def read_effects(effects: object) -> tuple[Effect, ...]:
 
 
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
-    """**Raises** `InputError` if rounding errors hide one of two numbers that are added. Traced numbers are not checked.
+    """**Raises** `InputError` if one of two numbers that are added is lost in rounding errors. Traced numbers are not checked.
 
     This happens if the loads are too heavy or too light for the machine, or their drag is too weak for their inertia.
     """
@@ -406,7 +406,7 @@ def _require_comparable(
         if not _MIN_RATIO <= total / whole <= 1.0 / _MIN_RATIO:
             raise InputError(
                 "loads.mass",
-                f"gives {total:.3g} kg for all loads on a machine of {whole:.3g} kg, and rounding errors hide one of them; "
+                f"gives {total:.3g} kg for all loads on a machine of {whole:.3g} kg; one of them is lost in rounding errors; "
                 f"loads may have {_MIN_RATIO:g} to {1.0 / _MIN_RATIO:g} times the machine's mass",
             )
     if drag is not None:

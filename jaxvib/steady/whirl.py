@@ -47,7 +47,7 @@ class WhirlStatus(eqx.Enumeration):
     done = "the result was computed"
     refused = REFUSED
     lost_digits = (
-        "rounding errors hide some of these motions, whose values are NaN: use double precision, "
+        "some of these motions are lost in rounding errors, and their values are NaN: use double precision, "
         "or parameters whose sizes differ less"
     )
 
@@ -108,7 +108,7 @@ class Whirl(Result):
     - `forward`: (ns, nd) True if the motion turns with the rotor, False if it turns against the rotor or not at all
     - `straight`: (ns, nd) True if the axis moves on a straight line, which needs different horizontal and vertical supports
     - `critical`: the critical speeds
-    - `status`: a `WhirlStatus`; motions that rounding hides are NaN
+    - `status`: a `WhirlStatus`; motions that are lost in rounding errors are NaN
     """
 
     status: WhirlStatus

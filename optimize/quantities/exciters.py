@@ -192,7 +192,9 @@ def force_per_throw(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: T
     >>> force_per_throw().unit
     'N/m'
     """
-    return _of_point("force_per_throw", "N/m", _force_per_throw, "foundation force per throw", at, body, tier)
+    return _of_point(
+        "force_per_throw", "N/m", _force_per_throw, "foundation force divided by the amplitude of a point", at, body, tier
+    )
 
 
 def _force_per_throw(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:

@@ -35,7 +35,7 @@ def test_natural_frequencies_without_digits_are_refused(double, support, link):
         scene = two_masses(support, link)
         with pytest.raises(
             jv.ComputationError,
-            match=r"lost_digits: rounding errors hide a natural frequency: "
+            match=r"lost_digits: a natural frequency is lost in rounding errors: "
             r"use double precision",
         ):
             jv.natural_frequencies(scene)

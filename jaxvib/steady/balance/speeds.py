@@ -205,8 +205,8 @@ def _direction(model: LinearModel) -> Array:
 
 
 def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
-    """**Raises** `InputError` if no coordinate moves the port, a rotor has a motion without a spring, or rounding errors hide a
-    resonance."""
+    """**Raises** `InputError` if no coordinate moves the port, a rotor has a motion without a spring, or a resonance is lost in
+    rounding errors."""
     if not np.any(port):
         problem = "does not move with any coordinate, and its loads have no effect; put the exciter at a point that can move"
         raise InputError("machine.port", problem)
@@ -214,7 +214,7 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; every motion needs one")
         return
-    # Resonances that rounding hides, relative to the highest one, although a spring resists the motion.
+    # Resonances so much lower than the highest one that they are lost in rounding errors, although a spring resists the motion.
     rounding = mass.shape[0] * np.finfo(mass.dtype).eps
     inverse = np.linalg.inv(np.linalg.cholesky(mass))
     squares = np.linalg.eigvalsh(inverse @ stiffness @ inverse.T)

@@ -343,8 +343,8 @@ def jams_of(scene: Scene) -> JamModes:
     chosen = jnp.argmax(hits, axis=1)
     omega = jnp.where(there, omega[chosen], n)
 
-    # Closer to a fold, rounding errors hide the difference between its rotor speed and the scene's, and derivatives are not
-    # significant.
+    # Closer to a fold, the difference between its rotor speed and the scene's is lost in rounding errors, and derivatives are
+    # not significant.
     speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
     close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
     close = (close | jnp.roll(close, -1))[chosen]

@@ -1,4 +1,4 @@
-"""Working regime of a machine: the stable synchronous regime at the speed of its motors, found from fixed starts."""
+"""Working regime of a machine: the stable synchronous regime at the speed of its motors, from a fixed list of starts."""
 
 from __future__ import annotations
 
