@@ -306,9 +306,9 @@ def least_torque() -> Quantity:
 
     >>> from optimize import least_torque
     >>> (least_torque() < 0.7).words
-    'least torque that passes the resonances at most 0.7'
+    'least torque needed to pass the resonances at most 0.7'
     """
-    text = "least torque that passes the resonances"
+    text = "least torque needed to pass the resonances"
     return regime_quantity("least_torque", "", _least_torque, text, tiers=("leading",), pieces_function=_least_torques)
 
 

@@ -1,4 +1,4 @@
-"""Run-up of motors from rest: resonances that catch exciters, peaks on the way, and the weakest motors that pass."""
+"""Run-up of motors from rest: resonances that catch exciters, peaks on the way, and the weakest motors that still pass."""
 
 from __future__ import annotations
 

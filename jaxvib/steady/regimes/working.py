@@ -77,7 +77,7 @@ def working_regime(scene: Scene, *, throw: bool = True) -> SynchronousRegime:
     >>> motor = jv.InductionMotor(100.0, breakdown_torque=60.0, breakdown_slip=0.1, inertia=0.05)
     >>> exciters = [jv.Exciter(drive=motor, unbalance=0.4, at=(x, 0.0), direction=s) for x, s in ((-0.6, 1), (0.6, -1))]
     >>> regime = jv.working_regime(jv.Scene(screen, exciters=exciters))
-    >>> bool(regime.stable), round(abs(float(regime.phases[1])), 4)    # half a turn apart: a vertical line
+    >>> bool(regime.stable), round(abs(float(regime.phases[1])), 4)    # half a turn apart: the body moves along a vertical line
     (True, 3.1416)
 
     Source: I. I. Blekhman, Synchronization in Science and Technology, 1988, for the function; this package for the choice.
