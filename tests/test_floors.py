@@ -192,3 +192,9 @@ def test_contributing_names_every_package():
 
 def test_every_module_has_a_docstring():
     assert [name for name, text in sources().items() if text.strip() and ast.get_docstring(ast.parse(text)) is None] == []
+
+
+def test_names_of_test_files_are_unique():
+    """Test folders are no packages, so that pytest imports each file by its name alone."""
+    names = collections.Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
+    assert not [name for name, count in names.items() if count > 1]

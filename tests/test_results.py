@@ -183,6 +183,7 @@ RESULTS = {
     ),
     "RunPrediction": lambda: jv.predict_run(RESULTS["MachineFit"](), measured_run()),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
+    "Response": lambda: jv.response(SCREEN, np.linspace(50.0, 110.0, 7)),
     "RunUps": run_ups,
     "Capture": lambda: _summarize_captures(
         np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150, 7200
@@ -208,7 +209,7 @@ RESULTS = {
 
 # fmt: off
 SEVERAL_PANELS = ["Run", "Envelope", "MotorRunUp", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-                  "BalancedStates", "Swing", "Identified", "MachineFit", "RunPrediction", "RunUps",
+                  "BalancedStates", "Response", "Swing", "Identified", "MachineFit", "RunPrediction", "RunUps",
                   "SynchronousRegimes", "SynchronousOrbit"]
 # fmt: on
 

@@ -20,16 +20,17 @@ CIRCUIT = {
     "magnetizing_inductance": "H",
     "inertia": "kg m^2",
 }
+UP = {"stiffness_up": "N/m", "damping_up": "N s/m"}
 UNITS = {
     "machines": {
         "one_mass": PLATFORMS,
         "two_mass": LINKED,
         "three_mass": LINKED,
         "network": LINKED,
-        "planar_rotor": PLATFORMS,
+        "planar_rotor": PLATFORMS | UP,
         "plane_body": {"mass": "kg", "inertia": "kg m^2"},
         "plane_network": {},
-        "rotor": PLATFORMS | INERTIA | TERMS | {"position": "m", "stations": "m"},
+        "rotor": PLATFORMS | UP | INERTIA | TERMS | {"position": "m", "stations": "m"},
     },
     "loads": {
         "ball": LOADS | {"ball_radius": "m"},

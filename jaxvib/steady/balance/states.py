@@ -266,7 +266,13 @@ def _imbalances(scene: Scene) -> tuple[complex, complex, np.ndarray]:
     imbalances = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
     static = sum((complex(*map(float, each.static)) for each in imbalances), 0j)
     moment = sum((complex(*map(float, each.moment)) for each in imbalances), 0j)
-    return static, moment, np.asarray(scene.mount().distances(scene.loads.count))
+    return static, moment, np.asarray(_distances(scene))
+
+
+@cached
+def _distances(scene: Scene) -> Array:
+    """Return the distance of each load from the mass centre along the axis, (N,) m."""
+    return scene.mount().distances(scene.loads.count)
 
 
 def _planes(scene: Scene) -> list[_Plane]:

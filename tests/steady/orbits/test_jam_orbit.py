@@ -9,7 +9,7 @@ import jaxvib as jv
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.steady.orbits import diagram, search
-from jaxvib.steady.orbits.describe import swing
+from jaxvib.steady.orbits.describe import half_range
 from jaxvib.steady.orbits.search import _interpolated
 from jaxvib.steady.orbits.stability import steps_for
 
@@ -61,9 +61,9 @@ def test_swings_are_half_of_what_lies_between_the_extremes():
     """Unsymmetric signals: 3 + cos t + cos 2 t lies between 3 - 9/8 and 5."""
     orders = np.array([0, 1, 2])
     np.testing.assert_allclose(
-        swing(orders, jnp.array([[3.0, 1.0, 1.0], [0.0, 1.0, 0.0]], complex)), [(2.0 + 9.0 / 8.0) / 2.0, 1.0], rtol=1e-12
+        half_range(orders, jnp.array([[3.0, 1.0, 1.0], [0.0, 1.0, 0.0]], complex)), [(2.0 + 9.0 / 8.0) / 2.0, 1.0], rtol=1e-12
     )
-    np.testing.assert_allclose(swing(np.array([1, 3]), jnp.array([[1.0, 0.0], [0.0, 2.0j]])), [1.0, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(half_range(np.array([1, 3]), jnp.array([[1.0, 0.0], [0.0, 2.0j]])), [1.0, 2.0], rtol=1e-12)
 
 
 @pytest.mark.parametrize("orders", [np.arange(1, 16, 2), np.arange(1, 9)], ids=["odd", "all"])
@@ -74,7 +74,7 @@ def test_swings_miss_no_peak(orders):
     dense[:, orders] = harmonics
     samples = np.fft.irfft(dense, axis=1) * 2**15
     lies_between = (samples.max(axis=1) - samples.min(axis=1)) / 2.0
-    np.testing.assert_allclose(swing(orders, jnp.asarray(harmonics)), lies_between, rtol=1e-6)
+    np.testing.assert_allclose(half_range(orders, jnp.asarray(harmonics)), lies_between, rtol=1e-6)
 
 
 def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():

@@ -17,7 +17,7 @@ from scipy.optimize import fsolve
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed
-from jaxvib.steady.orbits.describe import Orbit, _peaks, swing
+from jaxvib.steady.orbits.describe import Orbit, _peaks, half_range
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 
@@ -360,7 +360,7 @@ def test_the_highest_of_several_peaks_is_that_between_samples():
     wave = np.exp(1j * orders[:, None] * theta)
     harmonics = (random.normal(size=(40, 8)) + 1j * random.normal(size=(40, 8))) * np.array([0.02, 1.0, 0.02, *[1e-3] * 5])
     dense = np.max((harmonics @ wave).real, axis=1)  # within 1e-9 between its samples
-    np.testing.assert_allclose(swing(orders, jnp.asarray(harmonics)), dense, rtol=3e-9)
+    np.testing.assert_allclose(half_range(orders, jnp.asarray(harmonics)), dense, rtol=3e-9)
     np.testing.assert_allclose(_peaks(orders, jnp.asarray(harmonics[0])).max(), dense[0], rtol=3e-9)
     width = 2.0 * np.pi / 16.0
     parts = width * np.arange(16)[:, None] + np.linspace(0.0, width, 12501)
