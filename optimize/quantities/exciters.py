@@ -22,7 +22,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.points import Ellipse
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
-from optimize.quantities.quantity import TIERS, BuiltinQuantity, Quantity, Tier, walk
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier, walk
 from optimize.quantities.user_inputs import number_in
 
 __all__ = [
@@ -54,21 +54,6 @@ class RegimeQuantity(BuiltinQuantity):
     """Quantity of the working regime of a machine with several exciters."""
 
 
-def regime_quantity(
-    name: str,
-    unit: str,
-    function: Callable[..., Array],
-    text: str,
-    tier: Tier = "leading",
-    tiers: tuple[Tier, ...] = TIERS,
-    settings: tuple[object, ...] = (),
-    pieces_function: Callable[..., Array] | None = None,
-) -> Quantity:
-    return RegimeQuantity(
-        name, unit, function, tier=tier, tiers=tiers, text=text, settings=settings, pieces_function=pieces_function
-    )
-
-
 def _point(at: Sequence[Number], field: str) -> Point:
     if not isinstance(at, (list, tuple)) or len(at) != 2:
         raise InputError(field, f"is {quoted(at)}; it must be a point (x, y) of the body")
@@ -87,7 +72,7 @@ def _of_point(
 ) -> Quantity:
     point = _point(at, "at")
     text = f"{text} at ({point[0]:g}, {point[1]:g}) m"
-    return regime_quantity(name, unit, function, text, tier, settings=(point, count(body, "body", low=0), *settings))
+    return RegimeQuantity(name, unit, function, tier=tier, text=text, settings=(point, count(body, "body", low=0), *settings))
 
 
 def _ellipse(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float = 0.0) -> Ellipse:
@@ -239,7 +224,7 @@ def _of_deck(
     if not isinstance(points, (list, tuple)) or len(points) < 2:
         raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
     places = tuple(_point(point, f"points[{k}]") for k, point in enumerate(points))
-    return regime_quantity(name, "", function, text, tier, settings=(places, count(body, "body", low=0)))
+    return RegimeQuantity(name, "", function, tier=tier, text=text, settings=(places, count(body, "body", low=0)))
 
 
 def _motion_spread(evaluation: Evaluation, tier: Tier, points: tuple[Point, ...], body: int) -> Array:
@@ -259,7 +244,7 @@ def synchronization_margin() -> Quantity:
     >>> (synchronization_margin() > 3.0).words
     'margin of synchronisation at least 3'
     """
-    return regime_quantity("synchronization_margin", "", _margin, "margin of synchronisation", tiers=("leading",))
+    return RegimeQuantity("synchronization_margin", "", _margin, text="margin of synchronisation", tiers=("leading",))
 
 
 def _margin(evaluation: Evaluation, tier: Tier) -> Array:
@@ -281,7 +266,7 @@ def resonance_distance() -> Quantity:
     'distance from the nearest resonance at least 0.5'
     """
     text = "distance from the nearest resonance"
-    return regime_quantity("resonance_distance", "", _distance, text, tiers=("leading",), pieces_function=_distances)
+    return RegimeQuantity("resonance_distance", "", _distance, text=text, tiers=("leading",), pieces_function=_distances)
 
 
 def _distance(evaluation: Evaluation, tier: Tier) -> Array:
@@ -309,7 +294,7 @@ def least_torque() -> Quantity:
     'least torque needed to pass the resonances at most 0.7'
     """
     text = "least torque needed to pass the resonances"
-    return regime_quantity("least_torque", "", _least_torque, text, tiers=("leading",), pieces_function=_least_torques)
+    return RegimeQuantity("least_torque", "", _least_torque, text=text, tiers=("leading",), pieces_function=_least_torques)
 
 
 def _least_torque(evaluation: Evaluation, tier: Tier) -> Array:
@@ -367,7 +352,8 @@ def deck_points(quantities: Iterable[Quantity]) -> list[Point] | None:
 
 
 def working_speed() -> Quantity:
-    return regime_quantity("speed", "rad/s", _working_speed, "speed")
+    """Return the mean speed of the exciters in the working regime."""
+    return RegimeQuantity("speed", "rad/s", _working_speed, text="speed")
 
 
 def _working_speed(evaluation: Evaluation, tier: Tier) -> Array:
@@ -376,9 +362,10 @@ def _working_speed(evaluation: Evaluation, tier: Tier) -> Array:
 
 
 def working_amplitude(scene: Scene, k: int) -> Quantity:
+    """Return the amplitude of coordinate `k`, counted from 0, in the working regime."""
     structure = scene.machine.structure()
     name = f"amplitude of {structure.coordinates[k]}"
-    return regime_quantity("amplitude", structure.units[k], _working_amplitude, name, settings=(k,))
+    return RegimeQuantity("amplitude", structure.units[k], _working_amplitude, text=name, settings=(k,))
 
 
 def _working_amplitude(evaluation: Evaluation, tier: Tier, k: int) -> Array:
@@ -386,10 +373,12 @@ def _working_amplitude(evaluation: Evaluation, tier: Tier, k: int) -> Array:
 
 
 def working_force(evaluation: Evaluation, tier: Tier) -> Array:
+    """Return the foundation force of the working regime, N."""
     return evaluation.working(tier).foundation_force
 
 
 def working_power(evaluation: Evaluation, tier: Tier) -> Array:
+    """Return the power of all drives in the working regime, W."""
     motion = evaluation.working(tier)
     assert not isinstance(motion, Run)  # runs do not contain the torques of the drives
     return jnp.sum(motion.power)

@@ -17,7 +17,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.steady.measures import shaft_torque
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
-from optimize.quantities.exciters import regime_quantity, working_force, working_power
+from optimize.quantities.exciters import RegimeQuantity, working_force, working_power
 from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity, Tier
 
 __all__ = [
@@ -65,11 +65,13 @@ def jam_quantity(
     tiers: tuple[Tier, ...] = TIERS,
     pieces_function: Callable[..., Array] | None = None,
 ) -> Quantity:
+    """Return a quantity of the jam with the number `mode`."""
     text = f"{text}, mode {mode}"
     return BuiltinQuantity(name, unit, function, mode, of, tier, (mode, *settings), tiers, text, pieces_function)
 
 
 def pair_text(of: Pair) -> str:
+    """Return the platform or the pair of platforms of a quantity as text."""
     if of is None:
         return ""
     return f" of platform {of}" if isinstance(of, int) else f" of platform {of[0]} against {of[1]}"
@@ -181,7 +183,7 @@ def foundation_force(*, mode: int | None = None, harmonic: int | None = None, ti
     if mode is None:
         if harmonic is not None:
             raise InputError("harmonic", f"is {quoted(harmonic)} without a mode; give the jam mode")
-        return regime_quantity("foundation_force", "N", working_force, "foundation force", tier)
+        return RegimeQuantity("foundation_force", "N", working_force, tier=tier, text="foundation force")
     if harmonic is None:
         return jam_quantity(
             "foundation_force", "N", jam_force, mode, tier, "foundation force", settings=(None,), pieces_function=_peaks
@@ -334,7 +336,7 @@ def power(*, mode: int | None = None, tier: Tier = "leading") -> Quantity:
     'W'
     """
     if mode is None:
-        return regime_quantity("power", "W", working_power, "power of all drives", tier, ("leading", "exact"))
+        return RegimeQuantity("power", "W", working_power, tier=tier, tiers=("leading", "exact"), text="power of all drives")
     return jam_quantity("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
 
 

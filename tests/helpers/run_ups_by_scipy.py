@@ -2,6 +2,8 @@
 
 import functools
 
+import equinox as eqx
+import jax
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
@@ -34,6 +36,22 @@ def ramp(t):
         TOP * (2.0 * x - x**3) * 2.0 / 3.0,
         TOP / DURATION * (2.0 - 3.0 * x**2) * 2.0 / 3.0,
     )
+
+
+class Ramp(jv.IdealDrive):
+    """`ramp` as a prescribed drive."""
+
+    speed: jax.Array
+    kind: str = eqx.field(static=True, default="ramp", kw_only=True)
+
+    def angle_at(self, t):
+        return ramp(t)[0]
+
+    def speed_at(self, t):
+        return ramp(t)[1]
+
+    def acceleration_at(self, t):
+        return ramp(t)[2]
 
 
 def accelerations(times, cases, phase=0.4, turning=ramp):

@@ -2,12 +2,10 @@
 
 import functools
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_ups_by_scipy import TOP, TRUTH, accelerations, bound, free_motions, ramp, record, scene_of
+from run_ups_by_scipy import TOP, TRUTH, Ramp, accelerations, bound, free_motions, ramp, record, scene_of
 
 import jaxvib as jv
 
@@ -197,22 +195,6 @@ def test_results_are_saved_and_drawn(tmp_path):
     again = jv.load(fit.save(tmp_path / "fit"))
     assert again.summary() == fit.summary() and "mode 2" in fit.summary()
     assert len(fit.plot().axes) == 2
-
-
-class Ramp(jv.IdealDrive):
-    """Run-up of the records as a prescribed drive."""
-
-    speed: jax.Array
-    kind: str = eqx.field(static=True, default="ramp", kw_only=True)
-
-    def angle_at(self, t):
-        return ramp(t)[0]
-
-    def speed_at(self, t):
-        return ramp(t)[1]
-
-    def acceleration_at(self, t):
-        return ramp(t)[2]
 
 
 def test_plan_predicts_the_errors_after_a_run_with_an_added_mass():

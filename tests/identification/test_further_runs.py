@@ -4,11 +4,10 @@ import functools
 from types import SimpleNamespace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_ups_by_scipy import TOP, TRUTH, accelerations, ramp, record, scene_of
+from run_ups_by_scipy import TOP, TRUTH, Ramp, accelerations, ramp, record, scene_of
 
 import jaxvib as jv
 from jaxvib.identification.checks import coverage_notes
@@ -19,22 +18,6 @@ T = 0.002 * np.arange(8000)
 NOISE = 0.05
 NAMES = ("machine.stiffness", "machine.damping", "machine.link_stiffness", "machine.link_damping")
 SLOW = 0.45
-
-
-class Ramp(jv.IdealDrive):
-    """Run-up of the records as a prescribed drive."""
-
-    speed: jax.Array
-    kind: str = eqx.field(static=True, default="ramp", kw_only=True)
-
-    def angle_at(self, t):
-        return ramp(t)[0]
-
-    def speed_at(self, t):
-        return ramp(t)[1]
-
-    def acceleration_at(self, t):
-        return ramp(t)[2]
 
 
 def slow_ramp(t):

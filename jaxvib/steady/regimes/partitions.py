@@ -25,7 +25,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import speed_text
 from jaxvib.equations.averaged import require_rotating_masses
-from jaxvib.equations.torque_balance import assemble_torque_balance, influence_of
+from jaxvib.equations.torque_balance import assemble_for_search, assemble_torque_balance, influence_of
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -170,10 +170,9 @@ def regime_partitions(scene: Scene, *, stable: bool = True) -> RegimePartitions:
     motions = [_motion(parts, count) for parts in _products(tuple(range(count)), regimes)]
     rows = _Rows(*map(np.array, zip(*motions, strict=True))) if motions else _no_rows(count)
     interaction = in_chunks(_MOTIONS_PER_PROGRAM, _interactions, rows.speed, rows.group, shared=(scene,))
-    balance = cached(assemble_torque_balance)(scene)
     kept = np.flatnonzero(interaction <= _LARGEST_INTERACTION)
     kept = kept[np.lexsort((np.max(rows.group[kept], axis=1, initial=0), ~rows.stable[kept]))]
-    orders = np.array([exchange.order for exchange in exchanges_in(balance)])
+    orders = np.array([exchange.order for exchange in exchanges_in(assemble_for_search(scene))])
     kept = kept[_distinct(rows.speed[kept], rows.torque[kept], orders)]
     return RegimePartitions(
         status=RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none,
