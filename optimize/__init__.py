@@ -7,10 +7,6 @@ from jaxvib.code_changes import watch
 
 watch(sys.modules[__name__])  # first, because only later imports are watched
 
-from jaxvib.runtime.startup import start
-
-start()  # a process that uses only this package is prepared too, before its first array
-
 from optimize.design import Design
 from optimize.files import load_design
 from optimize.pareto import Front, pareto

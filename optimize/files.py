@@ -12,6 +12,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import Tables, build_part, load_scene, misplaced_name, read_toml, suggest_name
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.startup import start
 from jaxvib.units import count, number
 from jaxvib.units.tables import csv_column
 from optimize import recipes
@@ -68,6 +69,7 @@ def load_design(path: str | Path) -> Design:
     >>> load_design(folder / "design.toml").objective.name
     'force_per_amplitude'
     """
+    start()  # a process that uses no other name of jaxvib makes its first arrays here
     tables = read_toml(path)
     for name in tables:
         if name not in _SECTIONS:

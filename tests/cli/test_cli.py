@@ -1,6 +1,7 @@
 """The commands as a user types them."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -324,7 +325,9 @@ def test_import_leaves_jax_as_it_was_and_loads_no_command_line():
         "import sys, jax; before = dict(jax.config.values); import jaxvib, optimize; assert dict(jax.config.values) == before; "
         "assert not any(m.startswith(('jaxvib.cli', 'click', 'pint')) for m in sys.modules)"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    unset = ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "JAXVIB_AUTOMATIC")
+    clean = {name: value for name, value in os.environ.items() if name not in unset}
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env=clean)
 
 
 def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):

@@ -57,8 +57,12 @@ def test_a_folder_that_is_refused_stops_nobody(tmp_path):
     assert done.stdout.split() == [*FLAGS, "None"] and "programs are not cached" in done.stderr
 
 
-def test_the_design_package_prepares_the_process():
-    script = "import jax, optimize; from jaxvib.runtime.cpu import has_flags; jax.numpy.ones(2); assert has_flags()"
-    clean = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "JAXVIB_AUTOMATIC")}
+def test_a_design_file_prepares_the_process(tmp_path):
+    script = (
+        "import jax, optimize; assert jax.config.jax_compilation_cache_dir is None; "
+        "optimize.load_design('examples/antiphase/design.toml'); assert jax.config.jax_compilation_cache_dir is not None"
+    )
+    unset = ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "JAXVIB_AUTOMATIC")
+    clean = {name: value for name, value in os.environ.items() if name not in unset} | {"XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run([sys.executable, "-W", "error", "-c", script], env=clean, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
