@@ -350,7 +350,7 @@ def test_motion_without_a_spring_is_refused():
 
 
 def plain_multipliers(s):
-    """Multipliers by SciPy's implicit method, from the dense equations; loads at the first arrangement."""
+    """Multipliers by SciPy from the dense equations; loads at the first arrangement."""
     angles, n, nd = jv.balanced_states(s).angles[0], float(s.drive.speed), s.machine.structure().mass.shape[0]
     motion = lambda t: np.concatenate([np.zeros(2 * nd), angles + n * t, np.full(angles.size, n)])  # noqa: E731
     return multipliers(reference_model(s), motion, 2.0 * np.pi / n)
@@ -367,7 +367,7 @@ def plain_multipliers(s):
     ],
     ids=["slow rotor", "damped carrier", "light loads", "strong drag", "no damping"],
 )
-def test_stiff_balanced_motions_are_those_of_scipys_radau(numbers, mass, drag, speed):
+def test_multipliers_of_hard_balanced_motions_are_those_of_scipy(numbers, mass, drag, speed):
     machine = jv.one_mass(**dict(zip(("mass", "stiffness", "damping"), numbers, strict=True)))
     s = jv.Scene(machine, jv.balls(count=2, mass=mass, radius=0.1, drag=drag), jv.ConstantSpeed(speed))
     result = balanced_stability(s)

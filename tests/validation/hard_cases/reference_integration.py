@@ -87,7 +87,7 @@ def natural_sizes(p: ReferenceModel) -> np.ndarray:
 
 
 def multipliers(p: ReferenceModel, motion: Callable[[float], np.ndarray], period: float, *, rtol: float = 1e-10) -> np.ndarray:
-    """Floquet multipliers of a known periodic motion y(t), by SciPy's implicit Radau method: for any drag and damping."""
+    """Floquet multipliers of a known periodic motion y(t) by SciPy: Radau where drag or damping is stiff, otherwise DOP853."""
     size = natural_sizes(p)
     n = size.size
 
@@ -100,7 +100,8 @@ def multipliers(p: ReferenceModel, motion: Callable[[float], np.ndarray], period
     def jacobian(t: float, _: np.ndarray) -> np.ndarray:
         return np.kron(slopes(t), np.eye(n))
 
-    run = solve_ivp(field, (0.0, period), np.eye(n).ravel(), "Radau", [period], jac=jacobian, rtol=rtol, atol=1e-2 * rtol)
+    how = {"method": "Radau", "jac": jacobian} if is_stiff(p) else {"method": "DOP853"}
+    run = solve_ivp(field, (0.0, period), np.eye(n).ravel(), t_eval=[period], rtol=rtol, atol=1e-2 * rtol, **how)
     if not run.success:
         raise ArithmeticError(run.message)
     return np.linalg.eigvals(run.y[:, -1].reshape(n, n))
