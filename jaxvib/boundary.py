@@ -94,7 +94,7 @@ def validated(function: F) -> F:
                     if isinstance(value, (list, tuple, Decimal)) and _has_array(kind):
                         bound.arguments[name] = np.asarray(value, dtype=float)
                     elif isinstance(value, (np.ndarray, jax.Array)) and not _is_traced(value) and _is_list(kind):
-                        bound.arguments[name] = np.asarray(value).tolist()
+                        bound.arguments[name] = value if value.dtype == object else np.asarray(value).tolist()
         try:
             return function(*bound.args, **bound.kwargs)
         except _NEEDS_VALUE:
@@ -125,7 +125,7 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
             try:
                 kind = eval(kind, names)  # safe, because annotations are code of this package
             except NameError as error:
-                names[error.name or ""] = _MATPLOTLIB_CLASSES.get(error.name or "", Any)
+                names[error.name or ""] = Any
             except (TypeError, AttributeError):
                 kind = Any
         kind = Any if isinstance(kind, str) else kind
@@ -134,13 +134,18 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
 
 
 class _ByName(type):
-    """Metaclass that recognizes instances of matplotlib's classes by name, since matplotlib is imported only for figures."""
+    """Metaclass that recognizes instances of a class by its name."""
 
     def __instancecheck__(cls, value: object) -> bool:
         return any(each.__name__ == cls.__name__ for each in type(value).__mro__)
 
 
-_MATPLOTLIB_CLASSES = {name: _ByName(name, (), {}) for name in ("Axes", "Figure")}
+class Axes(metaclass=_ByName):
+    """matplotlib's class in annotations, without the import of matplotlib, which is slow."""
+
+
+class Figure(metaclass=_ByName):
+    """matplotlib's class in annotations, without the import of matplotlib, which is slow."""
 
 
 def is_real(value: object) -> bool:

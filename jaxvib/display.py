@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    from jaxvib.boundary import Axes, Figure
+
+Onto: TypeAlias = Axes | Sequence[Axes] | None
+"""Axes onto which a chart is drawn: one, or as many as it has panels; None for a new figure."""
+
+Drawn: TypeAlias = "Figure | Any"
+"""Result of a plot: the new figure, or the axes of the argument `ax`, which are of the caller's type (`Any`)."""
 
 SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
 """Unit in which speeds are shown."""

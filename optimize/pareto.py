@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.display import shown_unit
+from jaxvib.display import Axes, Drawn, shown_unit
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
@@ -22,11 +21,6 @@ from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Synthesis
 from optimize.space import DesignSpace
 from optimize.synthesize import synthesize
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _SAME_POINT_DIFFERENCE = 1e-6
 """Difference of quantities, relative to the range of the front, below which two machines count as one point."""

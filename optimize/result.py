@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
-from jaxvib.display import shown_unit
+from jaxvib.display import Axes, Drawn, shown_unit
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.structures.platforms import Platforms
@@ -18,11 +18,6 @@ from jaxvib.motion.run import Run
 from jaxvib.results.fields import Plain, in_unit, plain
 from jaxvib.results.result import Result
 from jaxvib.units import unit_ratio
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _MAX_SHOWN_PERCENT = 1000.0
 """Largest change that is shown in per cent; larger ones are shown in the unit of the objective."""

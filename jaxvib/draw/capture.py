@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, Onto, legend_above, panels
+from jaxvib.display import Drawn, Onto
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
 
 
 def threshold_chart(

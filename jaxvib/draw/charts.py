@@ -9,16 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
 from jaxvib.draw.style import (
     COLORS,
     GUIDE,
     MARKERS,
     OPERATING,
     UNSTABLE,
-    Drawn,
     Look,
-    Onto,
     legend_above,
     legend_outside,
     length_unit,

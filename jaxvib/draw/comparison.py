@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Look, Onto, legend_above, log_ticks, panels
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Look, legend_above, log_ticks, panels
 
 
 def tiers_chart(

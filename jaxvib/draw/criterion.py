@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import GUIDE, OPERATING, Drawn, Onto, legend_above, log_ticks, panels
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
+from jaxvib.draw.style import GUIDE, OPERATING, legend_above, log_ticks, panels
 
 _KINDS = (
     ("loads gather (both agree)", "#ececec"),

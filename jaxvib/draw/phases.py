@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.display import SpeedUnit, speed_unit
+from jaxvib.display import Drawn, SpeedUnit, speed_unit
 from jaxvib.draw.charts import solid_and_dashed
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, Drawn, legend_above, log_ticks, panels
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, legend_above, log_ticks, panels
 
 _PATTERNS = (
     "all together",

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxvib.display import speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, Drawn, Onto, legend_above, panels
+from jaxvib.display import Drawn, Onto, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, legend_above, panels
 
 
 def swing_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:

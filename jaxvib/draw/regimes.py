@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, Drawn, Onto, legend_above, log_ticks, panels
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, legend_above, log_ticks, panels
 
 HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
 """Hatches that distinguish neighbouring areas in greyscale."""

@@ -7,20 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import (
-    COLORS,
-    GUIDE,
-    MARKERS,
-    STROKES,
-    Drawn,
-    Look,
-    Onto,
-    legend_above,
-    length_unit,
-    log_ticks,
-    panels,
-)
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Look, legend_above, length_unit, log_ticks, panels
 
 
 def modes_chart(

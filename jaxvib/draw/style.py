@@ -14,14 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
-from jaxvib.display import shown_unit
+from jaxvib.display import Onto, shown_unit
 from jaxvib.errors import InputError, quoted
-
-Onto: TypeAlias = "Axes | Sequence[Axes] | None"
-"""Axes onto which a chart is drawn: one, or as many as it has panels; None for a new figure."""
-
-Drawn: TypeAlias = "Figure | Any"
-"""Result of a plot: the new figure, or the axes of the argument `ax`, which are of the caller's type (`Any`)."""
 
 Look: TypeAlias = dict[str, Any]
 """Drawing style: options of matplotlib, which have various types."""

@@ -10,7 +10,8 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, legend_above, log_ticks, panels
+from jaxvib.display import Drawn
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, legend_above, log_ticks, panels
 
 _NO_ANSWER_COLOR = "#f4f4f4"
 """Background colour of a map, which is visible for cases without a result."""

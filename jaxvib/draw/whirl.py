@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, OPERATING, Drawn, legend_above, panels
+from jaxvib.display import Drawn, SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, OPERATING, legend_above, panels
 
 _SENSES = {
     "forward": (COLORS[0], "-", "forward whirl"),

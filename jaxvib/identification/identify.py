@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.identification.checks import FitStatus, coverage_notes, status_of
 from jaxvib.identification.directions import (
@@ -38,9 +39,6 @@ from jaxvib.study.bearing.identify import Identified, identify_bearing
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 _RETURNS = 2
 """Number of times that undetermined combinations of numbers are moved back to their first values."""

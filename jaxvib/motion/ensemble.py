@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.boundary import call_user, validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
@@ -37,12 +37,6 @@ from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import REFUSED, without_numbers
 from jaxvib.units import Number
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """Results of `_run`, for one run or for many."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import Axes, Drawn
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -28,11 +28,6 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import failure, member, status_name
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _EXPONENTIAL_LOG_GROWTH, _LINEAR_LOG_GROWTH = math.log(1e3), math.log(2.1)
 """Logarithms of growth over the later half of a run: above the first the growth is exponential; below the second it can be

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, speed_text
+from jaxvib.display import Axes, Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.forces import normal_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.mount import on_body, read_place
@@ -35,12 +35,6 @@ from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number
 from jaxvib.units.known import when_known
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 
 @cached

@@ -11,19 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 
 from jaxvib.boundary import validated
+from jaxvib.display import Figure
 from jaxvib.errors import InputError, written
 from jaxvib.machine.scene import Scene
 from jaxvib.report.tables import Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.result import Result
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy")
 

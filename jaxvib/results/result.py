@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self, final
 import equinox as eqx
 
 from jaxvib.boundary import validated
+from jaxvib.display import Figure
 from jaxvib.errors import InputError, quoted
 from jaxvib.results import fields, files
 from jaxvib.results.csv import main_axis, table_along
@@ -20,7 +21,6 @@ from jaxvib.results.status import sentence, status_name
 if TYPE_CHECKING:
     import pandas
     import xarray
-    from matplotlib.figure import Figure
 
 
 class Result(eqx.Module):

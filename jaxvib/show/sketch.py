@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn
 from jaxvib.draw.machine.deck import ellipses, magnification
 from jaxvib.draw.machine.parts import Part, Text, put
-from jaxvib.draw.style import COLORS, Drawn, panels
+from jaxvib.draw.style import COLORS, panels
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.show.view import View

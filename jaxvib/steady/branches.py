@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto, SpeedUnit
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -24,8 +25,6 @@ from jaxvib.steady.jams.jam import STABILITY_CRITERION, AbstractJam, Jam, branch
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
     from jaxvib.steady.orbits.diagram import ExactBranches
 
 

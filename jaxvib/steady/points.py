@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text
+from jaxvib.display import Axes, Drawn, quantity_text
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.mount import Place, on_body, read_place
@@ -28,11 +28,6 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, known_number, number, numbers
 from jaxvib.units.known import when_known
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 STANDARD_GRAVITY = 9.80665
 """Acceleration 1 g, m/s^2."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, speed_text
+from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.averaged import require_rotating_masses
 from jaxvib.equations.linear import peak_force
 from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
@@ -30,10 +30,6 @@ from jaxvib.steady.measures import acceleration_of, rms_velocity_of
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.regimes.local import decays, regime_growth
 from jaxvib.units import Number, Numbers, count, number, numbers
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 _POINTS_PER_SIDE = 64
 """Number of speeds on each side of a resonance in the default range."""

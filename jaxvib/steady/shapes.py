@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.equations.linear import linear_model
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
@@ -18,12 +16,6 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 
 class ModeShapes(Result):

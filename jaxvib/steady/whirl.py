@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text, speed_unit
+from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text, speed_unit
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.mount import Mount
@@ -24,12 +24,6 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units import Numbers, numbers
 from jaxvib.units.known import when_known
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 LoadMasses = Literal["fixed", "none"]
 

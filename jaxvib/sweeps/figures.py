@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.display import shown_unit
+from jaxvib.display import Axes, Drawn, Figure, shown_unit
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.files import scene_from_toml, suggest_name
@@ -19,10 +19,7 @@ from jaxvib.sweeps.axes import SAMPLE, axis_of, put
 from jaxvib.sweeps.store import Store
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Drawn, Look
+    from jaxvib.draw.style import Look
 
 _MAX_DOTS = 1500
 """Maximum number of cases along an axis of a figure; if there are more, only every k-th case is drawn."""

@@ -14,6 +14,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import Axes, Drawn
 from jaxvib.errors import InputError
 from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.scene import Scene
@@ -32,9 +33,6 @@ from optimize.quantities.quantity import Tier
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _MAX_WORKERS = 16
 """Maximum number of worker processes on a machine with few cores; with more than four cores, four for each core."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.draw.style import COLORS, GUIDE, Drawn, panels
+from jaxvib.display import Drawn
+from jaxvib.draw.style import COLORS, GUIDE, panels
 
 
 def ellipses(points: np.ndarray, amplitude: np.ndarray, magnify: float) -> list[np.ndarray]:

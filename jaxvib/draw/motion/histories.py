@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, legend_above, length_unit, load_names, panels
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, STROKES, legend_above, length_unit, load_names, panels
 
 _BINS = 300
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, Onto, legend_above, log_ticks, panels
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, log_ticks, panels
 from jaxvib.errors import InputError, quoted
 
 PARTS = ("amplitude", "phase", "force", "torque")

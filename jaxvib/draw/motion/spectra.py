@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 
-from jaxvib.display import SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, legend_above, length_unit, panels
+from jaxvib.display import Drawn, SpeedUnit, speed_unit
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, length_unit, panels
 
 _DECADES = 1e-4
 """Lower end of the amplitude scale, relative to the largest amplitude."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.errors import InputError
 from jaxvib.identification.further_runs.planned import PlannedRun, expected_errors, expected_information, expected_run
 from jaxvib.identification.further_runs.profile import optimized_profile, read_limits, require_within
@@ -19,11 +18,6 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.units import Number
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 
 class RunPlan(Result):

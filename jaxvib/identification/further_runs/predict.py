@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto
 from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
 from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
 from jaxvib.identification.fit import differences_of, linear_at, run_equations
@@ -19,9 +20,6 @@ from jaxvib.identification.run import MeasuredRun
 from jaxvib.numerics.noise import Noise, noise_of
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 _NOISE_RATIO = 1.5
 """Ratio of the residuals to the noise of the fit above which the model is said to lack a part."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
@@ -26,11 +24,6 @@ from jaxvib.runtime.compat import enumeration_names
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.steady.whirl import whirl
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _SAME_SPEED = 3e-3
 """Relative difference below which two speeds count as equal: of two loads, of a load and the rotor, or of one load in the first

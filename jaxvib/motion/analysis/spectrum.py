@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, speed_text
+from jaxvib.display import Axes, Drawn, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -17,12 +17,6 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.units import count
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 _ZERO_PADDING_FACTOR = 4
 """Factor by which zero padding reduces the spacing of the computed frequencies. With this factor the heights of peaks are

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_text
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, only_exciter_value
@@ -20,10 +18,6 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import status_name
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 
 class EnvelopeStatus(eqx.Enumeration):

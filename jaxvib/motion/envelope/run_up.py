@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, speed_text
+from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.drives.drive import Motor, MotorWrapper
@@ -24,10 +24,6 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import Number, number
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 _BELOW_RESONANCE = 1.05
 """Speed relative to a natural frequency up to which an exciter has not passed it; exciters are caught slightly below."""

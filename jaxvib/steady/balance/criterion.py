@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_unit
+from jaxvib.display import Axes, Drawn, SpeedUnit, speed_unit
 from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, rotating_direction
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.terms import (
@@ -28,12 +28,6 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.speeds import CharacteristicSpeeds, CriterionStatus, characteristic_speeds, port_receptance
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 
 class Criterion(Result):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.display import speed_unit
+from jaxvib.display import Axes, Drawn, SpeedUnit, speed_unit
 from jaxvib.equations.linear import LinearModel, linear_model, require_one_point
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -22,12 +21,6 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.units.known import when_known
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 _GRID_POINTS = 24
 """Number of grid points on each side of each resonance in the search for sign changes of the damped machine."""

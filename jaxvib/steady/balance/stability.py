@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import numpy as np
 
+from jaxvib.display import Axes, Drawn
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 
 class StabilityStatus(eqx.Enumeration):

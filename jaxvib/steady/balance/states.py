@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import natural_frequencies, turning_loads
 from jaxvib.errors import InputError, quoted
@@ -37,9 +38,6 @@ from jaxvib.steady.balance.monodromy import (
 )
 from jaxvib.steady.balance.stability import BalancedStability
 from jaxvib.units import count
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 
 class BalanceStatus(eqx.Enumeration):

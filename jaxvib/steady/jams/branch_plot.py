@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from jax import Array
 
-from jaxvib.display import speed_text
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_text
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 
 class _Branch(Protocol):

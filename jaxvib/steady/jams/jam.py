@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, shown_unit, speed_text, speed_unit
+from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, shown_unit, speed_text, speed_unit
 from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force, require_drag
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -38,10 +38,6 @@ from jaxvib.steady.jams.folds import (
 )
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units.known import when_known
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 STABILITY_CRITERION = "by slope, for light loads that stay together"
 """Name of the stability criterion of jam modes, with its assumption."""

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.steady.jams.phases import PhaseStatus
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 _PHASE_JUMP = 0.3
 """If a phase changes by more than this, rad, between neighbouring load speeds, a figure shows another pattern."""

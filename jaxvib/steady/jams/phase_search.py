@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Axes, Drawn, SpeedUnit
 from jaxvib.equations.averaged import averaged_growth
 from jaxvib.equations.torque_balance import TorqueBalance, assemble_for_search, assemble_torque_balance, response_of
 from jaxvib.errors import InputError, quoted
@@ -40,12 +41,6 @@ from jaxvib.steady.jams.phases import (
     phase_jam,
 )
 from jaxvib.units import count, random_numbers
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 _SHOWN_DRAG_FACTOR = 30.0
 """Drag range of a figure of all jams: from the scene's drag divided by this factor to the drag times it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.averaged import averaged_growth
 from jaxvib.equations.linear import JAM_TERMS, peak_force, require_drag, turning_loads
 from jaxvib.equations.torque_balance import (
@@ -39,11 +38,6 @@ from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units import number, numbers
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _SAME_JAM_DISTANCE = 0.02
 """Largest relative difference of load speeds at which jams of two methods count as the same."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, speed_text
+from jaxvib.display import Drawn, Onto, quantity_text, speed_text
 from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
@@ -31,9 +29,6 @@ from jaxvib.steady.orbits.solve import (
 from jaxvib.steady.orbits.stability import Floquet, floquet
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import count, known_number
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 _MAX_INTEGRATION_STEPS = 2**17
 """Maximum number of integration steps in a turn; beyond it no multipliers are computed. The fastest motion of the carrier is

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto, SpeedUnit
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
@@ -29,10 +30,6 @@ from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.orbits.describe import OrbitStatus, orbits
 from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 _ORBITS_PER_BATCH = 32
 """Number of orbits in a batch: enough to fill vector registers, few enough for the cache."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto
 from jaxvib.errors import InputError
 from jaxvib.machine.numbers.named import find_number, put_numbers
 from jaxvib.machine.scene import Scene
@@ -33,9 +34,6 @@ from jaxvib.steady.orbits.whole import (
     periodic_scene,
     residual_of,
 )
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["LimitStatus", "SynchronizationLimit", "synchronization_limit"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import quantity_text, speed_text
+from jaxvib.display import Drawn, Onto, quantity_text, speed_text
 from jaxvib.equations.forces import drive_torques
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
@@ -37,9 +37,6 @@ from jaxvib.steady.orbits.whole import (
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number, Numbers, known_number
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["HasSpeedAndPhases", "SynchronousOrbit", "SynchronousStatus", "synchronous_orbit"]
 

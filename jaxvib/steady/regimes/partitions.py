@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.averaged import require_rotating_masses
 from jaxvib.equations.torque_balance import assemble_for_search, assemble_torque_balance, influence_of
 from jaxvib.errors import InputError, quoted
@@ -43,11 +43,6 @@ from jaxvib.steady.regimes.synchronous import (
     mass_owners,
     synchronous_regimes,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _MAX_MASSES = 6
 """Largest number of rotating masses; 6 have 63 possible groups and 203 partitions."""

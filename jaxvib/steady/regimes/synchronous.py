@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, Onto, speed_text
 from jaxvib.equations.averaged import require_rotating_masses
 from jaxvib.equations.linear import peak_force
 from jaxvib.equations.torque_balance import (
@@ -56,11 +56,6 @@ from jaxvib.steady.regimes.local import (
 from jaxvib.steady.regimes.search import all_regimes, is_balanced
 from jaxvib.units import Number, number, numbers
 from jaxvib.units.known import when_known
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn, Onto
 
 _REGIMES_PER_PROGRAM = 16
 """Number of regimes in one program; typical scenes have 2 to 20."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,12 +12,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 T = TypeVar("T")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxvib.boundary import call_user, is_real, validated
+from jaxvib.display import Axes, Drawn
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
@@ -21,11 +22,6 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _STEP_RATIO = math.sqrt(10.0)
 _DIFFERENCE_STEPS = tuple(float(h) for h in np.logspace(-2.0, -7.0, 11))

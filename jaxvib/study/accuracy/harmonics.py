@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -13,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError, quoted
@@ -27,11 +26,6 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 from jaxvib.units import Number, numbers
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 
 class HarmonicConvergence(Result):

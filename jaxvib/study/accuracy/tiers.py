@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit, part
@@ -20,11 +19,6 @@ from jaxvib.steady.jams.jam import Jam, jam_modes
 from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.units import numbers
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 
 class TierValues(eqx.Module):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import call_user, validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import Effect
@@ -27,12 +27,6 @@ from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
 from jaxvib.study.audit.tiers import TierRow, tier_rows
 from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
-
 
 _TIER_STEPS = 3
 """Time of the comparison of all tiers, in times of one effect, for the share that `progress` reports."""

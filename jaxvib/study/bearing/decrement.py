@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import Axes, Drawn
 from jaxvib.errors import InputError
 from jaxvib.results.estimate import Estimate, interval
 from jaxvib.results.fields import in_unit
@@ -16,11 +17,6 @@ from jaxvib.results.status import Computed
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import count
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 _LARGE_AMPLITUDE, _LARGE_AMPLITUDE_ERROR = np.pi / 3.0, 1e-3
 """Amplitude, rad, above which a relative error of the averaged formula and of the fitted arcs is assumed, and this error."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -14,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.numerics.noise import colored_covariance
 from jaxvib.results.estimate import Estimate, interval, shown, student_quantile
@@ -28,9 +28,6 @@ from jaxvib.study.bearing.decrement import (
 from jaxvib.study.bearing.fit import TOLERANCE, Fit, Unknowns, first_guess, fit_swing, steps_for
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, Friction
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 _MAX_HALF_PERIODS = 1.3
 """Number of half periods without a turning point, before the first or after the last one, after which the pendulum counts as at

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -14,6 +14,7 @@ import optimistix as optx
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.friction import dry_lever
 from jaxvib.motion.steps import Tolerance, require
@@ -25,9 +26,6 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, Numbers, count, number, numbers
 from jaxvib.units.known import when_known
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
 
 
 class BearingPendulum(eqx.Module):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Axes, Drawn
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
@@ -29,11 +30,6 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
 from jaxvib.units import Number, count, number, random_numbers
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 MAX_CAPTURED_SLIP = 3e-3
 """Relative difference of speeds below which a load turns with the rotor, as in `regime`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.display import Axes, Drawn
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
@@ -21,11 +21,6 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.study.capture.capture import Capture, Rotation, capture
 from jaxvib.units import Number
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.draw.style import Drawn
 
 
 class ThresholdCurve(Result):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import validated
+from jaxvib.display import Drawn, Onto, SpeedUnit
 from jaxvib.equations.linear import circular_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -20,10 +20,6 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.parallel import in_parallel
 from jaxvib.steady.balance.criterion import criterion
 from jaxvib.steady.balance.states import balanced_growth, stability_changes
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 
 class CriterionMap(Result):

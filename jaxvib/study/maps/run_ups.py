@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Drawn, Onto, SpeedUnit, speed_text
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.effects.base import has_term
@@ -32,10 +32,6 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, numbers, random_numbers
-
-if TYPE_CHECKING:
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn, Onto
 
 _FAILED = "failed"
 """Name of the outcome of a run that did not reach its end and has no regime."""

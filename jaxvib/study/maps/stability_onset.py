@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.display import speed_text
+from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import make_scene
@@ -20,12 +19,6 @@ from jaxvib.runtime.parallel import in_parallel
 from jaxvib.steady.jams.branch_plot import MARKS
 from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint, exact_branches
 from jaxvib.units import number
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from jaxvib.display import SpeedUnit
-    from jaxvib.draw.style import Drawn
 
 
 class StabilityMap(Result):
