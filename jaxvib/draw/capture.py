@@ -26,9 +26,7 @@ def threshold_chart(
     axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0], label="share, with its standard error")
     if np.isfinite(threshold):
         axis.axvline(threshold, color=COLORS[1], ls="--", label=f"threshold {threshold:.3f}")
-    axis.set_xlabel("initial speed relative to the rotor / rotor speed")
-    axis.set_ylabel("share of starts captured")
-    axis.set_ylim(-0.05, 1.05)
+    axis.set(xlabel="initial speed relative to the rotor / rotor speed", ylabel="share of starts captured", ylim=(-0.05, 1.05))
     legend_above(axis)
     return figure if ax is None else ax
 
@@ -51,9 +49,7 @@ def curve_chart(
     missing = np.isnan(threshold)
     if np.any(missing):
         axis.plot(value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not all starts captured")
-    axis.set_xlabel("value")
-    axis.set_ylabel("initial speed relative to the\nrotor / rotor speed")
-    axis.set_ylim(-1.03, 0.0)
+    axis.set(xlabel="value", ylabel="initial speed relative to the\nrotor / rotor speed", ylim=(-1.03, 0.0))
     legend_above(axis)
     return figure if ax is None else ax
 
@@ -89,12 +85,10 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     paths.set_xlim(-180.0, 180.0)
     paths.set_xticks(np.arange(-180, 181, 90))
     paths.yaxis.set_major_locator(MultipleLocator(45.0))
-    paths.set_xlabel("around the axis, relative to the rotor, degrees")
-    paths.set_ylabel("in the tube, degrees")
+    paths.set(xlabel="around the axis, relative to the rotor, degrees", ylabel="in the tube, degrees")
     legend_above(paths, 3)
     speeds.axhline(0.0, color=GUIDE, ls="--", lw=0.8)
-    speeds.set_xlabel("time, s")
-    speeds.set_ylabel("speed relative to the\nrotor / rotor speed")
+    speeds.set(xlabel="time, s", ylabel="speed relative to the\nrotor / rotor speed")
     legend_above(speeds)
     return figure if ax is None else ax
 

@@ -96,8 +96,7 @@ def branch_diagram(
             )
         axis.plot([], [], color="black", label="stable")
         axis.plot([], [], color="black", ls=UNSTABLE, label="unstable")
-        axis.set_xlim(0.0, high)
-        axis.set_xlabel("rotor speed, " + unit)
+        axis.set(xlim=(0.0, high), xlabel="rotor speed, " + unit)
         if ax is None:
             axis.set_ylabel(label)
             axis.set_title(title, loc="left", fontsize="medium")
@@ -109,8 +108,7 @@ def branch_diagram(
             shown = np.stack([values[np.isfinite(rotor_speed)] for _, values in group])
             axis.set_ylim(0.0, 1.08 * float(np.max(shown, initial=1e-300, where=np.isfinite(shown))))
         else:
-            axis.set_yscale("log")
-            axis.set_ylim(*log_limits([values for _, values in group], rotor_speed, omega, resonances))
+            axis.set(yscale="log", ylim=log_limits([values for _, values in group], rotor_speed, omega, resonances))
             log_ticks(axis)
         if at is not None:
             axis.axvline(scale * at, label="operating speed; numbers: jam modes", **OPERATING)
@@ -269,9 +267,7 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
         text = f"{before:.4g} → {after:.4g}{share}"
         axis.text(1.02, place, text, va="center", fontsize=9, transform=axis.get_yaxis_transform())
     axis.axvline(1.0, color="black", lw=0.9)
-    axis.set_xscale("log")
-    axis.set_xlim(low**1.1, high**1.1)
-    axis.set_ylim(-0.6, len(rows) - 0.4)
+    axis.set(xscale="log", xlim=(low**1.1, high**1.1), ylim=(-0.6, len(rows) - 0.4))
     axis.set_yticks(places, [name for name, _, _ in rows])
     log_ticks(axis, "x")
     axis.set_xlabel("after / before; amplitudes and forces zero to peak")
@@ -293,8 +289,7 @@ def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None =
     if np.nanmin(history) > 0.0:
         axis.set_yscale("log")
         log_ticks(axis)
-    axis.set_xlabel("iteration")
-    axis.set_ylabel(label)
+    axis.set(xlabel="iteration", ylabel=label)
     legend_above(axis)
     return figure if ax is None else ax
 
@@ -312,7 +307,6 @@ def front_chart(x: np.ndarray, y: np.ndarray, *, x_label: str, y_label: str, ax:
     for k, place in enumerate(zip(x, y, strict=True)):
         axis.annotate(f"{k}", place, xytext=(5, 4), textcoords="offset points", fontsize="small")
     axis.margins(0.08)
-    axis.set_xlabel(x_label)
-    axis.set_ylabel(y_label)
+    axis.set(xlabel=x_label, ylabel=y_label)
     legend_above(axis)
     return figure if ax is None else ax

@@ -30,8 +30,7 @@ def tiers_chart(
     axes.plot([], [], "o", color="black", mfc="white", label="hollow: unstable")
     log_ticks(axes, "x")
     log_ticks(axes)
-    axes.set_xlabel("mass of a load, kg")
-    axes.set_ylabel("relative error of the leading order")
+    axes.set(xlabel="mass of a load, kg", ylabel="relative error of the leading order")
     legend_above(axes)
     return figure if ax is None else ax
 
@@ -120,8 +119,7 @@ def convergence_chart(
         axes.semilogy(harmonics, np.maximum(error[:, k], floor), "o-", color=color, ms=4.5, label=name)
         axes.semilogy(harmonics, np.maximum(estimate[:, k], floor), ls=(0, (3, 2)), lw=1.0, color=color)
     axes.plot([], [], ls=(0, (3, 2)), lw=1.0, color="black", label="estimate")
-    axes.set_xlabel("highest harmonic")
-    axes.set_ylabel("relative error of the rotor speed")
+    axes.set(xlabel="highest harmonic", ylabel="relative error of the rotor speed")
     legend_above(axes, title="loads at")
     return figure if ax is None else ax
 
@@ -158,8 +156,7 @@ def stability_chart(
         look: Look = {"mec": COLORS[k % len(COLORS)], "mfc": "none", "mew": 1.4, "ms": max(9.0 - 2.0 * k, 3.0), "ls": ""}
         axes.plot(scale * points[:, 0], points[:, 1], "os^D"[k % 4], label=kind, **look)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
-    axes.set_xlabel(f"speed of loads, {unit}")
-    axes.set_ylabel(label)
+    axes.set(xlabel=f"speed of loads, {unit}", ylabel=label)
     legend_above(axes, 1)
     return figure if ax is None else ax
 
@@ -206,8 +203,7 @@ def audit_chart(
     log_ticks(left, "x")
     left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="requested accuracy")
     left.set_yticks(place, labels)
-    left.set_ylim(n - 0.4, -0.6)
-    left.set_xlabel("change, %")
+    left.set(ylim=(n - 0.4, -0.6), xlabel="change, %")
     legend_above(left, 3)
     return figure if ax is None else ax
 
@@ -234,7 +230,6 @@ def steps_chart(
         axes.loglog(steps, np.maximum(line, floor), color=color, label=name)
         axes.loglog([x], [max(y, floor)], "o", color=color, mfc="none", ms=8)
     axes.axhline(tolerance, color="black", ls=":", lw=1.2, label="tolerance; rings: best step")
-    axes.set_xlabel("step, relative")
-    axes.set_ylabel(f"differences against {route} mode")
+    axes.set(xlabel="step, relative", ylabel=f"differences against {route} mode")
     legend_above(axes)
     return figure if ax is None else ax

@@ -115,6 +115,4 @@ def criterion_chart(
     legend_above(ax, handles=legend)
     for y, words in ((0.96, "f > 0: loads gather"), (0.05, "f < 0: loads balance the rotor")):
         ax.text(0.99, y, words, transform=ax.transAxes, ha="right", va="center", fontsize="small", color="#555555")
-    ax.set_xlim(speed[0], speed[-1])
-    ax.set_xlabel(f"rotor speed, {unit}")
-    ax.set_ylabel("criterion f, kg m²")
+    ax.set(xlim=(speed[0], speed[-1]), xlabel=f"rotor speed, {unit}", ylabel="criterion f, kg m²")

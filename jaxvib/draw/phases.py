@@ -74,8 +74,6 @@ def drag_diagram(
     if within is not None:
         axis.set_xlim(at / within, at * within)
     log_ticks(axis, "x")
-    axis.set_ylim(0.0, 1.05 * scale * rotor_speed)
-    axis.set_xlabel(label)
-    axis.set_ylabel("speed of loads, " + unit)
+    axis.set(ylim=(0.0, 1.05 * scale * rotor_speed), xlabel=label, ylabel="speed of loads, " + unit)
     legend_above(axis, 3)
     return figure if ax is None else ax

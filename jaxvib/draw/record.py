@@ -30,8 +30,7 @@ def swing_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: 
     for sign in (-2.0, 2.0):
         bottom.axhline(sign * degrees * noise, color=GUIDE, lw=0.9, ls=":", label="twice the noise" if sign > 0.0 else None)
     legend_above(bottom)
-    bottom.set_ylabel("fit - record, deg")
-    bottom.set_xlabel("time, s")
+    bottom.set(ylabel="fit - record, deg", xlabel="time, s")
     return figure if ax is None else ax
 
 
@@ -99,6 +98,5 @@ def fit_chart(
     for sign in (-2.0, 2.0):
         bottom.axhline(sign, color=GUIDE, lw=0.9, ls=":", label="twice the noise" if sign > 0.0 else None)
     legend_above(bottom)
-    bottom.set_ylabel("(reading - fit) / noise")
-    bottom.set_xlabel("time, s")
+    bottom.set(ylabel="(reading - fit) / noise", xlabel="time, s")
     return figure if ax is None else ax

@@ -41,8 +41,7 @@ def regime_chart(
         look = {"color": COLORS[k % len(COLORS)], "hatch": HATCHES[k % len(HATCHES)], "edgecolor": "white", "lw": 0.0}
         top.bar(drag, 100.0 * share, bottom=low, width=drag * width, label=kind, **look)
         low = low + 100.0 * share
-    top.set_ylabel("share of the starts, %")
-    top.set_ylim(0.0, 100.0)
+    top.set(ylabel="share of the starts, %", ylim=(0.0, 100.0))
     legend_above(top, 4)
     bottom.plot(
         np.repeat(drag, omega.shape[1]),
@@ -54,9 +53,7 @@ def regime_chart(
         label="loads, each start",
     )
     bottom.axhline(scale * rotor_speed, color="black", lw=1.0, ls="--", label="rotor")
-    bottom.set_ylabel(f"speed of loads, {unit}")
-    bottom.set_xlabel("drag, N s/m")
-    bottom.set_xscale("log")
+    bottom.set(ylabel=f"speed of loads, {unit}", xlabel="drag, N s/m", xscale="log")
     log_ticks(bottom, "x")
     legend_above(bottom)
     return figure if ax is None else ax

@@ -60,13 +60,11 @@ def modes_chart(
     top.plot([], [], "o", color="black", mfc="white", label="unstable")
     legend_above(top)
     top.set_ylabel(f"speed of loads, {unit}")
-    bottom.set_ylabel(f"amplitude, {', '.join(dict.fromkeys(labels))}, zero to peak")
-    bottom.set_xlabel("number of the jam mode")
+    bottom.set(ylabel=f"amplitude, {', '.join(dict.fromkeys(labels))}, zero to peak", xlabel="number of the jam mode")
     shown = amplitude * np.where(tilts, 1e3, factor)
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     if shown.size:
-        bottom.set_yscale("log")
-        bottom.set_ylim(0.6 * np.min(shown), 1.7 * np.max(shown))
+        bottom.set(yscale="log", ylim=(0.6 * np.min(shown), 1.7 * np.max(shown)))
         log_ticks(bottom)
     there = mode[np.isfinite(omega)]
     bottom.set_xticks(there)
@@ -100,8 +98,7 @@ def shapes_chart(
         axis.bar(places, shape[:, k], width=0.94 * width, label=name, **look)
     axis.axhline(0.0, color="black", lw=0.9)
     axis.set_xticks(range(len(frequency)), [f"{scale * w:.4g} {unit}" for w in frequency])
-    axis.set_ylim(-1.1, 1.1)
-    axis.set_ylabel("mode shape, relative")
+    axis.set(ylim=(-1.1, 1.1), ylabel="mode shape, relative")
     axis.grid(False, axis="x")
     legend_above(axis, 6)
     return figure if ax is None else ax
@@ -129,9 +126,7 @@ def phase_circles(
     figure, axes = panels(rows, columns, size=(3.2, 3.2), ax=ax)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     for k, axis in enumerate(axes):
-        axis.set_aspect("equal")
-        axis.set_xlim(-1.6, 1.6)
-        axis.set_ylim(-1.35, 1.35)
+        axis.set(aspect="equal", xlim=(-1.6, 1.6), ylim=(-1.35, 1.35))
         axis.set_axis_off()
         if k >= len(sets):
             continue
@@ -230,9 +225,7 @@ def speeds_chart(
             axis.barh(height, min(end, top) - start, left=start, height=0.5, **hatch)
     labels = [label for label, _ in (*rows, *spans)]
     axis.set_yticks(heights[::-1], labels[::-1])
-    axis.set_ylim(-0.6, len(labels) - 0.3)
-    axis.set_xlim(0.0, top)
-    axis.set_xlabel(f"speed, {unit}")
+    axis.set(ylim=(-0.6, len(labels) - 0.3), xlim=(0.0, top), xlabel=f"speed, {unit}")
     return figure if ax is None else ax
 
 
@@ -267,8 +260,7 @@ def points_chart(values: np.ndarray, *, x_label: str, y_label: str, ax: Axes | N
     for k in range(values.shape[1]):
         mark = MARKERS[k % len(MARKERS)]
         axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], mark, ms=3.5, color=COLORS[k % len(COLORS)])
-    axis.set_xlabel(x_label)
-    axis.set_ylabel(y_label)
+    axis.set(xlabel=x_label, ylabel=y_label)
     return figure if ax is None else ax
 
 
@@ -291,9 +283,7 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Draw
             **{"marker": "o", "ls": "", "ms": 5.0, "label": name, **look},
         )
     legend_above(axis, 3)
-    axis.set_aspect("equal")
-    axis.set_xlabel("real part")
-    axis.set_ylabel("imaginary part")
+    axis.set(aspect="equal", xlabel="real part", ylabel="imaginary part")
     return figure if ax is None else ax
 
 
@@ -306,7 +296,6 @@ def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertain
     axes.fill_between(half[[0, -1]], exponent - uncertainty, exponent + uncertainty, color=COLORS[1], alpha=0.3, lw=0.0)
     axes.plot(half[[0, -1]], [exponent, exponent], color=COLORS[1], ls="--", label="exponent, with its standard error")
     axes.axhline(0.0, color="black", lw=0.8)
-    axes.set_xlabel("time, s")
-    axes.set_ylabel("growth of disturbances, 1/s")
+    axes.set(xlabel="time, s", ylabel="growth of disturbances, 1/s")
     legend_above(axes)
     return figure if ax is None else ax

@@ -85,8 +85,7 @@ def label_map(
             inside = inside or bool(np.any(within[0] & within[1]))
         if inside:
             entries.append(Line2D([], [], color="black", lw=1.1, ls=dashes, label=f"{kind} bifurcations of exact jams"))
-    axis.set_xlim(edges[0])
-    axis.set_ylim(edges[1])
+    axis.set(xlim=edges[0], ylim=edges[1])
     _scales(axis, x_label, y_label, log)
     axis.grid(False)
     legend_above(axis, 3, handles=entries)
@@ -117,8 +116,7 @@ def _light(colour: str) -> tuple[float, float, float]:
 
 
 def _scales(axis: Axes, x_label: str, y_label: str, log: tuple[bool, bool]) -> None:
-    axis.set_xlabel(x_label)
-    axis.set_ylabel(y_label)
+    axis.set(xlabel=x_label, ylabel=y_label)
     if log[0]:
         axis.set_xscale("log")
         log_ticks(axis, "x")
@@ -217,8 +215,7 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, x_label: str, a
     """
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     axis.bar(edges[:-1], counts, width=np.diff(edges), align="edge", color=COLORS[0], alpha=0.55)
-    axis.set_ylabel("cases")
-    axis.set_xlabel(x_label)
+    axis.set(ylabel="cases", xlabel=x_label)
     share = axis.twinx()
     share.plot(edges, 100.0 * np.concatenate([[0.0], np.cumsum(counts)]) / max(np.sum(counts), 1), color=COLORS[1])
     share.set_ylim(0.0, 102.0)

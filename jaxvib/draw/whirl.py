@@ -57,10 +57,7 @@ def campbell_diagram(
     if at is not None:
         axis.axvline(scale * at, label="operating speed", **OPERATING)
     left = scale * float(np.min(rotor_speed)) if len(rotor_speed) > 1 else 0.0
-    axis.set_xlim(left, right)
-    axis.set_ylim(0.0, top)
-    axis.set_xlabel(f"rotor speed, {unit}")
-    axis.set_ylabel(f"whirl speed, {unit}")
+    axis.set(xlim=(left, right), ylim=(0.0, top), xlabel=f"rotor speed, {unit}", ylabel=f"whirl speed, {unit}")
     legend_above(axis, 3)
     return figure if ax is None else ax
 

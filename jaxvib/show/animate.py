@@ -225,8 +225,7 @@ def _plot_histories(axes: tuple[Axes, Axes], scene: Scene, shown: SampledMotion)
     for k, name in enumerate(structure.foundation_directions):
         look = {"color": "black" if k else COLORS[1], "ls": STROKES[k], "lw": 1.2}
         lower.plot(shown.time, shown.force[:, k], label=f"foundation force, {name}", **look)
-    lower.set_ylabel("N")
-    lower.set_xlabel("time, s")
+    lower.set(ylabel="N", xlabel="time, s")
     legend_above(lower)
     for axis in (upper, lower):
         axis.set_xlim(shown.time[0], shown.time[-1])

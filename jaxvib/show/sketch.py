@@ -102,8 +102,7 @@ def _draw_deck(axis: Axes, view: View, deck: Deck, limits: Limits) -> None:
         axis.plot(*path[0], "o", color=COLORS[1], ms=3.5, zorder=4.0)
     left, right, bottom, top = limits
     (low_x, low_y), (high_x, high_y) = (extreme(np.concatenate(paths), axis=0) for extreme in (np.min, np.max))
-    axis.set_xlim(min(left, low_x - 0.1), max(right, high_x + 0.1))
-    axis.set_ylim(min(bottom, low_y - 0.1), max(top, high_y + 0.1))
+    axis.set(xlim=(min(left, low_x - 0.1), max(right, high_x + 0.1)), ylim=(min(bottom, low_y - 0.1), max(top, high_y + 0.1)))
     note = f"ellipses drawn {magnify:g} x as large"
     axis.text(right, bottom, note, ha="right", va="bottom", fontsize="x-small", color="#555555")
 
@@ -119,7 +118,5 @@ def checked_scene(scene: object) -> Scene:
 def fit(axis: Axes, limits: Limits) -> None:
     """Set the limits of axes to those of a drawing, with equal scales, and hide ticks and frame."""
     left, right, bottom, top = limits
-    axis.set_xlim(left, right)
-    axis.set_ylim(bottom, top)
-    axis.set_aspect("equal")
+    axis.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     axis.set_axis_off()

@@ -37,8 +37,7 @@ def deck_chart(points: np.ndarray, amplitude: np.ndarray, *, ax: Axes | None = N
         axis.plot(*path[0], "o", color=COLORS[k % len(COLORS)], ms=4)
     axis.plot(*points.T, "+", color=GUIDE, ms=6)
     axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x, m")
-    axis.set_ylabel("y, m")
+    axis.set(xlabel="x, m", ylabel="y, m")
     note = f"amplitudes drawn {magnify:g} x as large"
     axis.set_title(note, loc="left", fontsize="small")
     return figure if ax is None else ax

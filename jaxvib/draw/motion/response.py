@@ -79,8 +79,7 @@ def response_chart(
         if name in ("amplitude", "force"):
             _logarithmic(axis)
         legend_above(axis)
-    axes[-1].set_xlabel(f"speed of the exciter, {unit}")
-    axes[-1].set_xlim(0.0, scale * float(np.max(curve["speed"])))
+    axes[-1].set(xlabel=f"speed of the exciter, {unit}", xlim=(0.0, scale * float(np.max(curve["speed"]))))
     return figure if ax is None else ax
 
 
@@ -156,6 +155,5 @@ def _logarithmic(axis: Axes) -> None:
     if there.size == 0:
         return
     top = 2.0 * float(np.max(there))
-    axis.set_yscale("log")
-    axis.set_ylim(max(0.5 * float(np.min(there)), top / 10.0**_DECADES), top)
+    axis.set(yscale="log", ylim=(max(0.5 * float(np.min(there)), top / 10.0**_DECADES), top))
     log_ticks(axis)

@@ -42,11 +42,13 @@ def spectrum_chart(
     for name, speeds, stroke in marks:
         for k, speed in enumerate(np.abs(speeds[0])):
             axis.axvline(scale * float(speed), color="black", lw=0.9, ls=stroke, label=None if k else name)
-    axis.set_yscale("log")
-    axis.set_ylim(_DECADES * top, 2.0 * top)
-    axis.set_xlim(0.0, scale * float(frequency[-1]))
-    axis.set_xlabel(f"frequency, {unit}")
-    axis.set_ylabel("amplitude, zero to peak")
+    axis.set(
+        yscale="log",
+        ylim=(_DECADES * top, 2.0 * top),
+        xlim=(0.0, scale * float(frequency[-1])),
+        xlabel=f"frequency, {unit}",
+        ylabel="amplitude, zero to peak",
+    )
     legend_above(axis)
     return figure if ax is None else ax
 
@@ -88,9 +90,7 @@ def waterfall_chart(
     for name, speeds, color, stroke in marks:
         for k, speed in enumerate(np.abs(speeds).T):
             axis.plot(time, scale * speed, color=color, lw=1.4, ls=stroke, label=None if k else name)
-    axis.set_ylim(0.0, scale * float(frequency[-1]))
-    axis.set_xlabel("time, s")
-    axis.set_ylabel(f"frequency, {unit}")
+    axis.set(ylim=(0.0, scale * float(frequency[-1])), xlabel="time, s", ylabel=f"frequency, {unit}")
     legend_above(axis)
     return figure if ax is None else ax
 
@@ -114,7 +114,6 @@ def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes |
     axis.plot([0.0], [0.0], "+", color="black", ms=9.0)
     axis.set_aspect("equal", adjustable="datalim")
     axis.locator_params(nbins=6)
-    axis.set_xlabel(f"horizontal, {unit}")
-    axis.set_ylabel(f"vertical, {unit}")
+    axis.set(xlabel=f"horizontal, {unit}", ylabel=f"vertical, {unit}")
     legend_above(axis, 2)
     return figure if ax is None else ax
