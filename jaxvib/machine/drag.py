@@ -11,7 +11,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, require_one_of
 from jaxvib.units import Number, number
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known
 
 Cause = Literal["oil", "rolling", "bearing"]
 
@@ -104,41 +104,25 @@ def drag_of(
             value[name] = read(each, needed[name], name)
     speeds = {"load_speed": load_speed, "rotor_speed": rotor_speed}
     arm, (slow, fast) = read(radius, "m", "radius"), (read(speed, "rad/s", name) for name, speed in speeds.items())
-    when_known(_require_slip, slow, fast)
+    problem = "is {:.6g} rad/s; it must be less than the rotor_speed of {:.6g} rad/s"
+    require_if_known(lambda slow, fast: slow < fast, slow, fast, field="load_speed", problem=problem)
     slip, press = arm * (fast - slow), arm * slow**2
     if cause == "oil":
         return _oil_drag(slip, value["ball_radius"], value["viscosity"], value["density"])
     if cause == "rolling":
-        when_known(_require_small_lever, value["rolling_lever"], value["ball_radius"])
-        return value["mass"] * press * value["rolling_lever"] / (value["ball_radius"] * slip)
-    when_known(_require_small_bearing, value["diameter"], arm)
+        lever, problem = value["rolling_lever"], "is {:g} m; it must be at most a tenth of the ball_radius of {:g} m"
+        require_if_known(lambda k, r: k <= 0.1 * r, lever, value["ball_radius"], field="rolling_lever", problem=problem)
+        return value["mass"] * press * lever / (value["ball_radius"] * slip)
+    problem = "is {:g} m; it must be at most the radius of {:g} m"
+    require_if_known(lambda d, r: d <= r, value["diameter"], arm, field="diameter", problem=problem)
     return 0.5 * value["friction"] * value["mass"] * press * value["diameter"] / (arm * slip)
 
 
 def _oil_drag(slip: Array, r: Array, viscosity: Array, density: Array) -> Array:
     reynolds = 2.0 * density * r * slip / viscosity
-    when_known(_require_reynolds, reynolds)
+    limit = f"the formula holds up to {_MAX_REYNOLDS:g}; give a thicker oil or speeds that are closer together"
+    problem = "gives a Reynolds number of {:.3g}; " + limit
+    require_if_known(lambda number: number <= _MAX_REYNOLDS, reynolds, field="viscosity", problem=problem)
     # C_D rho pi r^2 v / 2 with the factor Re of C_D taken out, because Re can be very small.
     inertial = 0.42 * reynolds / (1.0 + 42500.0 * reynolds**-1.16)
     return np.pi / 4.0 * viscosity * r * (24.0 * (1.0 + 0.15 * reynolds**0.687) + inertial)
-
-
-def _require_slip(slow: float, fast: float) -> None:
-    if not slow < fast:
-        raise InputError("load_speed", f"is {slow:.6g} rad/s; it must be less than the rotor_speed of {fast:.6g} rad/s")
-
-
-def _require_reynolds(reynolds: float) -> None:
-    if not reynolds <= _MAX_REYNOLDS:
-        problem = f"the formula holds up to {_MAX_REYNOLDS:g}; give a thicker oil or speeds that are closer together"
-        raise InputError("viscosity", f"gives a Reynolds number of {reynolds:.3g}; {problem}")
-
-
-def _require_small_lever(lever: float, r: float) -> None:
-    if not lever <= 0.1 * r:
-        raise InputError("rolling_lever", f"is {lever:g} m; it must be at most a tenth of the ball_radius of {r:g} m")
-
-
-def _require_small_bearing(diameter: float, arm: float) -> None:
-    if not diameter <= arm:
-        raise InputError("diameter", f"is {diameter:g} m; it must be at most the radius of {arm:g} m")

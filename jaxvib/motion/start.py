@@ -26,7 +26,7 @@ from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, known_number, numbers
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known, when_known
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: at rest; near a jam mode; at rest with a smooth spin-up of the rotor."""
@@ -232,13 +232,9 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
         if not exciter.drive.constant:
             raise InputError("start", f"is 'spin_up', but the drive is {quoted(exciter.drive.kind)} already; start at 'rest'")
         drives.append(SpinUp(exciter.drive.speed, end / 2.0 if spin_up is None else spin_up))
-    when_known(_require_shorter, drives[0].duration, end)
+    times, problem = (drives[0].duration, end), "is {:g} s, longer than the run of {:g} s; run longer"
+    require_if_known(lambda duration, end: duration <= end, *times, field="spin_up", problem=problem)
     return eqx.tree_at(lambda s: [exciter.drive for exciter in s.exciters], scene, drives)
-
-
-def _require_shorter(duration: float, end: float) -> None:
-    if duration > end:
-        raise InputError("spin_up", f"is {duration:g} s, longer than the run of {end:g} s; run longer")
 
 
 def validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None = None) -> State:

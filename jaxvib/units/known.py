@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -31,6 +31,19 @@ def when_known(check: Callable[..., T], *values: PyTree) -> T | None:
     True
     """
     return check(*jax.tree.map(_plain, values)) if is_known(values) else None
+
+
+def require_if_known(allowed: Callable[..., object], *values: PyTree, field: str, problem: str) -> None:
+    """Raise `InputError` if `allowed(*values)` is not true of known values; `problem` is formatted with the values.
+
+    >>> require_if_known(lambda gap, tube: gap < tube, 1.0, 2.0, field="gap", problem="is {:g} m; the tube has {:g} m")
+    """
+
+    def check(*known: Any) -> None:
+        if not allowed(*known):
+            raise InputError(field, problem.format(*known))
+
+    when_known(check, *values)
 
 
 def _plain(leaf: object) -> object:

@@ -13,7 +13,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import INERTIA, ConstantSpeed, Drive, IdealDrive, Motor, MotorWrapper
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, Numbers
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known, when_known
 
 
 class TorqueTable(Motor):
@@ -46,7 +46,8 @@ class TorqueTable(Motor):
         self.speeds, self.torques = _points(TorqueTable, speeds=speeds, torques=torques)
         self.inertia = read_numbers(TorqueTable, "drive", inertia=inertia)["inertia"]
         self.kind = "torque_table"
-        when_known(_require_fall, self.torques)
+        problem = "must begin with a positive torque and end with 0 or a negative one, at the motor's speed without a load"
+        require_if_known(lambda torques: torques[0] > 0.0 >= torques[-1], self.torques, field="drive.torques", problem=problem)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -85,12 +86,6 @@ def _require_ascending(values: np.ndarray, name: str) -> None:
         raise InputError(f"drive.{name}[{k}]", f"is {values[k]:g} after {values[k - 1]:g}; list the {name} in ascending order")
 
 
-def _require_fall(torques: np.ndarray) -> None:
-    if torques[0] <= 0.0 or torques[-1] > 0.0:
-        needed = "the first must be positive, and the last 0 or negative, so that the motor has a speed without a load"
-        raise InputError("drive.torques", f"are {torques[0]:g} N m first and {torques[-1]:g} N m last; {needed}")
-
-
 class SpeedProfile(IdealDrive):
     """Drive that prescribes the rotor speed at several times, with constant accelerations between them.
 
@@ -119,7 +114,8 @@ class SpeedProfile(IdealDrive):
     def __init__(self, times: Numbers, speeds: Numbers):
         self.times, self.speeds = _points(SpeedProfile, times=times, speeds=speeds)
         self.kind = "speed_profile"
-        when_known(_require_turning, self.speeds)
+        problem = "are all 0; at least one must be greater than 0"
+        require_if_known(lambda speeds: np.any(speeds > 0.0), self.speeds, field="drive.speeds", problem=problem)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -154,19 +150,9 @@ class SpeedProfile(IdealDrive):
 
     def settled(self) -> Drive:
         """Return `ConstantSpeed` at the last speed. **Raises** `InputError` if the rotor comes to rest."""
-        when_known(_require_steady_speed, self.speeds)
-        return ConstantSpeed(cast(Array, self.speed))
-
-
-def _require_turning(speeds: np.ndarray) -> None:
-    if not np.any(speeds > 0.0):
-        raise InputError("drive.speeds", "are all 0; at least one must be greater than 0")
-
-
-def _require_steady_speed(speeds: np.ndarray) -> None:
-    if speeds[-1] == 0.0:
         problem = "end at 0, so there is no steady motion; use simulate, or a profile that ends at a speed"
-        raise InputError("drive.speeds", problem)
+        require_if_known(lambda speeds: speeds[-1] != 0.0, self.speeds, field="drive.speeds", problem=problem)
+        return ConstantSpeed(cast(Array, self.speed))
 
 
 class Converter(MotorWrapper):

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
 from jaxvib.machine.drives.drive import INERTIA, Motor, kloss_torque
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number, count
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known
 
 _POSITIVE = {"low": 0.0, "open_low": True}
 
@@ -67,8 +66,12 @@ class NamePlateMotor(Motor):
             frequency=frequency,
         ).values()
         self.kind = "name_plate_motor"
-        when_known(_require_below, self.rated_speed, self.frequency)
-        when_known(_require_breakdown, self.breakdown_slip)
+        problem = "is {:g} rad/s; it must be below the supply's frequency, {:g} rad/s"
+        speeds = self.rated_speed, self.frequency
+        require_if_known(lambda rated, f: rated < f * (1.0 - 1e-6), *speeds, field="drive.rated_speed", problem=problem)
+        needed = "it must be less than 1; check the rated speed and the supply's frequency"
+        problem = "and the rated slip give a breakdown slip of {:.3g}; " + needed
+        require_if_known(lambda slip: slip < 1.0, self.breakdown_slip, field="drive.breakdown_ratio", problem=problem)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -91,17 +94,6 @@ class NamePlateMotor(Motor):
     def torque(self, speed: Array) -> Array:
         """Return the torque of Kloss's formula."""
         return kloss_torque(1.0 - speed / self.speed, self.breakdown_torque, self.breakdown_slip)
-
-
-def _require_below(rated: float, supply: float) -> None:
-    if rated >= supply * (1.0 - 1e-6):
-        raise InputError("drive.rated_speed", f"is {rated:g} rad/s; it must be below the supply's frequency, {supply:g} rad/s")
-
-
-def _require_breakdown(slip: float) -> None:
-    if slip >= 1.0:
-        needed = "it must be less than 1; check the rated speed and the supply's frequency"
-        raise InputError("drive.breakdown_ratio", f"and the rated slip give a breakdown slip of {slip:.3g}; {needed}")
 
 
 class DCMotorElectrical(Motor):

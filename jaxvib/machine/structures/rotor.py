@@ -18,7 +18,7 @@ from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.machine.structures.damping import damping_constants
 from jaxvib.units import Number, Numbers
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known, when_known
 
 _MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
 
@@ -209,7 +209,9 @@ def rotor(
 
     places = read(2, position=position)["position"]
     if stiffness_terms is None:
-        when_known(_require_two_places, places)
+        needed = "which leaves the tilt of the rotor without stiffness; give two places, such as [0.165, -0.155]"
+        problem = "puts both supports at {0[0]:g} m, " + needed
+        require_if_known(lambda at: at[0] != at[1], places, field="machine.position", problem=problem)
     transverse, polar = read(transverse_inertia=transverse_inertia, polar_inertia=polar_inertia).values()
     when_known(_require_possible_inertia, transverse, polar)
     for name, given, up in (("stiffness", stiffness_terms, stiffness_up), ("damping", damping_terms, damping_up)):
@@ -248,12 +250,6 @@ def _require_passive(field: str, one: float, two: float, three: float) -> None:
             "at least the square of the middle one"
         )
         raise InputError(f"machine.{field}", f"{[one, two, three]} {problem}")
-
-
-def _require_two_places(places: np.ndarray) -> None:
-    if places[0] == places[1]:
-        problem = "which leaves the tilt of the rotor without stiffness; give two places, such as [0.165, -0.155]"
-        raise InputError("machine.position", f"puts both supports at {places[0]:g} m, {problem}")
 
 
 def _require_possible_inertia(transverse: float, polar: float) -> None:

@@ -15,7 +15,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError
 from jaxvib.machine.effects.friction import dry_lever
 from jaxvib.motion.steps import Tolerance, require
 from jaxvib.ode.types import RealScalarLike
@@ -25,7 +25,7 @@ from jaxvib.runtime.compat import fast_diffrax_loop_end
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, Numbers, count, number, numbers
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_if_known
 
 
 class BearingPendulum(eqx.Module):
@@ -208,14 +208,13 @@ def swing(
 
     Source: Artyunin, Sumenkov 2019, equations (1)-(3).
     """
-    if not isinstance(pendulum, BearingPendulum):
-        raise InputError("pendulum", f"is {quoted(pendulum)}; it must be a BearingPendulum(mass=..., length=...)")
     times = numbers(time, "s", "time", None)
     chosen = Tolerance(1e-9 if times.dtype.itemsize >= 8 else 1e-5) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if times.ndim != 1:
         raise InputError("time", "is one number; a list of times is needed")
-    when_known(_require_ascending, times)
+    problem = "must ascend, each time later than the one before"
+    require_if_known(lambda t: np.all(np.diff(t) > 0.0), times, field="time", problem=problem)
     friction = Friction(
         number(viscous, "N m s", "viscous", low=0.0),
         None if dry is None else number(dry, "", "dry", low=0.0),
@@ -225,7 +224,9 @@ def swing(
     if dry is not None:
         _diameter(pendulum)
     if torque is not None:
-        when_known(_require_rest, friction.torque, pendulum.mass * pendulum.g * pendulum.length)
+        problem = "is {:g} N m; it must be below m g l, {:.4g} N m"
+        weight = pendulum.mass * pendulum.g * pendulum.length
+        require_if_known(lambda torque, most: abs(torque) < most, friction.torque, weight, field="torque", problem=problem)
     run = swing_states(
         pendulum,
         times,
@@ -239,16 +240,6 @@ def swing(
         count(max_steps, "max_steps"),
     )
     return outcome(run, throw=throw, failures=("max_steps_reached",), hint=lambda _: f" ({max_steps}); give a larger max_steps")
-
-
-def _require_ascending(times: np.ndarray) -> None:
-    if np.any(np.diff(times) <= 0.0):
-        raise InputError("time", "must ascend, each time later than the one before")
-
-
-def _require_rest(torque: np.ndarray, most: np.ndarray) -> None:
-    if np.any(np.abs(torque) >= most):
-        raise InputError("torque", f"is {float(torque):g} N m; it must be below m g l, {float(most):.4g} N m")
 
 
 def _diameter(pendulum: BearingPendulum) -> Array:
