@@ -62,8 +62,6 @@ def display_units(*, speed: SpeedUnit = "rpm", si: bool = False) -> None:
     4.45723 Hz: y1 +1.000
     >>> jv.display_units()
     """
-    if not isinstance(si, bool):
-        raise InputError("si", f"is {quoted(si)}; it must be True or False")
     _Chosen.speed, _Chosen.si = speed_unit(speed)[0], si
 
 

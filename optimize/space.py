@@ -18,7 +18,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 from optimize.quantities.evaluation import Evaluation
-from optimize.quantities.quantity import Quantity, require_quantity
+from optimize.quantities.quantity import Quantity
 
 Numbers = TypeVar("Numbers", np.ndarray, Array)
 
@@ -57,7 +57,6 @@ def hold(quantity: Quantity, value: Number | None = None) -> HeldQuantity:
     >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name
     'jam_frequency'
     """
-    require_quantity(quantity, "hold")
     if value is None:
         return HeldQuantity(quantity, None)
     held = float(number(value, quantity.unit, f"hold.{quantity.name}"))

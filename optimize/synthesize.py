@@ -31,7 +31,7 @@ from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.exciters import RegimeQuantity, working_amplitude, working_speed
 from optimize.quantities.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
-from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, require_quantity, walk
+from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, walk
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
 from optimize.search.polish import FEASIBILITY_TOLERANCE
@@ -213,9 +213,6 @@ def _options(starts: int, seed: int, iterations: int, polishing: int, rate: floa
 
 
 def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Demand | Sequence[Demand]) -> tuple[Demand, ...]:
-    if not isinstance(space, DesignSpace):
-        raise InputError("space", f"is {quoted(space)}; it must be a DesignSpace")
-    require_quantity(objective, "objective")
     demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
     for demand in demands:
         if not isinstance(demand, Demand):

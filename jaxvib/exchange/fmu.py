@@ -22,11 +22,10 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.state import State
-from jaxvib.errors import InputError, require_one_of, written
+from jaxvib.errors import InputError, require_one_of, require_writable, written
 from jaxvib.exchange.c_code import Written, number_text, write_program
 from jaxvib.exchange.description import Fmi, Variable, describe_model
 from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, named_entries, without_motor_states
-from jaxvib.exchange.optional import require_writable
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units

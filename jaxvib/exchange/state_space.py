@@ -15,8 +15,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, averaged_field
 from jaxvib.equations.linear import linear_model
-from jaxvib.errors import InputError, quoted, written
-from jaxvib.exchange.optional import optional_module, require_writable
+from jaxvib.errors import InputError, optional_module, quoted, require_writable, written
 from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces, signals_of
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import terms_of

@@ -15,8 +15,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import estimated_frequencies, linear_model
-from jaxvib.errors import InputError, open_regular, quoted, require_one_of, written
-from jaxvib.exchange.optional import optional_module, require_writable
+from jaxvib.errors import InputError, open_regular, optional_module, quoted, require_one_of, require_writable, written
 from jaxvib.exchange.state_space import state_space
 from jaxvib.machine.mount import Place, on_body
 from jaxvib.machine.scene import Scene

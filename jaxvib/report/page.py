@@ -16,7 +16,7 @@ import equinox as eqx
 
 from jaxvib.boundary import validated
 from jaxvib.display import Figure
-from jaxvib.errors import InputError, written
+from jaxvib.errors import written
 from jaxvib.machine.scene import Scene
 from jaxvib.report.tables import Units, accuracy_table, escaped, in_display_units, parameter_tables, result_tables
 from jaxvib.results.fields import Plain
@@ -99,8 +99,6 @@ def html_report(
     >>> "<!doctype html>" in path.read_text()
     True
     """
-    if not isinstance(result, Result):
-        raise InputError("result", f"is a {type(result).__name__}; give a result, such as that of jv.simulate")
     kind, path = type(result).__name__, Path(path)
     own = getattr(result, "scene", None)
     if scene is None and isinstance(own, Scene):

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import optional_module
 from jaxvib.results.status import is_status, sentence, status_names
 
 if TYPE_CHECKING:
@@ -139,10 +139,7 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
 
     **Raises** `InputError` if xarray is not installed.
     """
-    try:
-        import xarray as xr
-    except ImportError as error:
-        raise InputError("to_xarray", "needs xarray; install it with: pip install '.[xarray]'") from error
+    xr = optional_module("xarray", "xarray")
     labels = labels_of(result)
     variables = {}
     for name, axes, value, unit in columns(result):

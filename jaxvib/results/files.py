@@ -78,8 +78,6 @@ def load(path: str | Path) -> Any:
     >>> type(again).__name__, bool((again.stable == modes.stable).all())
     ('JamModes', True)
     """
-    if not isinstance(path, (str, Path)):
-        raise InputError("path", f"is {quoted(path)}; give the path of a result written by save")
     try:
         with open_regular(path) as file:
             arrays = _arrays(file)

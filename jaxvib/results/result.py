@@ -13,7 +13,7 @@ import equinox as eqx
 
 from jaxvib.boundary import validated
 from jaxvib.display import Figure
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, optional_module, quoted
 from jaxvib.results import fields, files
 from jaxvib.results.csv import main_axis, table_along
 from jaxvib.results.status import sentence, status_name
@@ -107,11 +107,7 @@ class Result(eqx.Module):
         **Raises** `InputError` for an axis that the result does not have, and if pandas is not installed
         (`pip install '.[xarray]'`).
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise InputError("to_pandas", "needs pandas; install it with: pip install '.[xarray]'") from error
-        return pandas.DataFrame(table_along(self, main_axis(self) if axis is None else axis))
+        return optional_module("pandas", "xarray").DataFrame(table_along(self, main_axis(self) if axis is None else axis))
 
     @final
     @validated

@@ -120,8 +120,6 @@ def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
         if scene is not None:
             raise InputError("scene", "is only for an Orbit, because a run contains its scene; leave it out")
         return motion.scene
-    if not isinstance(motion, Orbit):
-        raise InputError("motion", f"is a {type(motion).__name__}; give a Run, or an Orbit with its scene")
     if scene is None:
         raise InputError("scene", "is missing; an Orbit does not contain it: animate(orbit, scene=scene)")
     return scene

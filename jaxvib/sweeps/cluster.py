@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, optional_module
 from jaxvib.runtime.devices import take_a_device
 from jaxvib.sweeps.definition import CASE_STATUSES, Study
 from jaxvib.sweeps.program import Chunk, compute
@@ -35,12 +35,11 @@ def on_a_cluster(
     **Raises** `InputError` if Dask is not installed, the scheduler does not answer, no worker connects, or a worker has other
     versions.
     """
-    try:
-        import dask.config
-        from distributed import Client, LocalCluster, as_completed
-        from distributed.scheduler import KilledWorker
-    except ImportError as error:
-        raise InputError("workers", "need Dask; install it with: pip install '.[cluster]'") from error
+    optional_module("distributed", "cluster")
+    import dask.config
+    from distributed import Client, LocalCluster, as_completed
+    from distributed.scheduler import KilledWorker
+
     if workers is not None and scheduler is not None:
         raise InputError("scheduler", "cannot be combined with workers, which are processes of this machine; give one of them")
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))

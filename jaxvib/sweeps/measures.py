@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -24,13 +25,14 @@ _SETTLED_SPEED_SHARE = 0.01
 class RunMeasure:
     """Quantity that is computed from a run, see `BatchRun`.
 
-    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that returns a scalar, or an array with an additional
-    dimension of the name `axis` ("coordinate", "load"); `meanings`: for a label, the meanings of its values 0, 1, ...
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun`, or the name of its attribute, that gives a scalar or
+    an array with an additional dimension of the name `axis` ("coordinate", "load"); `meanings`: for a label, the meanings of
+    its values 0, 1, ...
     """
 
     name: str
     unit: str
-    function: Callable[[BatchRun], Array]
+    function: str | Callable[[BatchRun], Array]
     axis: str = ""
     meanings: tuple[str, ...] = ()
 
@@ -38,6 +40,10 @@ class RunMeasure:
     def words(self) -> str:
         """Description of the measure."""
         return self.name.replace("_", " ").removeprefix("run.")
+
+    def read(self, run: BatchRun) -> Array:
+        """Return the value of a run."""
+        return operator.attrgetter(self.function)(run) if isinstance(self.function, str) else self.function(run)
 
 
 Measure: TypeAlias = Quantity | RunMeasure
@@ -57,45 +63,17 @@ def _settling(run: BatchRun) -> Array:
     return jnp.where(run.regime.change < _SETTLED_SPEED_SHARE, late, run.window.time[-1])
 
 
-def _mode(run: BatchRun) -> Array:
-    return run.regime.mode
-
-
-def _load_speed(run: BatchRun) -> Array:
-    return run.measured.omega
-
-
-def _amplitude(run: BatchRun) -> Array:
-    return run.measured.amplitude
-
-
-def _force(run: BatchRun) -> Array:
-    return run.measured.foundation_force
-
-
-def _ripple(run: BatchRun) -> Array:
-    return run.regime.ripple
-
-
-def _rotor_speed(run: BatchRun) -> Array:
-    return run.regime.rotor_speed
-
-
-def _drift(run: BatchRun) -> Array:
-    return run.measured.drift
-
-
 RUN_MEASURES = {
     measure.name: measure
     for measure in (
         RunMeasure("run.regime", "", _regime, meanings=REGIMES),
-        RunMeasure("run.mode", "", _mode),
-        RunMeasure("run.load_speed", "rad/s", _load_speed),
-        RunMeasure("run.amplitude", "m or rad", _amplitude, axis="coordinate"),
-        RunMeasure("run.foundation_force", "N", _force),
-        RunMeasure("run.ripple", "rad/s", _ripple),
-        RunMeasure("run.rotor_speed", "rad/s", _rotor_speed),
-        RunMeasure("run.drift", "", _drift),
+        RunMeasure("run.mode", "", "regime.mode"),
+        RunMeasure("run.load_speed", "rad/s", "measured.omega"),
+        RunMeasure("run.amplitude", "m or rad", "measured.amplitude", axis="coordinate"),
+        RunMeasure("run.foundation_force", "N", "measured.foundation_force"),
+        RunMeasure("run.ripple", "rad/s", "regime.ripple"),
+        RunMeasure("run.rotor_speed", "rad/s", "regime.rotor_speed"),
+        RunMeasure("run.drift", "", "measured.drift"),
         RunMeasure("run.settling_time", "s", _settling),
     )
 }

@@ -77,7 +77,7 @@ def _each(
             if not isinstance(measure, RunMeasure):
                 return measure.read(evaluation)
             assert run is not None
-            return measure.function(run)
+            return measure.read(run)
 
         return tuple(jnp.asarray(read(measure)) for measure in measures), jnp.asarray(True) if run is None else run.finite
 

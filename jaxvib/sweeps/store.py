@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from jaxvib.code_changes import code_state, digest_of_sources
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, optional_module, quoted
 from jaxvib.machine.files import Tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence
@@ -50,15 +50,6 @@ class ChunkState(IntEnum):
     damaged = 2
 
 
-def require_zarr() -> ModuleType:
-    """Import zarr. **Raises** `InputError` if it is not installed."""
-    try:
-        import zarr
-    except ImportError as error:
-        raise InputError("sweep", "needs zarr and xarray; install them with: pip install '.[sweep]'") from error
-    return zarr
-
-
 def versions() -> dict[str, str]:
     """Return the versions of all packages on which a result depends, and a digest of the sources of jaxvib.
 
@@ -76,7 +67,7 @@ class Store:
     """
 
     def __init__(self, path: Path, writable: bool = False):
-        zarr = require_zarr()
+        zarr = optional_module("zarr", "sweep")
         self.path = path
         if not path.exists():
             raise InputError("store", f"is {quoted(str(path))}; there is no such store")
@@ -111,7 +102,7 @@ class Store:
     def create(cls, path: Path, study: Study) -> None:
         """Create the empty store of a study atomically. If another process has created it in the meantime, that store is
         kept."""
-        zarr = require_zarr()
+        zarr = optional_module("zarr", "sweep")
         part = path.with_name(f".{uuid.uuid4().hex}.partial")
         try:
             with warnings.catch_warnings():

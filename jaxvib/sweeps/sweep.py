@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, optional_module
 from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.start import Start
@@ -75,12 +75,9 @@ class Sweep(Result):
 
         **Raises** `InputError` if xarray is not installed or a chunk of the store is damaged.
         """
-        try:
-            import xarray
-        except ImportError as error:
-            raise InputError("data", "needs xarray; install it with: pip install '.[sweep]'") from error
+        open_dataset = optional_module("xarray", "sweep").open_dataset
         Store(Path(self.store)).require_whole()
-        return xarray.open_dataset(self.store, engine="zarr")
+        return open_dataset(self.store, engine="zarr")
 
     @property
     def scene(self) -> Scene:

@@ -19,7 +19,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder
-from optimize.quantities.quantity import Quantity, require_quantity
+from optimize.quantities.quantity import Quantity
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,6 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     >>> under(foundation_force(mode=3), "loaded", {"machine.mass[0]": "180 kg"}).words
     'foundation force, mode 3 (loaded)'
     """
-    require_quantity(quantity, "quantity")
     if not isinstance(changes, Mapping) or not changes:
         raise InputError("changes", f"is {quoted(changes)}; it must be a dictionary such as {{'drive.speed': '1200 rpm'}}")
     values = tuple((key, read_value(key, value)) for key, value in changes.items())
@@ -182,7 +181,6 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
 
 
 def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, seed: int, how: str, level: float) -> Quantity:
-    require_quantity(quantity, "quantity")
     if not isinstance(tolerances, Mapping) or not tolerances:
         raise InputError(
             "tolerances", f"is {quoted(tolerances)}; it must be a dictionary such as {{'machine.stiffness': 0.05}}"

@@ -439,12 +439,6 @@ def least(*quantities: Quantity) -> Quantity:
     return _extreme("least", quantities)
 
 
-def require_quantity(value: object, field: str) -> None:
-    """**Raises** `InputError` if a value is not a `Quantity`."""
-    if not isinstance(value, Quantity):
-        raise InputError(field, f"is {quoted(value)}; it must be a Quantity, for example foundation_force(mode=3)")
-
-
 def walk(quantity: Quantity) -> Iterator[Quantity]:
     """Yield the quantity and all quantities from which it is computed."""
     yield quantity

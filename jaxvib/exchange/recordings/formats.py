@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxvib.errors import InputError, open_regular, quoted
-from jaxvib.exchange.optional import optional_module
+from jaxvib.errors import InputError, open_regular, optional_module, quoted
 from jaxvib.exchange.uff import read_uff
 from jaxvib.identification.records.recorded import Recorded
 from jaxvib.results.table import read_table

@@ -116,8 +116,6 @@ def work_precision(
     if not tolerances:
         raise InputError("tolerances", f"are {quoted(tuple(tolerances))}; name one at least, such as 1e-6")
     count(repeats, "repeats")
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     if scene.drive.speed.dtype.itemsize < 8:
         problem = "is in single precision; errors are measured against double: switch JAX to float64 before it is made"
         raise InputError("scene", problem)

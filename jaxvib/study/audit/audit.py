@@ -160,9 +160,6 @@ def audit(
     """
     if isinstance(accuracy, bool) or not isinstance(accuracy, (int, float)) or not 0.0 < accuracy < 1.0:
         raise InputError("accuracy", f"is {quoted(accuracy)}; it must be a number between 0 and 1, such as 0.01 for 1 %")
-    for k, effect in enumerate(possible or ()):
-        if not isinstance(effect, Effect):
-            raise InputError(f"possible[{k}]", f"is {quoted(effect)}; it must be an Effect, for example Gravity()")
     scene = validate_scene(scene)
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
