@@ -29,13 +29,7 @@ if TYPE_CHECKING:
 @click.option("--format", "kind", type=click.Choice(["gif", "html", "both"]), default="both", show_default=True)
 @shared
 def animate(
-    source: Path,
-    until: str | None,
-    start: Start | None,
-    mode: int | None,
-    kind: str,
-    output: Output,
-    **options: Any,
+    source: Path, until: str | None, start: Start | None, mode: int | None, kind: str, output: Output, **options: Any
 ) -> None:
     """Make a film of the moving machine in slow motion: animation.gif and animation.html, in --out or the current folder.
 

@@ -66,13 +66,7 @@ def new(kind: str, output: Output) -> None:
 @csv_options
 @shared
 def simulate(
-    scene: Path,
-    tolerance: float | None,
-    accuracy: float | None,
-    window: bool,
-    csv: Path | None,
-    output: Output,
-    **options: Any,
+    scene: Path, tolerance: float | None, accuracy: float | None, window: bool, csv: Path | None, output: Output, **options: Any
 ) -> None:
     """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its picture."""
     from jaxvib.ode.progress import ProgressBar  # slow import, which --help does not need

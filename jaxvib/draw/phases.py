@@ -11,12 +11,7 @@ from jaxvib.display import Drawn, SpeedUnit, speed_unit
 from jaxvib.draw.charts import solid_and_dashed
 from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, legend_above, log_ticks, panels
 
-_PATTERNS = (
-    "all together",
-    "in two opposite groups",
-    "spread around the circle, cancelling each other",
-    "at other phases",
-)
+_PATTERNS = ("all together", "in two opposite groups", "spread around the circle, cancelling each other", "at other phases")
 """Patterns of phases, each of which has the same colour and marker in all figures."""
 
 _WIDTHS = (2.2, 1.0)

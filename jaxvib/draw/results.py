@@ -105,11 +105,7 @@ def shapes_chart(
 
 
 def phase_circles(
-    sets: Sequence[tuple[str, np.ndarray]],
-    *,
-    weights: np.ndarray | None = None,
-    imbalance: complex = 0.0,
-    ax: Onto = None,
+    sets: Sequence[tuple[str, np.ndarray]], *, weights: np.ndarray | None = None, imbalance: complex = 0.0, ax: Onto = None
 ) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
 

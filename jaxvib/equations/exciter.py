@@ -171,12 +171,7 @@ class RotorDynamics(eqx.Module):
         return (motion.speed, part.rotor[0] - dot(part.rotor[1], a), *rates)
 
     def _add_rotor(
-        self,
-        motion: Motion,
-        added_mass: list[list[Array | float]],
-        reaction: list[Array | float],
-        drag: Array,
-        coupling: Axes,
+        self, motion: Motion, added_mass: list[list[Array | float]], reaction: list[Array | float], drag: Array, coupling: Axes
     ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
         """Add the rotor's imbalance to the added mass and the reaction.
 

@@ -17,14 +17,7 @@ from jaxvib.equations.model import Model, assemble
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect
-from jaxvib.machine.effects.terms import (
-    ContactFriction,
-    GravityField,
-    LoadInteraction,
-    LoadPotential,
-    RotorImbalance,
-    Term,
-)
+from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadInteraction, LoadPotential, RotorImbalance, Term
 from jaxvib.machine.loads import CircularLoads, Loads
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene

@@ -282,12 +282,7 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
 
 
 def _compare_runs(
-    plan: RunPlan,
-    fine: Run,
-    coarse: Run,
-    control: StepControl,
-    coarser: StepControl,
-    before: Array | np.ndarray,
+    plan: RunPlan, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, before: Array | np.ndarray
 ) -> Run:
     """Return the run with smaller steps, with its estimated error and the cost of both; `before`: evaluations of earlier
     runs."""

@@ -133,10 +133,7 @@ def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
     first, last = x[:1], x[-1:]
     before = _BEFORE.astype(x.dtype) @ jnp.concatenate([x[:NODES] - first, v[:NODES]])
     after = _AFTER.astype(x.dtype) @ jnp.concatenate([x[-NODES:] - last, v[-NODES:]])
-    padded = (
-        jnp.concatenate([first + before[:1], x, last + after[:1]]),
-        jnp.concatenate([before[1:], v, after[1:]]),
-    )
+    padded = (jnp.concatenate([first + before[:1], x, last + after[:1]]), jnp.concatenate([before[1:], v, after[1:]]))
     polynomial = _polynomial(*([y[k : n - 1 + k] for k in range(NODES)] for y in padded))
     slope = _derivative(polynomial)
     curvature = _derivative(slope)

@@ -104,6 +104,5 @@ def require_own(folder: Path) -> None:
         others = mode & (stat.S_IWGRP | stat.S_IWOTH if place == folder else stat.S_IWOTH)
         if others and not (mode & stat.S_ISVTX and place != folder):
             raise InputError(
-                "folder",
-                f"is '{folder}'; others can write to '{place}', which is not safe; run chmod go-w '{place}'",
+                "folder", f"is '{folder}'; others can write to '{place}', which is not safe; run chmod go-w '{place}'"
             )

@@ -169,11 +169,7 @@ class Response(AbstractResponse, Result):
 
     @validated
     def plot(
-        self,
-        *,
-        unit: SpeedUnit | None = None,
-        show: Sequence[str] = ("amplitude", "phase", "force", "torque"),
-        ax: Onto = None,
+        self, *, unit: SpeedUnit | None = None, show: Sequence[str] = ("amplitude", "phase", "force", "torque"), ax: Onto = None
     ) -> Drawn:
         """Plot amplitudes, phases, foundation force and torque over the speed, with operating points and folds.
 
@@ -211,12 +207,7 @@ class Response(AbstractResponse, Result):
 
 @validated
 def response(
-    scene: Scene,
-    speeds: Numbers | None = None,
-    *,
-    phases: Numbers | None = None,
-    points: int = 500,
-    most: Number | None = None,
+    scene: Scene, speeds: Numbers | None = None, *, phases: Numbers | None = None, points: int = 500, most: Number | None = None
 ) -> Response:
     """Return the response of a machine to the unbalances of its exciters over their speed, and the torque that it needs.
 

@@ -299,12 +299,7 @@ def _dual(model: Step) -> np.ndarray:
 
 
 def _move(
-    problem: Problem,
-    searches: _Searches,
-    index: np.ndarray,
-    here: Point,
-    models: list[Step],
-    penalty_is_small: np.ndarray,
+    problem: Problem, searches: _Searches, index: np.ndarray, here: Point, models: list[Step], penalty_is_small: np.ndarray
 ) -> None:
     """Take the better one of the steps if it improves the design, adapt the trust region, and end searches at rest."""
     size, penalty, radius = searches.size[index], searches.penalty[index], searches.trust_radius[index]

@@ -309,12 +309,7 @@ class PlanarRotor(Machine):
 
 
 def planar_rotor(
-    *,
-    mass: Number,
-    stiffness: Number,
-    damping: Number,
-    stiffness_up: Number | None = None,
-    damping_up: Number | None = None,
+    *, mass: Number, stiffness: Number, damping: Number, stiffness_up: Number | None = None, damping_up: Number | None = None
 ) -> PlanarRotor:
     """Return a rotor that moves horizontally and vertically on one support.
 

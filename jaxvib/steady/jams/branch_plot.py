@@ -38,12 +38,7 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], j
         f"resonances {speed_text(estimated_frequencies(branch.scene), 6)}"
     ]
     names = [(kind.replace("_", " "), w, n) for kind, w, n in marks]
-    return "\n".join(
-        [
-            *lines,
-            *(f"  {kind}: Omega {speed_text(w, 6)}, rotor {speed_text(n, 6)}" for kind, w, n in names),
-        ]
-    )
+    return "\n".join([*lines, *(f"  {kind}: Omega {speed_text(w, 6)}, rotor {speed_text(n, 6)}" for kind, w, n in names)])
 
 
 MARKS = {

@@ -223,11 +223,7 @@ def branch_pieces(model: ExcitedModel) -> Pieces:
     omega, speeds, found = omega[main], speeds[main], found[main]
     if model.modal is not None:  # again, with derivatives with respect to parameters
         speeds = jax.vmap(partial(_fold_speed, model))(omega)
-    folds = Folds(
-        omega=jnp.where(found, omega, jnp.nan),
-        rotor_speed=jnp.where(found, speeds, jnp.nan),
-        exists=found,
-    )
+    folds = Folds(omega=jnp.where(found, omega, jnp.nan), rotor_speed=jnp.where(found, speeds, jnp.nan), exists=found)
     cuts, turns = jax.lax.stop_gradient((jnp.where(found, omega, end), jnp.where(found, speeds, speed_end)))
     zero, mode = jnp.zeros_like(end), piece_modes(cuts, found, resonances)
     low, high = jnp.concatenate([zero, cuts]), jnp.concatenate([cuts, end])

@@ -356,8 +356,7 @@ def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> d
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
         found = jam_at(model, number, w, n, flat)
         values = jax.tree.map(
-            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value,
-            found,
+            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value, found
         )
         return eqx.tree_at(
             lambda j: (j.status, j.stable, j.rotor_speed),

@@ -33,13 +33,7 @@ from jaxvib.steady.jams.phase_starts import (
     phases_near,
     solved_clusters,
 )
-from jaxvib.steady.jams.phases import (
-    AbstractPhaseJam,
-    PhaseJam,
-    jam_from,
-    loads_with_drag,
-    phase_jam,
-)
+from jaxvib.steady.jams.phases import AbstractPhaseJam, PhaseJam, jam_from, loads_with_drag, phase_jam
 from jaxvib.units import count, random_numbers
 
 _SHOWN_DRAG_FACTOR = 30.0

@@ -18,14 +18,7 @@ from jaxvib.numerics.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.orbits.solve import (
-    Harmonics,
-    Parameter,
-    PeriodicSolution,
-    branch_tangent,
-    harmonics_of,
-    periodic_motion,
-)
+from jaxvib.steady.orbits.solve import Harmonics, Parameter, PeriodicSolution, branch_tangent, harmonics_of, periodic_motion
 from jaxvib.steady.orbits.stability import Floquet, floquet
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import count, known_number

@@ -110,12 +110,7 @@ class ExactBranches(Result):
 
 
 def exact_branches(
-    scene: Scene,
-    *,
-    points: int = 2000,
-    least: Number | None = None,
-    most: Number | None = None,
-    accuracy: float = 1e-8,
+    scene: Scene, *, points: int = 2000, least: Number | None = None, most: Number | None = None, accuracy: float = 1e-8
 ) -> ExactBranches:
     """Compute the branch n(Omega) of exact jams with its stability and the points of stability changes.
 

@@ -67,13 +67,7 @@ class OrbitPlan:
 
 
 def plan_orbit(
-    scene: Scene,
-    *,
-    mode: int | None,
-    omega: Number | None,
-    near: Number | None,
-    accuracy: float | None,
-    points: int | None,
+    scene: Scene, *, mode: int | None, omega: Number | None, near: Number | None, accuracy: float | None, points: int | None
 ) -> OrbitPlan:
     """Validate the arguments of `jam_orbit`, and choose start, points and method. **Raises** `InputError`."""
     named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
@@ -181,13 +175,7 @@ class SynchronousPlan:
 
 
 def plan_synchronous(
-    scene: Scene,
-    regime: Any,
-    *,
-    speed: Number | None,
-    phases: Numbers | None,
-    accuracy: float | None,
-    points: int | None,
+    scene: Scene, regime: Any, *, speed: Number | None, phases: Numbers | None, accuracy: float | None, points: int | None
 ) -> SynchronousPlan:
     """Validate the arguments of `synchronous_orbit`, and choose start and points. **Raises** `InputError`."""
     if regime is not None and (speed is not None or phases is not None):

@@ -10,13 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import estimated_frequencies
-from jaxvib.equations.torque_balance import (
-    TorqueBalance,
-    balance_residuals,
-    influence_of,
-    motion_of,
-    unknowns_of,
-)
+from jaxvib.equations.torque_balance import TorqueBalance, balance_residuals, influence_of, motion_of, unknowns_of
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached

@@ -25,12 +25,7 @@ from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.outcome import outcome, without_numbers
 from jaxvib.steady.regimes.local import Slopes, decays, regime_growth, slopes_of
 from jaxvib.steady.regimes.search import is_balanced, sets_of_phases
-from jaxvib.steady.regimes.synchronous import (
-    RegimeStatus,
-    SynchronousRegime,
-    fields_at,
-    require_one_speed,
-)
+from jaxvib.steady.regimes.synchronous import RegimeStatus, SynchronousRegime, fields_at, require_one_speed
 
 _PHASES_PER_UNKNOWN = 4
 """Number of random sets of phases divided by the square of the number of unknown phases. It is small, because a design

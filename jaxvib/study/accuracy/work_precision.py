@@ -144,13 +144,7 @@ class _Request:
     finished: int = 0
 
     def row(
-        self,
-        tier: str,
-        method: str,
-        setting: str,
-        call: Callable[[], T],
-        error: Callable[[T], float],
-        dtype: str = "float64",
+        self, tier: str, method: str, setting: str, call: Callable[[], T], error: Callable[[T], float], dtype: str = "float64"
     ) -> CostRow:
         """Return the row of a method, and report it to `progress`."""
         if self.progress is not None:

@@ -19,12 +19,7 @@ from jaxvib.numerics.noise import colored_covariance
 from jaxvib.results.estimate import Estimate, interval, shown, student_quantile
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
-from jaxvib.study.bearing.decrement import (
-    Decrement,
-    TurningPoints,
-    ten_periods,
-    turning_points,
-)
+from jaxvib.study.bearing.decrement import Decrement, TurningPoints, ten_periods, turning_points
 from jaxvib.study.bearing.fit import TOLERANCE, Fit, Unknowns, first_guess, fit_swing, steps_for
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, Friction

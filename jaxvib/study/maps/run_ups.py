@@ -199,21 +199,14 @@ def run_ups(
 
 
 def _sets_of_angles(
-    scene: Scene,
-    starts: int | None,
-    seed: int,
-    angles: Sequence[Sequence[float]] | None,
-    separation: Number | None,
+    scene: Scene, starts: int | None, seed: int, angles: Sequence[Sequence[float]] | None, separation: Number | None
 ) -> np.ndarray:
     """Return the sets (sets, count) of initial angles: the given ones, `starts` random ones, or that of `initial_state`."""
     n = scene.loads.count
     if starts is not None and angles is not None:
         raise InputError("starts", "cannot be combined with angles; give a number of random starts or the angles")
     if separation is not None and not (starts is None and angles is None):
-        raise InputError(
-            "separation",
-            f"is {quoted(separation)}; it is only for a single start, leave out starts and angles",
-        )
+        raise InputError("separation", f"is {quoted(separation)}; it is only for a single start, leave out starts and angles")
     if angles is not None:
         sets = np.asarray(angles, dtype=float)
         if sets.ndim != 2 or sets.shape[1] != n or not np.all(np.isfinite(sets)):
