@@ -72,28 +72,17 @@ def branch_diagram(
     if not show or any(part not in PARTS for part in show):
         raise InputError("show", f"is {quoted(tuple(show))}; it names some of: {', '.join(PARTS)}")
     rows = _branch_rows(show, (unit, scale * omega), amplitude, force, names, units)
-    columns = min(3, len(rows))
-    lines = -(-len(rows) // columns)
-    spare = 0 if ax is not None else lines * columns - len(rows)
-    if ax is not None:
-        lines, columns = 1, len(rows)
-    figure, axes = panels(lines, columns, size=(3.7, 3.5), ax=ax)
-    for empty in axes[len(axes) - spare :] if spare else ():
+    columns = len(rows) if ax is not None else min(3, len(rows))
+    figure, axes = panels(-(-len(rows) // columns), columns, size=(3.7, 3.5), ax=ax)
+    for empty in axes[len(rows) :]:
         empty.set_axis_off()
     n = scale * rotor_speed
     high = float(np.max(n[np.isfinite(n)]))
     crossed = crossings(rotor_speed, stable, modes, at)
     for axis, (title, label, group) in zip(axes, rows, strict=False):
         for j, (name, values) in enumerate(group):
-            solid_and_dashed(
-                axis,
-                n,
-                values,
-                stable,
-                COLORS[j],
-                name if len(group) > 1 else None,
-                marker=MARKERS[j] if len(group) > 1 else "",
-            )
+            label_and_marker = (name, MARKERS[j]) if len(group) > 1 else (None, "")
+            solid_and_dashed(axis, n, values, stable, COLORS[j], *label_and_marker)
         axis.plot([], [], color="black", label="stable")
         axis.plot([], [], color="black", ls=UNSTABLE, label="unstable")
         axis.set(xlim=(0.0, high), xlabel="rotor speed, " + unit)
@@ -111,13 +100,7 @@ def branch_diagram(
             axis.set(yscale="log", ylim=log_limits([values for _, values in group], rotor_speed, omega, resonances))
             log_ticks(axis)
         if at is not None:
-            axis.axvline(scale * at, label="operating speed; numbers: jam modes", **OPERATING)
-            points = []
-            for i, share, number, filled in crossed:
-                heights = [float(np.interp(share, [0, 1], values[i : i + 2])) for _, values in group]
-                points += [(y, number if y == max(heights) else "", filled) for y in heights]
-            if points:
-                numbered(axis, scale * at, *zip(*points, strict=True))
+            _operating_line(axis, scale * at, crossed, [values for _, values in group])
     if ax is None:
         legend_outside(figure, axes, 4 if columns > 1 else 2)
     else:
@@ -125,6 +108,17 @@ def branch_diagram(
     if judged and ax is None:
         figure.supxlabel(f"stable {judged}", fontsize="small", color="#555555")
     return figure if ax is None else ax
+
+
+def _operating_line(axis: Axes, at: float, crossed: list[tuple[int, float, str, bool]], curves: Sequence[np.ndarray]) -> None:
+    """Draw the line of the operating speed, with the numbers of the jams where it crosses the curves, see `crossings`."""
+    axis.axvline(at, label="operating speed; numbers: jam modes", **OPERATING)
+    points = []
+    for i, share, number, filled in crossed:
+        heights = [float(np.interp(share, [0, 1], values[i : i + 2])) for values in curves]
+        points += [(y, number if y == max(heights) else "", filled) for y in heights]
+    if points:
+        numbered(axis, at, *zip(*points, strict=True))
 
 
 _SPEED_TITLE = "speed of the loads"
@@ -217,9 +211,9 @@ def solid_and_dashed(
     stable: np.ndarray,
     color: str,
     label: str | None = None,
+    marker: str = "",
     *,
     widths: tuple[float, float] = (1.5, 1.2),
-    marker: str = "",
 ) -> None:
     """Draw a line as segments, solid where it is `stable` and dashed elsewhere; neighbouring segments share a point.
 
