@@ -376,7 +376,8 @@ def _problem_of_container(value: Any, origin: type, inner: tuple[Any, ...]) -> s
         if isinstance(value, Sequence) and not isinstance(value, str) and len(value) > _MAX_ENTRIES:
             return f"a list of at most {_MAX_ENTRIES} entries"
         if not several or isinstance(value, (str, bytes, bytearray)) or getattr(value, "ndim", 1) == 0:
-            return f"a list of {_plural(inner)}"
+            names = {float: "numbers", int: "whole numbers", str: "texts"}
+            return f"a list of {names.get(inner[0], 'values') if inner else 'values'}"
         if origin is tuple and inner and Ellipsis not in inner:
             if len(value) != len(inner):
                 return f"{len(inner)} values"
@@ -391,11 +392,6 @@ def _problem_of_container(value: Any, origin: type, inner: tuple[Any, ...]) -> s
             value = np.asarray(value).tolist()
         return _problem_of_entries(((f"[{index}]", each) for index, each in enumerate(value)), inner[:1])
     return None if isinstance(value, origin) else _words(origin.__name__)
-
-
-def _plural(inner: tuple[Any, ...]) -> str:
-    names = {float: "numbers", int: "whole numbers", str: "texts"}
-    return names.get(inner[0], "values") if inner else "values"
 
 
 def _problem_of_entries(entries: Any, kinds: tuple[Any, ...]) -> InputError | None:

@@ -279,13 +279,9 @@ def motion_of(balance: TorqueBalance, x: Array) -> tuple[Array, Array]:
     prescribed = balance.is_prescribed
     if not any(prescribed):
         return x[0] * jax.lax.stop_gradient(balance.speed), jnp.concatenate([jnp.zeros(1, x.dtype), x[1:]])
-    omega = balance.averaged.drives[_first_prescribed(balance)].speed
-    return omega, jnp.zeros(prescribed.size, x.dtype).at[np.flatnonzero(~prescribed)].set(x)
-
-
-def _first_prescribed(balance: TorqueBalance) -> int:
     field = balance.averaged
-    return next(k for k, (n, drive) in enumerate(zip(field.counts, field.drives, strict=True)) if n == 0 and drive.ideal)
+    omega = next(drive.speed for n, drive in zip(field.counts, field.drives, strict=True) if n == 0 and drive.ideal)
+    return omega, jnp.zeros(prescribed.size, x.dtype).at[np.flatnonzero(~prescribed)].set(x)
 
 
 def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = None) -> Array:

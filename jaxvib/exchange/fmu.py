@@ -335,7 +335,7 @@ def _model(scene: Scene, equations: Equations, programs: _Programs, variables: l
     states = [each for each in variables if each.nominal is not None]
     inputs = [each for each in variables if each.kind == "input"]
     lists = {
-        "names": [f'"{_c_text(each.name)}"' for each in variables],
+        "names": ['"' + re.sub(r"[^ -~]|[\"\\%?]", "_", each.name) + '"' for each in variables],
         "start_states": [str(each.start) for each in states],
         "start_inputs": [str(each.start) for each in inputs],
         "start_parameters": [str(each.start) for each in parameters],
@@ -360,10 +360,6 @@ def _model(scene: Scene, equations: Equations, programs: _Programs, variables: l
         **{name: ", ".join(texts) for name, texts in lists.items()},
         **{name: "\n".join(f"    {line}" for line in lines) for name, lines in blocks.items()},
     )
-
-
-def _c_text(text: str) -> str:
-    return re.sub(r"[^ -~]|[\"\\%?]", "_", text)
 
 
 def _compiled(files: dict[str, bytes], fmi: Fmi, identifier: str) -> tuple[dict[str, bytes] | None, str]:

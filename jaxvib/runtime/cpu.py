@@ -74,7 +74,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
         ours.append(f"--xla_force_host_platform_device_count={devices}")
     names = [flag.partition("=")[0] for flag in flags]
     flags += accepted_flags([flag for flag in ours if flag.partition("=")[0] not in names])
-    if _has_wide_vectors() and _VECTOR_WIDTH_FLAG not in names and wide_vectors_are_right(flags):
+    if re.search(r"\bavx512f\b", processor()) and _VECTOR_WIDTH_FLAG not in names and wide_vectors_are_right(flags):
         flags += accepted_flags([f"{_VECTOR_WIDTH_FLAG}=512"])
     os.environ["XLA_FLAGS"] = " ".join(flags)
     limit_blas_threads()
@@ -93,10 +93,6 @@ def limit_blas_threads() -> None:
 def has_flags() -> bool:
     """Return True if time loops run as one function: this jaxlib needs no flag, or the environment has it."""
     return not loops_need_a_flag() or _LOOPS in os.environ.get("XLA_FLAGS", "")
-
-
-def _has_wide_vectors() -> bool:
-    return re.search(r"\bavx512f\b", processor()) is not None
 
 
 @functools.cache

@@ -65,7 +65,7 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
     - one axis: the first measure as points; with samples, the shares of regimes if they were measured
     """
     opened = Store(Path(store))
-    dims = _dims(opened)
+    dims = opened.dims
     if len([d for d in dims if d != SAMPLE]) >= 2:
         return plot_map(store, ax=ax)
     if dims == [SAMPLE]:
@@ -95,7 +95,7 @@ def figures(
     **Raises** `InputError` for names that the store does not have.
     """
     opened = Store(Path(store))
-    grid = [d for d in _dims(opened) if d != SAMPLE]
+    grid = [d for d in opened.dims if d != SAMPLE]
     if len(grid) >= 2:
         yield "map", plot_map(store, measure, x=x, y=y, theory=theory)
     elif x or y:
@@ -132,7 +132,7 @@ def plot_map(
     from jaxvib.draw.sweeps import label_map, value_map
 
     opened = Store(Path(store))
-    dims = _dims(opened)
+    dims = opened.dims
     grid = [d for d in dims if d != SAMPLE]
     for name, given in (("x", x), ("y", y)):
         if given is not None and given not in grid:
@@ -171,7 +171,7 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     from jaxvib.draw.sweeps import shares_chart
 
     opened = Store(Path(store))
-    dims = _dims(opened)
+    dims = opened.dims
     grid = [d for d in dims if d != SAMPLE]
     over = over or (grid[0] if grid else None)
     if over not in grid:
@@ -226,7 +226,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
     from jaxvib.draw.sweeps import tornado_chart
 
     opened = Store(Path(store))
-    name, dims = _measure(opened, measure), _dims(opened)
+    name, dims = _measure(opened, measure), opened.dims
     axes = list(opened.record["axes"])
     ends = {axis: _fifths(opened, axis) for axis in axes}
     sums, found = {axis: np.zeros((2, 2)) for axis in axes}, np.zeros(2)
@@ -258,10 +258,6 @@ def _fifths(store: Store, axis: str) -> tuple[float, float]:
     """Return the upper end of the lowest fifth of the values of an axis, and the lower end of the highest fifth."""
     values = store.read(axis, slice(0, 1 << 20))
     return float(np.nanquantile(values, 0.2)), float(np.nanquantile(values, 0.8))
-
-
-def _dims(store: Store) -> list[str]:
-    return store.dims
 
 
 def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:

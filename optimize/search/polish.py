@@ -256,7 +256,8 @@ def _begin(problem: Problem, point: Point) -> _Searches:
     size = np.where(size > 0.0, size, 1.0)
     point = restore(problem, point, 2)
     starts, free = point.z.shape
-    multipliers = _initial_multipliers(problem, point) / size[:, None]
+    found = optimality(problem, point)
+    multipliers = np.nan_to_num(np.concatenate([found.held, found.demands], axis=1)) / size[:, None]
     shares = np.zeros((starts, problem.parts))
     shares[np.arange(starts), np.argmax(point.pieces, axis=1) if problem.parts > 1 else 0] = 1.0
     active = point.exists()
@@ -334,11 +335,6 @@ def _is_better(
     better |= kept & (remaining_decrease < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
     better |= kept & (violation(problem, here) > FEASIBILITY_TOLERANCE) & new.exists()
     return better
-
-
-def _initial_multipliers(problem: Problem, point: Point) -> np.ndarray:
-    found = optimality(problem, point)
-    return np.nan_to_num(np.concatenate([found.held, found.demands], axis=1))
 
 
 def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, penalty: np.ndarray) -> Point:

@@ -122,16 +122,14 @@ def sets_of_phases(prescribed: np.ndarray, dtype: np.dtype, per_unknown: int = _
 
     The phases of masses with prescribed speed are 0.
     """
-    free = _free_phases(prescribed)
+    free = np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
     n = free.size
     even = np.linspace(-np.pi, np.pi, per_unknown, endpoint=False)[:, None] if n == 1 else np.zeros((0, n))
     random = np.random.default_rng(0).uniform(-np.pi, np.pi, (per_unknown * n * n if n > 1 else 0, n))
-    return _with_fixed(np.concatenate([_regular_sets(n), even, random]), free, prescribed.size, dtype)
-
-
-def _free_phases(prescribed: np.ndarray) -> np.ndarray:
-    """Return the masses whose phases are unknown."""
-    return np.flatnonzero(~prescribed) if prescribed.any() else np.arange(1, prescribed.size)
+    sets = np.concatenate([_regular_sets(n), even, random])
+    phases = np.zeros((len(sets), prescribed.size), dtype)
+    phases[:, free] = sets
+    return phases
 
 
 def _regular_sets(n: int) -> np.ndarray:
@@ -139,13 +137,6 @@ def _regular_sets(n: int) -> np.ndarray:
     halves = np.pi * (np.arange(min(2**n, _MOST_REGULAR))[:, None] >> np.arange(n) & 1)
     splayed = 2.0 * np.pi / (n + 1) * np.arange(1, n + 1)[:, None] * np.arange(1, n + 1)
     return np.concatenate([halves, splayed])
-
-
-def _with_fixed(sets: np.ndarray, free: np.ndarray, count: int, dtype: np.dtype) -> np.ndarray:
-    """Return sets of all phases (sets, count) from those of the `free` masses; the others are 0."""
-    phases = np.zeros((len(sets), count), dtype)
-    phases[:, free] = sets
-    return phases
 
 
 def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

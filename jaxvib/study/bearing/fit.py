@@ -118,7 +118,7 @@ def fit_swing(
         frequency=1.0 / duration,
         friction=Friction(
             viscous=inertia / duration,
-            dry=None if law.dry is None else 2.0 * length * size / (_bearing(pendulum) * start.frequency * duration),
+            dry=None if law.dry is None else 2.0 * length * size / (pendulum.diameter * start.frequency * duration),
             air=None if law.air is None else inertia / (size * start.frequency * duration),
             torque=None if law.torque is None else inertia * start.frequency**2 * size,
         ),
@@ -211,8 +211,3 @@ def _least_squares(
     none = (jnp.asarray(jnp.inf), start, jnp.zeros(size), jnp.zeros((size, p)), jnp.asarray(jnp.nan), jnp.zeros(size))
     end = jax.lax.while_loop(is_unfinished, step, (jnp.asarray(0), start, jnp.asarray(0.1), *none, jnp.asarray(jnp.inf)))
     return end[4], end[5], end[6], (end[7], end[8]), end[-1] < 1e-2
-
-
-def _bearing(pendulum: BearingPendulum) -> Array:
-    assert pendulum.bearing is not None
-    return pendulum.bearing

@@ -157,8 +157,8 @@ def identify_bearing(
 
     Source: Artyunin, Sumenkov 2019, who determine mu1 from two amplitudes; the fit to the whole record: this package.
     """
-    if dry and pendulum.bearing is None:
-        raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
+    if dry:
+        _ = pendulum.diameter  # raises if it is missing
     if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
         raise InputError("instrument", f"is {quoted(instrument)}; the relative uncertainty of J is at least 0 and less than 1")
     turns = turning_points(record)

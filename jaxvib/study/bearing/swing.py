@@ -80,6 +80,13 @@ class BearingPendulum(eqx.Module):
         """Natural frequency of small swings without friction, sqrt(m g l/J), rad/s; typical: 4 to 10."""
         return jnp.sqrt(self.mass * self.g * self.length / self.total_inertia)
 
+    @property
+    def diameter(self) -> Array:
+        """Diameter at which dry friction acts, m. **Raises** `InputError` if it is missing."""
+        if self.bearing is None:
+            raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
+        return self.bearing
+
     def radial_load(self, angle: Array, rate: Array) -> Array:
         """Return N = m (l f'^2 + g cos f), N: the load of the bearing along the rod.
 
@@ -93,7 +100,7 @@ class BearingPendulum(eqx.Module):
 
     def dead_zone(self, dry: Array) -> Array:
         """Return the angle, rad, up to which dry friction mu2 (`dry`) holds the pendulum at rest: tan f = mu2 d/(2 l)."""
-        return jnp.arctan(dry * _diameter(self) / (2.0 * self.length))
+        return jnp.arctan(dry * self.diameter / (2.0 * self.length))
 
 
 class Friction(NamedTuple):
@@ -222,7 +229,7 @@ def swing(
         None if torque is None else number(torque, "N m", "torque"),
     )
     if dry is not None:
-        _diameter(pendulum)
+        _ = pendulum.diameter  # raises if it is missing
     if torque is not None:
         problem = "is {:g} N m; it must be below m g l, {:.4g} N m"
         weight = pendulum.mass * pendulum.g * pendulum.length
@@ -240,12 +247,6 @@ def swing(
         count(max_steps, "max_steps"),
     )
     return outcome(run, throw=throw, failures=("max_steps_reached",), hint=lambda _: f" ({max_steps}); give a larger max_steps")
-
-
-def _diameter(pendulum: BearingPendulum) -> Array:
-    if pendulum.bearing is None:
-        raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
-    return pendulum.bearing
 
 
 def controller_to(tolerance: float) -> diffrax.AbstractStepSizeController:
@@ -357,7 +358,7 @@ def _rates(
         dry = friction.dry
         if dry is None or width is None or free is None:
             return slip, torque / pendulum.total_inertia
-        torque = torque - dry_lever(dry, _diameter(pendulum), slip, width) * jnp.abs(pendulum.radial_load(f, slip))
+        torque = torque - dry_lever(dry, pendulum.diameter, slip, width) * jnp.abs(pendulum.radial_load(f, slip))
         return jnp.where(free, slip, 0.0), jnp.where(free, torque / pendulum.total_inertia, 0.0)
 
     return rates
