@@ -25,8 +25,8 @@ from jaxvib.cli.output import csv_options
 @csv_options
 @shared
 def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
-    """List the whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out adds the Campbell
-    diagram."""
+    """List the whirl speeds of the rotor in SCENE, forward, backward or straight (the axis moves on a straight line), and its
+    critical speeds; --out adds the Campbell diagram."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.units import number

@@ -65,7 +65,7 @@ def foundation_moment(scene: Scene, state: State, about: Sequence[Number] = (0.0
 
     **Arguments**
 
-    - `scene`, whose machine is a body in a plane, or several of which one stands on the foundation
+    - `scene`, whose machine is a body in a plane, or several bodies, only one of which stands on the foundation
     - `state` of the scene
     - `about` p (2,), m, measured from the position of this body's centre of mass at rest (the default); typical: the middle of
       the foundation
@@ -93,11 +93,13 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 
         E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B_j q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ] + V(q)
             + theta' d'(theta).P q' + J_r theta'^2/2
-            + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + J_j s_j^2/2 ]
+            + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + I_j s_j^2/2 ]
 
     - d is the imbalance of the rotor
     - J_r is the inertia of a motor's rotor (an ideal drive has none)
-    - c is a load's slip and s its spin on its track, if effects release them
+    - c is the sliding velocity of a load's contact point and s its spin about the contact normal; each is 0 unless an effect
+      permits it
+    - I_j is the moment of inertia of a load about the contact normal
 
     **Arguments**
 
@@ -197,7 +199,7 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     >>> [round(float(p), 2) for p in jv.power(scene, 0.0, state)]     # b_W R^2 n (n - phi'), b_W R^2 (n - phi')^2 + b y'^2
     [80.0, 64.3]
 
-    Source: derived here from `vector_field`; for the drag of platforms the antiphase paper, equation (2).
+    Source: derived here from `vector_field`; the drag of loads on machines with platforms: the antiphase paper, equation (2).
     """
     return _power(validate_scene(scene), _at_time(t, state), state)
 
@@ -298,8 +300,8 @@ def _spin_power(
 ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
     """Return rates and powers of loads that spin and slide.
 
-    **Returns** the rates of the coordinates that are equivalent to the slip of each load; the power of the rotor to loads that
-    spin and slide, W; the power that sliding dissipates, W, without rolling friction.
+    **Returns** the rates of the coordinates at which the centre of a rolling load would move with the sliding velocity c; the
+    power of the rotor to loads that spin and slide, W; the power that sliding dissipates, W, without rolling friction.
     """
     loads, spin, zero = exciter.loads, state.spin, jnp.zeros(())
     if spin is None:
@@ -325,9 +327,10 @@ def _spin_power(
 def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
     """Return the force N with which each load presses on its track, (count,) N; negative if the track would have to pull.
 
-        N = m (centrifugal force of u' - n . (acceleration a + gravity upward)),    see `Loads.normal_force`
+        N = m (centrifugal acceleration of u' - n . (a + g e)),    see `Loads.normal_force`
 
-    n is the direction in which the load presses, a the acceleration of the point that carries the load. If N is negative, the
+    n is the direction in which the load presses, a the acceleration of the point that carries the load, g that of gravity, and
+    e the unit vector against gravity. If N is negative, the
     equations keep the load on its track, and friction that is proportional to N is 0.
 
     **Arguments**

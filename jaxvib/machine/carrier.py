@@ -86,7 +86,7 @@ class Machine(Part):
     `kind` is its name in scene files. `places` states how effects and drawings name a place on the machine:
 
     - "platform": by the number of the platform
-    - "shaft": by the distance along a rotor's axis from its mass centre, m
+    - "shaft": by the distance along a rotor's axis from its centre of mass, m
     - "number": by the number of a place in a list
     - "plane": by the point (x, y) of a body, m from its centre of mass
     - "point": not at all, because the exciter's place is the only one
@@ -181,7 +181,7 @@ class Machine(Part):
     def shaft_supports(self) -> list[tuple[float, float, float]] | None:
         """Return the supports along a rotor's axis, for a drawing; None if a drawing needs only the matrices.
 
-        **Returns** a list with the distance from the mass centre (m), the stiffness (N/m) and the damping (N s/m) of each
+        **Returns** a list with the distance from the centre of mass (m), the stiffness (N/m) and the damping (N s/m) of each
         support.
         """
         return None

@@ -31,7 +31,7 @@ class Dimensionless(eqx.Module):
         h_i = b_i/(2 M_i w), h_ij = b_ij/(2 M2S w), eps = y~/(kappa R), beta = b_W/(eps kappa m w)
 
     Platform i has displacement y_i, mass M_i, stiffness k_i and damping b_i; the N loads have mass m, radius R, drag b_W and
-    kappa = 1 + (moment of inertia about the mass centre)/(m R^2); phi_j are their angles, and s_y is the vertical component
+    kappa = 1 + (moment of inertia about the centre of mass)/(m R^2); phi_j are their angles, and s_y is the vertical component
     of their dimensionless unbalance s.
 
     The two papers scale the unbalance differently, and therefore also eps and v_i:

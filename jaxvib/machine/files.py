@@ -446,7 +446,7 @@ mass = "800 g"              # of one load
 radius = "120 mm"           # radius of the circle on which the centres of the loads run
 drag = "1.5 N s/m"          # viscous resistance of one load to motion relative to the rotor
 # ball_radius = "20 mm"     # of a ball or roller: gathered loads touch; without it they can be at one point
-# inertia = 0.0             # kg m^2 about the mass centre, pendulums only
+# inertia = 0.0             # kg m^2 about the centre of mass, pendulums only
 
 [drive]
 kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor

@@ -161,7 +161,8 @@ class Loads(Part):
     def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce | None:
         """Return the force of the loads on their track; None if it is not defined.
 
-        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; gravity `g` by axis, m/s^2 upward.
+        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `g`: the acceleration of gravity times the unit
+        vector against it, m/s^2, by axis.
         """
         return None
 
@@ -199,9 +200,9 @@ class CircularLoads(Loads):
     **Attributes** (scalar: shared by all loads; or (count,)); typical values: see `balls` and `pendulums`
 
     - `mass` m, kg
-    - `radius` R of the circle of the mass centres, m
+    - `radius` R of the circle of the centres of mass, m
     - `drag` b_W at that radius, N s/m
-    - `inertia` J_C about the mass centre, kg m^2 (pendulums; None for the others)
+    - `inertia` J_C about the centre of mass, kg m^2 (pendulums; None for the others)
     - `count` N of loads
     - `kind`: "ball", "roller" or "pendulum"
     - `ball_radius` r of a ball or roller, m (scalar); None for loads that can all be at one point. If it is set, gathered
@@ -390,10 +391,10 @@ def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inert
 
     - `count` N; typical: 1 to 4
     - `mass` m, kg; typical: 0.05 to 1
-    - `radius` R: distance of the mass centre from the axis, m; typical: 0.05 to 0.2
+    - `radius` R: distance of the centre of mass from the axis, m; typical: 0.05 to 0.2
     - `drag` b_W at that radius, N s/m: a bearing with the viscous coefficient mu (N m s) has b_W = mu/R^2; typical: 0.05 to 3,
       that is mu from 3e-4 to 0.02 N m s at R = 0.08 m
-    - `inertia` J_C about the mass centre, kg m^2 (default 0: a point mass); typical: 0 to 0.5 m R^2
+    - `inertia` J_C about the centre of mass, kg m^2 (default 0: a point mass); typical: 0 to 0.5 m R^2
 
     **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
 

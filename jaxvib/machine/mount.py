@@ -23,8 +23,8 @@ class BodyPoint(eqx.Module):
 
 
 Place = int | float | Sequence[float] | Array | BodyPoint | None
-"""Place on a machine: the number of a platform, the distance along a rotor's axis from its mass centre, m, or the point (x, y)
-of a body in a plane, m; None is the default place of the machine."""
+"""Place on a machine: the number of a platform, the distance along a rotor's axis from its centre of mass, m, or the point (x,
+y) of a body in a plane, m; None is the default place of the machine."""
 
 
 def read_place(at: int | Number | Sequence[Number] | None, name: str) -> int | Array | None:
@@ -53,7 +53,7 @@ def on_body(at: int | Array | None, body: int) -> Place:
 class Mount(eqx.Module):
     """Mount of an exciter on a machine with nd coordinates q, whose points move in np directions.
 
-        load j moves by sum_l levers[l][j] rows[l] q,      the rotor's mass centre by sum_l rotor_levers[l] rows[l] q
+        load j moves by sum_l levers[l][j] rows[l] q,      the rotor's centre of mass by sum_l rotor_levers[l] rows[l] q
 
     **Attributes**
 
@@ -62,7 +62,7 @@ class Mount(eqx.Module):
     - `axes` (np,): the direction of each row in the plane of the loads (0 horizontal, 1 up)
     - `levers`: a lever (count,) for each entry of `rows`; None stands for 1, an absent entry for 0. `levers` is (None,) if all
       loads run at the first point, and (None, distances from this point in m) if each load has its own station
-    - `rotor_levers`: the same for the rotor's mass centre, scalars
+    - `rotor_levers`: the same for the rotor's centre of mass, scalars
     - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one.
       typical: 0.01 to 0.5 kg m^2, the polar inertia of the rotor
     - `turn` c (nd,): the exciter's housing turns by c q, and the reaction torque of the drive acts on it; None if it does not
@@ -119,11 +119,11 @@ class Mount(eqx.Module):
         return dict(zip(self.axes, _combine(levers, moved), strict=True))
 
     def rotor_rows(self) -> Array:
-        """Return the matrix (directions, nd) that gives the displacement of the rotor's mass centre from q."""
+        """Return the matrix (directions, nd) that gives the displacement of the rotor's centre of mass from q."""
         return _combine(self.rotor_levers, self.rows)
 
     def distances(self, count: int) -> Array:
-        """Return the distance of each of `count` loads from the rotor's mass centre along the axis, (count,) m.
+        """Return the distance of each of `count` loads from the rotor's centre of mass along the axis, (count,) m.
 
         The distances are 0 on a machine that does not tilt.
         """

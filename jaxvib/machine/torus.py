@@ -31,12 +31,12 @@ class TorusBalls(Loads):
 
         kappa m (B f'' + 2 rho cos a a' f') = (2/5) m w rho cos a a' + F_f
         kappa m (rho a'' - B f'^2 cos a)    = - (2/5) m w B cos a f' + F_a
-        N = m (B f'^2 sin a + rho a'^2 - n . (acceleration of the mount + gravity upward))
+        N = m (B f'^2 sin a + rho a'^2 - n . (acceleration of the mount + g e))
 
-    - w is the rotor speed. A ball rolls without slip and without drilling spin
-    - Its rotation adds the inertia kappa - 1 and the terms with w, which do no work. Because of these terms the rotation
-      contributes B f' (f' - w) instead of B f'^2; the centrifugal force on a ball that turns with the tube is then that of its
-      mass alone
+    - w is the rotor speed, g the acceleration of gravity, and e the unit vector against gravity
+    - A ball rolls without sliding and without drilling spin. Its rotation adds the inertia kappa - 1 and the terms with w,
+      which do no work. Because of these terms the rotation contributes B f' (f' - w) instead of B f'^2; the centrifugal force
+      on a ball that turns with the tube is then that of its mass alone
     - The acceleration of the wall when w changes is neglected, as in the gyroscopic matrix of a rotor
     - A ball on the equator moves like a ball in a plane track of radius R + rho
 

@@ -59,7 +59,7 @@ class EnsembleStatus(eqx.Enumeration):
     detached = "the run reached its end, but a load lost contact with its track; the equations keep it on the track"
     not_finite = "the motion grew without bounds"
     refused = REFUSED
-    not_resolved = "the steps are too long for the decay of the loads by drag or of the machine by damping: use more steps"
+    not_resolved = "steps too long for motions that decay fast, by drag of the loads or damping of the machine: use more steps"
 
 
 class Ensemble(Result):
@@ -191,7 +191,8 @@ def ensemble(
     last, load_speed, apart, finite, detached, taken = ends
     error = np.full(plan.allowed.shape, np.inf if estimate else np.nan, plan.end.dtype)
     if plan.is_compared:
-        # The share is that of a method of order 3. This is conservative, because the method has order 8.
+        # The error is the part (coarse/each)^3 of the difference, as for a method of order 3. This is conservative, because the
+        # method has order 8.
         error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
@@ -252,7 +253,8 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 
     helds, taken = jax.lax.map(whole, counts)
-    # Wrapped angles are relative to the number of turns of the first unpacked state.
+    # `unpack` subtracts from wrapped angles the whole turns of the first state that it is given. States that are compared are
+    # therefore unpacked in one call.
     ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
     pair = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds))
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))

@@ -206,7 +206,7 @@ def _unrolled_solve(a: Array, b: Array) -> Array:
 
 @_unrolled_solve.defjvp
 def _unrolled_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """a x' = b' - a' x, from the same adjugate, with half the operations of its derivative."""
+    """a x' = b' - a' x, from the same adjugate, with half the operations of an automatic derivative of `_unrolled_solve`."""
     (a, b), (da, db) = primals, tangents
     adjugate, determinant = _adjugate(a)
     x = _times(adjugate, b) / determinant
@@ -253,8 +253,8 @@ def _solve_one_by_one(size: int, is_mapped: list[bool], a: Array, b: Array) -> t
 
 @custom_vmap
 def eigenvalues_in_turn(matrix: Array) -> Array:
-    """Eigenvalues of a matrix (n, n), (n,) complex, without vectors. The library is called for one matrix of a batch after the
-    other, see `solve_in_turn`."""
+    """Eigenvalues (n,), complex, of a matrix (n, n), without eigenvectors. The library is called for one matrix of a batch
+    after the other, see `solve_in_turn`."""
     return jnp.linalg.eigvals(matrix)
 
 
@@ -294,7 +294,7 @@ def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array]
     """
     eps = jnp.finfo(norm.dtype).eps
 
-    def left(x: Array) -> tuple[Array, Array]:
+    def residual(x: Array) -> tuple[Array, Array]:
         rest = b - product(x)
         return rest, jnp.max(jnp.abs(rest)) / (norm * jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(b)))
 
@@ -305,10 +305,10 @@ def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array]
     def correct(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         steps, x, rest, error, _ = carry
         x = x + inverse(rest)
-        return steps + 1, x, *left(x), error
+        return steps + 1, x, *residual(x), error
 
     x = inverse(b)
-    rest, error = left(x)
+    rest, error = residual(x)
     start = (jnp.asarray(0), x, rest, error, jnp.full_like(error, jnp.inf))
     return jax.lax.while_loop(improves, correct, start)[1]
 

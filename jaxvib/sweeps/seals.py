@@ -23,7 +23,8 @@ FOLDER = ".seals"
 _LAYOUT, _LOCK = "layout", "lock"
 
 _intact: dict[str, tuple[object, ...]] = {}
-"""Stamps (time, size, number) of the files of chunks that this process has read and verified, by the path of the seal."""
+"""Stamps (time of change, size, inode number) of the files of chunks that this process has read and verified, by the path of
+the seal."""
 
 
 def seal_of(store: Path, chunk: int) -> Path:
@@ -85,7 +86,7 @@ def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None
 
 
 def seal_layout(store: Path) -> None:
-    """Record the digests of all files of a store without chunks: metadata and values of axes."""
+    """Record the digests of all files of a new store, before it has chunks: metadata and values of axes."""
     files = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob("*")) if path.is_file()}
     digests = {name: _digest({name: path}) for name, path in files.items()}
     (store / FOLDER).mkdir()

@@ -1,4 +1,4 @@
-"""Quantities at other operating points, in other load cases and over tolerances."""
+"""Quantities in other load cases and over tolerances."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class Robust(_OfPart):
 
 @validated
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
-    """Return a quantity of the same machine at another operating point or with other loads: some parameters are changed.
+    """Return a quantity of the same machine in another load case: some parameters are changed, such as the rotor speed.
 
     **Arguments**
 

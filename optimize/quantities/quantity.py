@@ -410,7 +410,7 @@ def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
 
 @validated
 def largest(*quantities: Quantity) -> Quantity:
-    """Return the largest of some quantities of the same unit, for example of one quantity at several operating points.
+    """Return the largest of some quantities of the same unit, for example of one quantity in several load cases (`under`).
 
     **Arguments**: `quantities`, at least one; typical: 2 to 5.
 

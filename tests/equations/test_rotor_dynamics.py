@@ -72,7 +72,7 @@ def test_published_equations_of_the_rotor():
 
 
 def test_a_rotor_held_in_its_plane_is_the_planar_rotor():
-    """Supports, loads and imbalance in the plane of the mass centre: nothing tilts, y and z go as the planar rotor's."""
+    """Supports, loads and imbalance in the plane of the centre of mass: nothing tilts, y and z go as the planar rotor's."""
     flat = dict(stiffness=(6e5, 6e5), damping=(400.0, 400.0), position=(0.1, -0.1), stations=0.0)
     effects = (jv.Gravity(), jv.StaticImbalance(0.01))
     loads, drive = pendulums(count=2), jv.ConstantSpeed(300.0)

@@ -155,7 +155,7 @@ def test_one_column_takes_its_rate_from_a_remark(tmp_path, line):
 def test_rate_replaces_times_of_the_file(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("time (s),frame\n" + "".join(f"{t:.2f},{x:.6f}\n" for t, x in zip(T, FRAME, strict=True)))
-    with pytest.raises(jv.InputError, match=r"has the time 0 s twice, at samples 1 and 2; .* give rate"):
+    with pytest.raises(jv.InputError, match=r"has the time 0 s twice, at samples 1 and 2; .* give the sampling rate `rate`"):
         jv.read_run(path, [jv.Channel("frame", "acceleration")])
     run = jv.read_run(path, [jv.Channel("frame", "acceleration")], rate="1 kHz")
     np.testing.assert_allclose(run.times["frame"], T, atol=1e-12)

@@ -12,7 +12,7 @@ import jaxvib as jv
 
 
 def rolled(q, distance):
-    """The point of a rigid shaft at a distance from its mass centre, across and up, after the rotations theta and psi."""
+    """The point of a rigid shaft at a distance from its centre of mass, across and up, after the rotations theta and psi."""
     (ct, cp), (st, sp) = jnp.cos(q[2:]), jnp.sin(q[2:])
     across = jnp.array([[ct, 0.0, st], [0.0, 1.0, 0.0], [-st, 0.0, ct]])
     up = jnp.array([[1.0, 0.0, 0.0], [0.0, cp, sp], [0.0, -sp, cp]])

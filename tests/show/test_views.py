@@ -52,7 +52,7 @@ def test_a_rotors_loads_move_across_and_up():
 
 
 def test_a_tilting_rotors_loads_move_by_their_stations():
-    """The side view has them at their stations, moving up; the front view together, moving as the mass centre."""
+    """The side view has them at their stations, moving up; the front view together, moving as the centre of mass."""
     scene, before = drawn("rotor")
     size, stations = len(scene.machine.structure().coordinates), np.asarray(scene.machine.stations)
     shift = loads_of(drawn("rotor", [1e-3, 2e-3, *[0.0] * (size - 2)])[1]) - loads_of(before)

@@ -17,9 +17,9 @@ from jaxvib.machine.loads import CircularLoads
 
 BY_NAME = {case.name: case for case in CASES}
 FAST = {
-    ("light fold, 1e-8 below", "float64"),
-    ("light fold, 1e-8 below", "float32"),
-    ("light fold, 1e-8 above", "float64"),
+    ("fold of light loads, 1e-8 below", "float64"),
+    ("fold of light loads, 1e-8 below", "float32"),
+    ("fold of light loads, 1e-8 above", "float64"),
     ("exact fold, 1e-8 below", "float32"),
     ("damping 1e-8 of critical", "float64"),
     ("three platforms alike, weak links", "float64"),
@@ -63,7 +63,7 @@ def turned(scene):
     return eqx.tree_at(lambda s: s.loads, scene, Turned(**fields))
 
 
-@pytest.mark.parametrize("name", ["one load", "light fold, 1e-8 below"])
+@pytest.mark.parametrize("name", ["one load", "fold of light loads, 1e-8 below"])
 def test_wrong_sign_in_the_equations_fails(name):
     case = BY_NAME[name]
     found = outcome(dataclasses.replace(case, answer=lambda scene: case.answer(turned(scene))))

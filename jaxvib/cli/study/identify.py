@@ -21,8 +21,8 @@ Command = TypeVar("Command", bound=Callable)
 
 _NAMED = (
     ("mass", "pendulum", "Mass of the pendulum, such as '300 g'."),
-    ("length", "pendulum", "Distance of the mass centre from the axis of the bearing, such as '25 cm'."),
-    ("inertia", "pendulum", "Moment of inertia about the mass centre, kg m^2 [0, a point mass]."),
+    ("length", "pendulum", "Distance of the centre of mass from the axis of the bearing, such as '25 cm'."),
+    ("inertia", "pendulum", "Moment of inertia about the centre of mass, kg m^2 [0, a point mass]."),
     ("bearing", "pendulum", "Diameter of the bearing, for --dry, such as '20 mm'."),
     ("g", "pendulum", "Gravity [9.81 m/s^2]."),
     ("angle-unit", "record", "Unit of the angle, such as deg [as in the header]."),

@@ -21,8 +21,8 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     minute of test.
 
     The file names the runs so far, as for `identify`, and each [[candidate]]: a ramp, a dwell or a coast-down, other places of
-    sensors, numbers that are changed. With the table [limits], the speed of the best candidate is varied over time until the
-    expected errors are smallest."""
+    sensors, or changed numbers of the machine, such as an added mass. With the table [limits], the curve of speed over time of
+    the best candidate is optimized for the smallest expected errors."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.display import speed_text

@@ -90,7 +90,7 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
             raise InputError(
                 str(path),
                 f"has no column of times; its columns are {names}: name one 'time (s)', write a line '# rate: 2000 Hz', or "
-                "give rate",
+                "give the sampling rate, `rate`",
             )
     places = [k for k in range(table.width) if k not in clocks]
     if not places:

@@ -97,7 +97,10 @@ def speed_of(recorded: Sequence[Recorded], pulses: str | None, speed: str | None
     kind, unit = ("pulses", None) if pulses else ("speed", found.unit or None)
     channel = Channel(found.name, kind, unit=unit, per_turn=per_turn)
     if found.time is None:
-        raise InputError("pulses" if pulses else "speed", f"is {quoted(name)}, which has no times in the file; give rate")
+        raise InputError(
+            "pulses" if pulses else "speed",
+            f"is {quoted(name)}, which has no times in the file; give the sampling rate, `rate`",
+        )
     return MeasuredRun.from_arrays([channel], {found.name: found.time}, {found.name: found.values}, source="recording")
 
 

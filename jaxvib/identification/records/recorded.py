@@ -60,7 +60,7 @@ def described_channels(
         factor = _factor(found, channel, where)
         if found.time is None:
             if channel.kind != "pulses":
-                raise InputError(where, "has no times in the file; give rate")
+                raise InputError(where, "has no times in the file; give the sampling rate of the run, `rate`")
             times[channel.name] = _between(found.values, low, high, found.values)
             continue
         if found.time.size != found.values.size:
@@ -101,5 +101,6 @@ def _factor(recorded: Recorded, channel: Channel, where: str) -> float:
         return 1.0 if factor is None else factor
     if factor is None:
         problem = f"is in {quoted(recorded.unit)} in the file, which is not a unit of {channel.kind}"
-        raise InputError(where, f"{problem}; correct its kind, or give the unit of the readings, such as unit='10 {si}'")
+        remedy = f"give the unit of the readings, such as unit='10 {si}' if a reading of 1 is 10 {si}"
+        raise InputError(where, f"{problem}; correct its kind, or {remedy}")
     return factor

@@ -42,7 +42,9 @@ def require_ascending(time: np.ndarray, where: str) -> None:
         k = int(wrong[0])
         if time[k + 1] == time[k]:
             problem = f"has the time {time[k]:g} s twice, at samples {k + 1} and {k + 2}"
-            raise InputError(where, f"{problem}; leave one of them out, or give rate if the file rounds its times")
+            raise InputError(
+                where, f"{problem}; leave one of them out, or give the sampling rate `rate` if the file rounds its times"
+            )
         problem = f"has the time {time[k + 1]:g} s at sample {k + 2}, and {time[k]:g} s at the sample before it"
         raise InputError(where, f"{problem}; times must ascend: sort the samples, or make two runs of them")
 

@@ -183,7 +183,7 @@ class Gravity(Effect):
 
 
 class StaticImbalance(Effect):
-    """Static imbalance: the offset of the rotor's mass centre from its axis is e (cos(theta + angle), sin(theta + angle)).
+    """Static imbalance: the offset of the rotor's centre of mass from its axis is e (cos(theta + angle), sin(theta + angle)).
 
     theta is the rotor's angle. The force on the machine at the rotor is - M e d^2/dt^2 (cos(theta + angle), sin(theta +
     angle)).

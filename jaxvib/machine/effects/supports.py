@@ -20,7 +20,7 @@ Side = Literal["above", "below", "both"]
 
 
 class _Support(Effect):
-    """Support on the foundation at a platform, or around a rotor's axis at a distance from its mass centre."""
+    """Support on the foundation at a platform, or around a rotor's axis at a distance from its centre of mass."""
 
     repeatable = True
     platform: eqx.AbstractVar[int | None]
@@ -57,7 +57,7 @@ class CubicSupport(_Support):
     - `stiffness` k3, N/m^3, negative for a softening support; typical: 1e7 to 1e10. It stiffens a support k by 1 % at the
       amplitude a if (3/4) k3 a^2 = 0.01 k: 3e7 for 5e4 N/m and 5 mm
     - `platform` above the support, numbered from 1 (default: 1)
-    - `position` along a rotor's axis, m from the rotor's mass centre, in place of the platform; typical: -0.5 to 0.5
+    - `position` along a rotor's axis, m from the rotor's centre of mass, in place of the platform; typical: -0.5 to 0.5
 
     **Raises** `InputError` for values that are not allowed. A scene raises it for a place that the machine does not have.
 

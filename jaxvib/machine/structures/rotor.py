@@ -26,7 +26,7 @@ _MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
 class Rotor(Machine):
     """Rigid rotor on two supports, with the coordinates q = (y, z, theta, psi).
 
-    y and z are the displacements of the mass centre, horizontal and up; theta and psi are the tilts of the axis.
+    y and z are the displacements of the centre of mass, horizontal and up; theta and psi are the tilts of the axis.
 
         M y'' + b1 y' + b2 theta' + c1 y + c2 theta = f_y
         M z'' + b1 z' + b2 psi' + c1 z + c2 psi = f_z
@@ -98,7 +98,7 @@ class Rotor(Machine):
         return dataclasses.replace(carrier, **changed) if changed else carrier
 
     def mount(self, at: Place = None) -> Mount:
-        """Return the station of the exciter, or the mass centre with a lever for each load, and the tilt of the axis."""
+        """Return the station of the exciter, or the centre of mass with a lever for each load, and the tilt of the axis."""
         skew = np.zeros((4, 4))
         skew[2, 3], skew[3, 2] = 1.0, -1.0
         station = self.stations if at is None else jnp.asarray(at)
@@ -112,21 +112,25 @@ class Rotor(Machine):
         )
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return the matrix that gives the displacement of the point of the axis at a distance from the mass centre, m.
+        """Return the matrix that gives the displacement of the point of the axis at a distance from the centre of mass, m.
 
-        None is the common station of the loads, or the mass centre if each load has its own.
+        None is the common station of the loads, or the centre of mass if each load has its own.
         """
         if isinstance(place, int):
-            raise InputError(name, f"is {place}, which numbers a platform; on a rotor give a position, m from the mass centre")
+            raise InputError(
+                name, f"is {place}, which numbers a platform; on a rotor give a position, m from the centre of mass"
+            )
         if isinstance(place, Sequence) or (isinstance(place, jax.Array) and place.ndim > 0):
-            raise InputError(name, f"is {quoted(place)}, a point of a body; on a rotor give a position, m from the mass centre")
+            raise InputError(
+                name, f"is {quoted(place)}, a point of a body; on a rotor give a position, m from the centre of mass"
+            )
         translation, tilt = self._directions()
         shared = self.stations if self.stations.ndim == 0 else None
         distance = shared if place is None else jnp.asarray(place)
         return translation if distance is None else translation + distance * tilt
 
     def _directions(self) -> tuple[Array, Array]:
-        """Return rows (2, 4) of the mass centre, and of the tilt of the axis."""
+        """Return rows (2, 4) of the centre of mass, and of the tilt of the axis."""
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
     @property
@@ -170,8 +174,8 @@ def rotor(
     - `stiffness` k (2,) of the supports, N/m; typical: 1e5 to 1e6
     - `damping` (2,) of the supports, N s/m; typical: 100 to 1000; also a ratio "5 %" or a loss factor, see `one_mass`. With
       "5 %" at both supports the translation of the rotor without tilt has this ratio
-    - `position` (2,) of the supports along the axis, m from the mass centre, one side negative; typical: 0.1 to 0.5
-    - `stations` of the loads along the axis, m from the mass centre, one number or one for each load; typical: -0.3 to 0.3,
+    - `position` (2,) of the supports along the axis, m from the centre of mass, one side negative; typical: 0.1 to 0.5
+    - `stations` of the loads along the axis, m from the centre of mass, one number or one for each load; typical: -0.3 to 0.3,
       default 0
     - `stiffness_terms` (c1, c2, c3) in N/m, N, N m: a list of three in place of the terms that follow from the supports;
       typical: 1e6, up to 2e4, 3e4
@@ -270,7 +274,7 @@ class PlanarRotor(Machine):
     - `damping` b, N s/m
     - `stiffness_up` and `damping_up`: vertical values, if `stiffness` and `damping` are the horizontal ones; None: the same
 
-    Source: the special case of `Rotor` with both supports and all loads in the plane of its mass centre.
+    Source: the special case of `Rotor` with both supports and all loads in the plane of its centre of mass.
     """
 
     mass: Array = eqx.field(metadata=_MASS)
@@ -349,9 +353,9 @@ _ROTOR = """
 kind = "pendulum"           # ball, roller, pendulum
 count = 4
 mass = "50 g"               # of one load
-radius = "80 mm"            # distance of the mass centre from the axis
+radius = "80 mm"            # distance of the centre of mass from the axis
 drag = 0.14                 # N s/m at that radius; viscous bearing friction mu (N m s) gives drag = mu / radius^2
-# inertia = 0.0             # kg m^2 about the mass centre, pendulums only
+# inertia = 0.0             # kg m^2 about the centre of mass, pendulums only
 
 [drive]
 kind = "run_up"             # constant_speed, spin_up, run_up, dc_motor, induction_motor
@@ -382,7 +386,7 @@ damping = 840.0             # N s/m
     + _ROTOR,
     "rotor": """# A rigid rotor on two supports; it moves in two directions and tilts about two axes.
 # Numbers are in SI units; text can have any unit of the same dimension.
-# Positions along the axis are measured from the mass centre.
+# Positions along the axis are measured from the centre of mass.
 [machine]
 kind = "rotor"
 mass = 37.0                               # kg, without the loads

@@ -259,8 +259,8 @@ class _Plane(NamedTuple):
 
 
 def _imbalances(scene: Scene) -> tuple[complex, complex, np.ndarray]:
-    """Return the static imbalance of the rotor, kg m, its moment about the mass centre, kg m^2, and the distance of each load
-    from the mass centre, (N,) m."""
+    """Return the static imbalance of the rotor, kg m, its moment about the centre of mass, kg m^2, and the distance of each
+    load from the centre of mass, (N,) m."""
     imbalances = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.all_effects, RotorImbalance)]
     static = sum((complex(*map(float, each.static)) for each in imbalances), 0j)
     moment = sum((complex(*map(float, each.moment)) for each in imbalances), 0j)
@@ -269,7 +269,7 @@ def _imbalances(scene: Scene) -> tuple[complex, complex, np.ndarray]:
 
 @cached
 def _distances(scene: Scene) -> Array:
-    """Return the distance of each load from the mass centre along the axis, (N,) m."""
+    """Return the distance of each load from the centre of mass along the axis, (N,) m."""
     return scene.mount().distances(scene.loads.count)
 
 
@@ -286,7 +286,7 @@ def _planes(scene: Scene) -> list[_Plane]:
         if abs(tilting) > _rounding() * max(abs(moment), abs(places[0] * static)):
             problem = (
                 "tilt the rotor: loads at one point cannot cancel a moment imbalance, or a static imbalance at another point "
-                "(it acts at the mass centre of the rotor); give loads at two stations, or leave it out"
+                "(it acts at the centre of mass of the rotor); give loads at two stations, or leave it out"
             )
             raise InputError("effects", problem)
         return [_Plane(np.arange(distances.size), static)]

@@ -98,8 +98,8 @@ file = "swing.csv"          # two columns, for example: time (s), angle (deg); p
 
 [pendulum]
 mass = "300 g"
-length = "250 mm"           # from the axis of the bearing to the mass centre
-inertia = 0.00625           # kg m^2 about the mass centre: a rod of length L has m L^2/12
+length = "250 mm"           # from the axis of the bearing to the centre of mass
+inertia = 0.00625           # kg m^2 about the centre of mass: a rod of length L has m L^2/12
 bearing = "20 mm"           # diameter at which dry friction acts
 # g = 9.81                  # m/s^2
 

@@ -40,8 +40,8 @@ class BearingPendulum(eqx.Module):
     **Arguments** (SI, or strings with a unit)
 
     - `mass` m, kg; typical: 0.1 to 1
-    - `length` l from the axis of the bearing to the mass centre, m; typical: 0.1 to 0.5
-    - `inertia` J_C about the mass centre, kg m^2 (default 0: a point mass; a rod of length L has m L^2/12); typical: 1e-3 to
+    - `length` l from the axis of the bearing to the centre of mass, m; typical: 0.1 to 0.5
+    - `inertia` J_C about the centre of mass, kg m^2 (default 0: a point mass; a rod of length L has m L^2/12); typical: 1e-3 to
       0.05
     - `bearing`: its diameter d, m, needed for dry friction only; typical: 0.005 to 0.02
     - `g`, m/s^2; typical: 9.81 (the default)
@@ -119,7 +119,7 @@ class SwingStatus(eqx.Enumeration):
     swinging = "the pendulum still swings at the last time"
     stopped = "dry friction stopped the pendulum"
     max_steps_reached = "the swing needs more steps than max_steps to reach its last time"
-    no_start = "the swing does not exist: one of its parameters is not finite, or the pendulum would not hang"
+    no_start = "the swing does not exist: one of its parameters is not finite, or its centre of mass would be above the bearing"
 
 
 class Swing(Result):
@@ -183,7 +183,8 @@ def swing(
 
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width) - b |f'| f' + M
 
-    If the pendulum turns within the dead zone |sin f - M/(m g l)| < mu2 d/(2 l) cos f, dry friction holds it permanently.
+    If the pendulum reverses its motion within the dead zone |sin f - M/(m g l)| < mu2 d/(2 l) cos f, dry friction holds it
+    permanently.
 
     **Arguments** (SI, or strings with a unit)
 
@@ -197,8 +198,8 @@ def swing(
     - `width`, rad/s: range of f' over which the dry friction changes its sign; default: a twentieth of the dead zone's angle
       times the natural frequency. A swing as small as the dead zone then loses 0.1 % too little energy; the error of larger
       swings is smaller. A smaller width needs more steps
-    - `stepsize_controller`: `Tolerance` of a step, relative, and in rad; typical: 1e-6 to 1e-9 (the default; in single
-      precision 1e-5). Or a controller of diffrax
+    - `stepsize_controller`: `Tolerance` of a step, whose number is the relative tolerance and also the absolute one, in rad and
+      rad/s; typical: 1e-6 to 1e-9 (the default; in single precision 1e-5). Or a controller of diffrax
     - `solver`, `adjoint`, `max_steps`: as in diffrax
     - `throw`: raise if `max_steps` is too small; otherwise, and under a JAX transformation, the status shows it
 
@@ -278,9 +279,9 @@ def swing_states(
     if dry is not None and width is None:
         zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
         width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
-    slowness = None if dry is None or width is None else _slowness(pendulum, friction, dry, width)
-    # There is no change of sign if friction already holds the pendulum at the start.
-    free = None if slowness is None else slowness(times[0], (angle, rate), None) > 0.0
+    margin = None if dry is None or width is None else _margin_to_rest(pendulum, friction, dry, width)
+    # The function of the event does not change its sign if friction already holds the pendulum at the start.
+    free = None if margin is None else margin(times[0], (angle, rate), None) > 0.0
     scale = jax.lax.stop_gradient(frequency)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(_rates(pendulum, friction, width, free)),
@@ -296,7 +297,7 @@ def swing_states(
         throw=False,
         # `flip=True` states that the function decreases through 0. Without it the search would fail if the last step ends just
         # before the root and, by rounding, the function has the same sign at both ends of the step.
-        event=None if slowness is None else diffrax.Event(slowness, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
+        event=None if margin is None else diffrax.Event(margin, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
     )
     assert solution.ts is not None and solution.ys is not None
     (f, slip), ((end,), (end_slip,)) = solution.ys
@@ -326,7 +327,7 @@ _Pair: TypeAlias = tuple[Array, Array]
 """Angle and rate of a pendulum, or their rates."""
 
 
-def _slowness(pendulum: BearingPendulum, friction: Friction, dry: Array, width: Array) -> Callable[..., Array]:
+def _margin_to_rest(pendulum: BearingPendulum, friction: Friction, dry: Array, width: Array) -> Callable[..., Array]:
     """Return a function of the motion that becomes negative when the pendulum is slow within the dead zone.
 
     There the integration ends, because with the smoothed sign of dry friction the pendulum would creep.
@@ -370,7 +371,7 @@ def _last_part(
     """Return the time at which a slow pendulum comes to rest, and its angles and rates until then.
 
     The motion continues from the state `y` at the time `last`. With the exact sign of dry friction it is a harmonic motion
-    about the end of the dead zone from which the pendulum moves away.
+    about that boundary of the dead zone which lies behind the moving pendulum.
     """
     (end, end_slip), frequency = y, pendulum.frequency
     way = jnp.where(end_slip < 0.0, -1.0, 1.0)

@@ -270,7 +270,7 @@ def two_mass():
 
 
 def tilting(station=0.1):
-    """A rotor with its loads off the mass centre, which the held load shifts; the place of the loads from the new one."""
+    """A rotor with its loads off the centre of mass, which the held load shifts; the place of the loads from the new one."""
     shift = 0.2 * station / 37.2
 
     def machine(mass, inertia, shift):

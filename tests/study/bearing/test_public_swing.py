@@ -1,6 +1,6 @@
 """A recorded swing that others have published, with their estimates (file tests/data/pendulum_free_swing.csv, MIT licence).
 
-Kaheman et al. 2022 (arXiv 2205.06231) recorded a pendulum of 0.148 kg at 0.148 m with 1.091e-4 kg m^2 about its mass centre.
+Kaheman et al. 2022 (arXiv 2205.06231) recorded a pendulum of 0.148 kg at 0.148 m with 1.091e-4 kg m^2 about its centre of mass.
 """
 
 import pathlib

@@ -176,7 +176,7 @@ CASES = (
         named=(("refused",), ("refused",)),
     ),
     Case(
-        "drag 1e8 times as large, exact jam",
+        "drag 1e8 times that of the published machine, exact jam",
         hard="loads turn almost with the rotor: the torque balance is a difference of numbers that are 1e8 times as large",
         quantity="load speed and amplitudes of mode 5",
         against="the closed form of a fixed unbalance",
@@ -186,7 +186,7 @@ CASES = (
         within=(1e-7, 1e-3),
     ),
     run_case(
-        "drag 1e3 times as large, run",
+        "drag 1e3 times that of the published machine, run",
         hard="loads follow the rotor within 1e-3 of its speed, so the equations are stiff",
         scene=lambda: published(eps=0.05, beta=1e3),
         answer=_RUN,

@@ -228,7 +228,7 @@ def _bent(
 
 CASES = (
     _bent(
-        "stop 1e4 times as stiff",
+        "stop 1e4 times as stiff as the support",
         "a bounce lasts a hundredth of a period, and the slope of the force jumps at its beginning",
         lambda: _one(Stop(4e8, gap=1e-3, side="above")),
         _moving,

@@ -110,7 +110,7 @@ _RUN, _RUN_AGAIN = final_state(40.0, lambda scene: away(scene, displacement=1.0)
 CASES = (
     *(
         jam_case(
-            f"light fold, 1e-8 {side}",
+            f"fold of light loads, 1e-8 {side}",
             hard="two modes merge: the load speed has an infinite slope, and the 8th digit of the rotor speed decides",
             scene=lambda sign=sign: published(_LIGHT_FOLD * (1.0 + sign * 1e-8)),
             named=((), ("at_fold",)),
