@@ -14,9 +14,9 @@ from jaxvib.results.fields import in_unit, part
 
 
 class Spin(eqx.Module):
-    """Free rotation of rolling loads, if effects release it (`FreeSpin`, `Sliding`), or its time derivative.
+    """Free rotation of rolling loads, if effects permit it (`FreeSpin`, `Sliding`), or its time derivative.
 
-    **Attributes** (each is None if no effect releases it)
+    **Attributes** (each is None if no effect permits it)
 
     - `drilling` (count,), rad/s: a load's spin about the normal of its contact, relative to its track
     - `slip`: a (count,) array, m/s, for each coordinate of a load: the velocity of its point of contact relative to the track
@@ -43,7 +43,7 @@ class ExciterState(eqx.Module):
       in rad and rad/s; () without loads
     - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it, followed by the states of the motor, such as
       currents; None under an ideal drive
-    - `spin` of the loads if effects release it, see `Spin` and `with_spin`; otherwise None
+    - `spin` of the loads if effects permit it, see `Spin` and `with_spin`; otherwise None
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> state = jv.State(displacement=jnp.zeros(1), velocity=jnp.zeros(1), angle=(jnp.array([0.0, 0.1]),), rate=(jnp.zeros(2),))

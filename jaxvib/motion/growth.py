@@ -117,10 +117,10 @@ def growth(
 
     The result depends on the later half of the run. With G the logarithm of the growth in this half and s its standard error:
 
-    - "chaotic" or "unstable": G > 3 s and G > ln 1000, with rates that agree in both quarters. The motion is unstable if it
-      returns to its former state within three turns of its rotor and loads. An unstable jam is an example; its exponent is
-      ln|multiplier| divided by the period of `jam_orbit`. An unstable motion that repeats itself only after more turns is
-      called chaotic
+    - "chaotic" or "unstable": G > 3 s and G > ln 1000, with rates that agree in the two quarters of this half. The motion is
+      unstable if it returns to its former state within three turns of its rotor and loads. An unstable jam is an example; its
+      exponent is ln|multiplier| divided by the period of `jam_orbit`. An unstable motion that repeats itself only after more
+      turns is called chaotic
     - "regular": G + 3 s < ln 1000 and G < 2 s; or G < ln 2.1 with rates that decrease as for growth proportional to time
     - "undecided": all other cases, for example if the rate is certain but the run is too short to reach ln 1000
 
@@ -222,7 +222,7 @@ def _sum_error(values: np.ndarray) -> float:
 
 
 def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
-    """Return True if the motion from `state` comes back to it within a few turns of rotor and loads."""
+    """Return True if the motion from `state` returns to this state within a few turns of rotor and loads."""
     speed, turning = float(scene.top_speed), []
     for own in state.exciters:
         turning += [*np.abs(np.ravel(own.rate[0]))] if own.rate else [] if own.rotor is None else [abs(own.rotor[1])]

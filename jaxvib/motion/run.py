@@ -136,7 +136,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def largest_force(self) -> Array:
-        """Largest force on the foundation on the way, N, among the stored states; of two directions the resultant."""
+        """Largest force on the foundation on the way, N, among the stored states; for two directions their resultant."""
         return jnp.sqrt(jnp.max(jnp.sum(self._whole.foundation_force**2, axis=1)))
 
     @property

@@ -291,7 +291,7 @@ def _compare_runs(
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
 
-def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
+def _error_share(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
     """Return the error of the finer of two runs of a smooth motion, as a share of the difference between both runs.
 
     With a method of order 8 the error falls with the power 8/9 of the tolerance and the power 8 of the number of steps. The
@@ -327,7 +327,7 @@ def _estimate_error(
     ours = window.state
     theirs = with_nearest_turns(theirs, ours) if wrap_angles(scene, window.time.dtype)[0] else theirs
     difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
-    error = estimated_error(difference, _shrink(control, coarser), scene, steps, fastest * window.time[-1])
+    error = estimated_error(difference, _error_share(control, coarser), scene, steps, fastest * window.time[-1])
     return jnp.where(found & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
 
 

@@ -148,7 +148,7 @@ def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: A
 
 @validated
 def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> State:
-    """Return the state completed by the rotation of the loads about their own centres, if effects of the scene release it.
+    """Return the state completed by the rotation of the loads about their own centres, if effects of the scene permit it.
 
     A state that contains this rotation already is returned unchanged.
 
@@ -156,13 +156,13 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
 
     **Arguments**
 
-    - `scene` whose effects release the rotation (`FreeSpin`, `Sliding`)
+    - `scene` whose effects permit the rotation (`FreeSpin`, `Sliding`)
     - `state` without this rotation
     - `rotation`: "rolling" (the default), for loads that roll on their track without spin about the contact normal; or "none",
       for loads that do not rotate in space (the equation above), so that their contact slides if the scene has `Sliding`;
       typical: slips of 5 to 50 m/s for "none"
 
-    **Returns** `State`. **Raises** `InputError` for another name, and for a spin in the state that the scene does not release
+    **Returns** `State`. **Raises** `InputError` for another name, and for a spin in the state that the scene does not permit
     or that has a wrong shape.
 
     >>> import jax.numpy as jnp, jaxvib as jv

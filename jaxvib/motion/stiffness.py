@@ -99,7 +99,7 @@ def advice(scene: Scene) -> str:
     if not decay > 10.0 * motion:
         return ""
     carrier = float(np.max(np.asarray(_carrier_decay(scene))))
-    name = "machine.damping makes the machine" if carrier >= decay else "loads.drag makes the loads"
+    name = "machine.damping makes vibrations" if carrier >= decay else "loads.drag makes speeds of loads"
     return (
         f"; {name} decay at {decay:.2g} 1/s, {decay / motion:.1g} times as fast as the motion: use a "
         "smaller value, or the default solver"

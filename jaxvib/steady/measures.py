@@ -1,4 +1,4 @@
-"""Measures of a vibration as engineers state them: stroke, acceleration, severity, isolation, loads on supports, conveying."""
+"""Measures of a vibration as engineers state them: stroke, acceleration, severity, isolation, forces on supports, conveying."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class VibrationMeasures(eqx.Module):
     - `exciter_force`, N: centrifugal force S Omega^2 of the loads
     - `transmissibility`: foundation force divided by `exciter_force`
     - `static_load` (nd,), N: weight that each support carries
-    - `dynamic_load` (nd,), N zero to peak, of each support
+    - `dynamic_load` (nd,), N zero to peak: force of the vibration on each support
     - `torque`, N m, and `power`, W: means at the shaft of the rotor
     - `coordinates`: the names of the coordinates
     """
@@ -155,7 +155,7 @@ class VibrationMeasures(eqx.Module):
 
 @validated
 def vibration_measures(scene: Scene, jam: Jam) -> VibrationMeasures:
-    """Return stroke, acceleration, velocity, isolation, loads on supports, torque and power of a jam of light loads.
+    """Return stroke, acceleration, velocity, isolation, forces on supports, torque and power of a jam of light loads.
 
         stroke = 2 |Y|,    acceleration = Omega^2 |Y| / g,    velocity = Omega |Y| / sqrt 2,
         dynamic load of support i = |k_i + i Omega b_i| |Y_i|,    static load = k_i s_i with K s = M g
@@ -224,8 +224,8 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
 
 
 def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tuple[Array, Array]:
-    """Return the static load and the dynamic load, zero to peak, of the support of each platform, (nd,) N each."""
-    machine = require_platforms(model.scene, "the load of a support")
+    """Return the weight on the support of each platform, and the force of the vibration on it, zero to peak, (nd,) N each."""
+    machine = require_platforms(model.scene, "the force on a support")
     static = machine.stiffness * jnp.nan_to_num(static_deflections(model.scene))
     spring = magnitude(jax.lax.complex(machine.stiffness, omega * machine.damping))
     return static, spring * magnitude(displacement)

@@ -265,8 +265,9 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 def critical_speeds(scene: Scene, *, loads: LoadMasses = "fixed") -> CriticalSpeeds:
     """Return the critical speeds, at which a whirl turns at the speed w of the rotor: (K - w^2 (M - i G)) X = 0.
 
-    The eigenproblem is Hermitian. On supports that are equal in both directions, a forward tilt has the inertia A - C, a
-    backward one A + C. Supports that differ split each critical speed in two.
+    The eigenproblem is Hermitian. On supports that are equal in both directions, the inertia of a forward tilt is the
+    transverse inertia of the rotor minus the polar one, that of a backward tilt their sum. Supports that differ split each
+    critical speed in two.
 
     **Arguments** as `whirl`: `scene`; `loads` "fixed" or "none".
 

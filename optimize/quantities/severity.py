@@ -1,4 +1,4 @@
-"""Quantities of a jam as engineers state them: stroke, acceleration, velocity, isolation, torque, loads on supports."""
+"""Quantities of a jam as engineers state them: stroke, acceleration, velocity, isolation, torque, forces on supports."""
 
 from __future__ import annotations
 
@@ -147,7 +147,8 @@ def _shaft_torque(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 
 @validated
 def support_load(*, mode: int, of: int) -> Quantity:
-    """Return the greatest load of a support in a jam mode, N: its static load plus the amplitude of its dynamic load.
+    """Return the greatest force on a support in a jam mode, N: the weight on it plus the amplitude of the force of the
+    vibration.
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `of`: the platform on the support; typical: 1 to 3.
 
@@ -156,11 +157,11 @@ def support_load(*, mode: int, of: int) -> Quantity:
 
     >>> from optimize import support_load
     >>> support_load(mode=3, of=2).words
-    'load of support 2, mode 3'
+    'force on support 2, mode 3'
     """
     count(of, "of")
     return jam_quantity(
-        "support_load", "N", _support_load, mode, "leading", f"load of support {of}", settings=(of,), tiers=("leading",)
+        "support_load", "N", _support_load, mode, "leading", f"force on support {of}", settings=(of,), tiers=("leading",)
     )
 
 

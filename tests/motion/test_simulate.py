@@ -16,7 +16,7 @@ from small_machine import small_machine, small_run, small_start
 import jaxvib as jv
 from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate
 from jaxvib.motion.plan import _enough_samples, _sample_size, _step_control, enough_steps
-from jaxvib.motion.simulate import _shrink
+from jaxvib.motion.simulate import _error_share
 from jaxvib.ode.dopri8_loop import LoopDopri8
 
 
@@ -135,8 +135,8 @@ def test_default_tolerance_depends_on_the_precision():
 def test_estimate_assumes_less_than_order_8():
     """An eighth is left where steps are half as long, 100^-0.45 where the tolerance is a hundredth."""
     equal, adaptive = ((lambda n: StepControl(steps=jnp.asarray(n))), (lambda x: StepControl(tolerance=jnp.asarray(x))))
-    np.testing.assert_allclose(_shrink(equal(200.0), equal(100.0)), 0.125, rtol=1e-12)
-    np.testing.assert_allclose(_shrink(adaptive(1e-8), adaptive(1e-6)), 100.0**-0.45, rtol=1e-12)
+    np.testing.assert_allclose(_error_share(equal(200.0), equal(100.0)), 0.125, rtol=1e-12)
+    np.testing.assert_allclose(_error_share(adaptive(1e-8), adaptive(1e-6)), 100.0**-0.45, rtol=1e-12)
 
 
 def test_a_run_that_another_is_compared_with_measures_nothing(monkeypatch):

@@ -59,7 +59,7 @@ class Trajectory(eqx.Module):
 
 
 def only_exciter_value(values: tuple[Array, ...], name: str) -> Array:
-    """Return the value of the only exciter. **Raises** `InputError` that names the values of several."""
+    """Return the value of the only exciter. **Raises** `InputError` if there are several; it names their values."""
     if len(values) != 1:
         raise InputError(name, f"are those of {len(values)} exciters; read {name}[0] and so on")
     return values[0]

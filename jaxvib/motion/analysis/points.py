@@ -45,8 +45,8 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
     The means and the harmonics of `speed` are fitted by least squares. Weights that vanish at both ends (Hann window) make the
     result insensitive to frequencies that are not a multiple of `speed`.
 
-    **Returns** the complex amplitudes (nd,), whose phase is measured from the middle of the time interval, and (nd, nd), see
-    `Harmonic.rest`.
+    **Returns** the complex amplitudes (nd,), whose phase is measured from the middle of the time interval, and the matrix
+    `Harmonic.rest` (nd, nd).
     """
     count = time.shape[0]
     weight = jnp.asarray(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2, time.dtype)[:, None]

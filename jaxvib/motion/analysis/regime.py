@@ -33,8 +33,8 @@ _LOCKED_PHASE_CHANGE = 0.1
 """Change of the relative phases, rad, from one half of the window to the other below which they count as constant."""
 
 _STEADY_SLIP = 0.02
-"""Relative difference between the slips of a load in the two halves of the window, below which the slip is steady. A load with
-a steady slip is jammed, even if the slip is small."""
+"""Relative difference between the lags of a load (angles by which it falls behind the rotor) in the two halves of the window,
+below which the lag is steady. A load with a steady lag is jammed, even if the lag is small."""
 
 _BALANCED_UNBALANCE_SHARE = 0.02
 """Residual unbalance below which loads count as balancing the rotor, relative to the unbalance of all loads at one angle."""
@@ -152,7 +152,7 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
 
     - Loads that make less than one turn swing
     - Loads turn with the rotor if their mean speed differs from the rotor speed by less than 0.3 %, unless they fall behind
-      steadily: by more than 0.1 rad over the part, with slips in both halves that agree within 2 %
+      steadily: by more than 0.1 rad over the part, with lags in its two halves that agree within 2 %
     - They balance the rotor if the residual unbalance of loads and rotor together is less than 2 % of the unbalance of the
       loads (static, and about tilts if the loads have stations)
     - Loads that all turn at another speed with constant relative phases are jammed

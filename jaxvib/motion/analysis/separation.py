@@ -76,10 +76,8 @@ def prepare_separation(scene: Scene, state: State, samples: int) -> None:
 def _transition(
     scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray, which: int
 ) -> tuple[Array, Array, Array]:
-    """Return the transition matrix from sample `first` to the last sample, and the time between them, s.
-
-    The matrix is the product of the first result and the exponential of the second.
-    """
+    """Return A, b and t: the transition matrix from sample `first` to the last sample is A exp(b), and t is the time between
+    them, s."""
     field = vector_field(scene)
     step = (times[-1] - times[0]) / (times.shape[0] - 1)
     begin = jax.tree.map(lambda leaf: leaf[0], states)

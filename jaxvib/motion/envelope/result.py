@@ -46,7 +46,7 @@ class Envelopes(eqx.Module):
 
     - `time` (nt,), s
     - `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s: complex amplitudes at the loads' mean angle. If exciters turn at
-      different speeds, they beat
+      different speeds, the amplitudes beat
     - `amplitude` (nt, nd), m, and `foundation_force` (nt, nb), N, zero to peak
     - `omega` (nt,): mean speed of the loads in their directions, and `load_speed` (nt, count), anticlockwise, rad/s
     - `phase` (nt, count) of each load relative to the mean angle, rad, in its direction of rotation

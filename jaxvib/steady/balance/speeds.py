@@ -1,4 +1,4 @@
-"""Characteristic speeds of a machine: coincident loads change between gathering and balancing."""
+"""Characteristic speeds of a machine, at which coincident loads change between gathering and balancing."""
 
 from __future__ import annotations
 

@@ -144,8 +144,8 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
         sum_j m_j R_j exp(i alpha_j) + U = 0,    sum_j m_j R_j s_j exp(i alpha_j) + W = 0
 
-    U is the `StaticImbalance` and W the `MomentImbalance` of the rotor, s_j the distance of a load along the axis from the mass
-    centre of the rotor. For loads in one plane the first equation is sufficient.
+    U is the `StaticImbalance` and W the `MomentImbalance` of the rotor, s_j the distance of a load along the axis from the
+    rotor's centre of mass. For loads in one plane the first equation is sufficient.
 
     - Two loads cancel if they are equal and opposite each other
     - Three loads cancel in one triangle and its mirror image

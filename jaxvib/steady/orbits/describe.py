@@ -100,10 +100,10 @@ class Orbit(Result):
 
     @validated
     def at(self, theta: Array) -> tuple[Array, Array, tuple[Array], tuple[Array]]:
-        """Return the motion at the angle `theta` = Omega t (scalar, rad): q (nd,) m, q' m/s, (phi,) (count,) rad, (phi',)
-        rad/s.
+        """Return the motion at the angle `theta` = Omega t (scalar, rad).
 
-        Tilts are in rad and rad/s. A state of `vector_field` consists of these: `jv.State(*orbit.at(0.0))` is a point of the
+        The result contains q (nd,), m, and q', m/s (tilts in rad and rad/s), and then phi (count,), rad, and phi', rad/s, each
+        in a tuple of one array. A `State` consists of these four: `jv.State(*orbit.at(0.0))` is a point of the
         motion. For many angles use `jax.vmap(orbit.at)`.
 
         **Raises** `InputError` for an angle that is not finite, or so large that its digits within a turn are lost.

@@ -113,7 +113,7 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
 
     **Arguments**
 
-    - `scene`, not all of whose exciters are turned by ideal drives
+    - `scene` with at least one exciter that has a motor or loads
     - `regime`: a motion with `speed` and `phases`, such as a `SynchronousOrbit` of the scene
     - `over`: name of the parameter, such as "exciters[1].drive.speed", "exciters[0].unbalance"
 

@@ -22,7 +22,7 @@ from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
 
 _PHASE_PER_STEP = 0.7
 """Phase of the carrier's fastest motion in an explicit step, rad. With order 8 the error of the multipliers is then 1e-12 for
-loads as fast as the carrier, and 1e-10 for loads three times as fast."""
+loads as fast as the carrier, and 1e-10 for loads three times as fast as the carrier."""
 
 _STIFF_DECAY_RATIO = 3.0
 """Ratio of decay rate and fastest oscillation above which the implicit method is used. Explicit steps would have to resolve

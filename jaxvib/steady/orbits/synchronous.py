@@ -196,7 +196,7 @@ def synchronous_orbit(
       instead prescribes th_k = sigma_k n t (phase 0) and Omega = n
     - the loads, all at one angle, if the rotor is balanced and has an ideal drive: the loads of all exciters jam at one speed
 
-    **Arguments**: `scene` without effects that release the rotation of loads about their own centres; and
+    **Arguments**: `scene` without effects that permit the rotation of loads about their own centres; and
 
     - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two arguments:
     - `speed`: start of Omega, rad/s or text; default: the mean speed of the motors; typical: 60 to 320

@@ -23,7 +23,8 @@ _LONGEST_STEP = 0.3
 """Largest change of a phase in a step of the search for a fold, rad."""
 
 _MIN_DAMPING = 1e-9
-"""Decay rate, relative to the speed, below which a motion is not called stable, because rounding hides weaker damping."""
+"""Decay rate, relative to the speed, below which a motion is not called stable: smaller computed rates can be rounding
+errors."""
 
 
 class Slopes(NamedTuple):

@@ -166,7 +166,8 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
 class SynchronousRegimes(AbstractSynchronousRegime):
     """All synchronous regimes of a scene: the arrays of `AbstractSynchronousRegime` with a leading axis over the n regimes.
 
-    Returned by `synchronous_regimes`. Stable regimes come first, then by falling speed.
+    Returned by `synchronous_regimes`. Stable regimes come first; regimes of the same stability are in the order of decreasing
+    speed.
 
     **Additional attribute**: `search`, a `RegimeSearchStatus`.
     """

@@ -128,7 +128,7 @@ def _stable_solution(balance: TorqueBalance) -> tuple[Array, Slopes | None, Arra
         k, _, growth = state
         return ~decays(growth, omega[order[k]]) & (k < len(sets) - 1)
 
-    # The loop has one body, which is compiled once; its first turn judges the first regime.
+    # The loop has one body, which is compiled once; its first iteration judges the first regime.
     begin = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(judged, jnp.asarray(0)))
     begin = (jnp.asarray(-1), begin[1], jnp.asarray(jnp.nan, omega.dtype))
     which, slopes, growth = jax.lax.while_loop(undecided, lambda state: judged(state[0] + 1), begin)

@@ -1,4 +1,5 @@
-"""Table of repeated records of one machine (docs/identification.md): intervals that hold the truth, errors, wrong minima.
+"""Table of repeated records of one machine (docs/identification.md): intervals that contain the true value, errors, wrong
+minima.
 
 PYTHONPATH=tests/helpers python -m repeated_records 400
 PYTHONPATH=tests/helpers python -m repeated_records 400 "white noise"
@@ -15,7 +16,7 @@ from repeated_records.fits import CASES, repeated
 
 def main(count: int, names: list[str]) -> None:
     print(
-        "| case | records | intervals that hold the truth | largest standard deviation / bound | wrong minima | "
+        "| case | records | intervals that contain the true value |  largest standard deviation / bound | wrong minima | "
         "of these with status found |"
     )
     for name in names:

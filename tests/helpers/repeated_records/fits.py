@@ -1,4 +1,5 @@
-"""Repeated records of one machine, each fitted from wrong first values: share of intervals that hold the truth, and errors.
+"""Repeated records of one machine, each fitted from wrong first values: share of intervals that contain the true value, and
+errors.
 
 One run-up by SciPy serves all records of a case; noise, gains and first values are drawn for each record.
 """
@@ -48,7 +49,7 @@ class Repeated:
 
     @property
     def held(self):
-        """Share (p,) of the intervals that hold the truth, wrong minima left out."""
+        """Share (p,) of the intervals that contain the true value, wrong minima left out."""
         return np.mean(np.abs(self.away[~self.wrong]) < 1.96, axis=0)
 
     @property
@@ -58,7 +59,8 @@ class Repeated:
 
     @property
     def row(self):
-        """Row of a table: intervals that hold the truth, standard deviation, wrong minima, those with status `found`."""
+        """Row of a table: intervals that contain the true value, standard deviation, wrong minima, those with status
+        `found`."""
         found = int(np.sum(self.wrong & (self.statuses == "found")))
         held, share = self.held, np.mean(self.statuses == "found")
         return (

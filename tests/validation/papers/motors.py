@@ -75,7 +75,7 @@ NUMBERS = (
                 quantity=f"jams {where} characteristic speed", printed=float(jams), computed=lambda k=k: float(_counts()[k][0])
             ),
             _ranges(
-                quantity=f"of these below the resonance, {where}",
+                quantity=f"jams below the resonance, of those {where} characteristic speed",
                 printed=float(below),
                 computed=lambda k=k: float(_counts()[k][1]),
             ),

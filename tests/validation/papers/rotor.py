@@ -268,11 +268,12 @@ NUMBERS = (
         reason=f"lowest of the computed values ({', '.join(f'{mu:g}' for mu in _TRIED)}); {_READING}",
     ),
     _friction_number(
-        "friction above which they do not balance it",
+        "friction above which the pendulums do not balance the rotor",
         4.0e-2,
         lambda: min(_ended("unbalanced"), default=math.nan),
         within=5e-4,
-        reason=f"at 5e-2 they balance it within 6 s; the paper may have evaluated an earlier time or other data; {_READING}",
+        reason="at 5e-2 they balance the rotor within 6 s; the paper may have evaluated an earlier time or other data; "
+        f"{_READING}",
     ),
     *(
         _measured(name, speed, reason="a measurement; the friction of the bearings on the test rig is not printed")
