@@ -16,8 +16,7 @@ from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
-from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces
-from jaxvib.machine.carrier import Machine
+from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.drives.drive import IdealDrive, Motor, MotorWrapper
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import SupportForce, Term
@@ -27,6 +26,33 @@ from jaxvib.numerics.linalg import solve_definite
 
 DriveBy = Literal["scene", "input"]
 """Source of the motion of the rotor: the drive of the scene, or inputs."""
+
+
+_RATES = ("", "/s", "/s^2")
+
+
+class Signal(NamedTuple):
+    """Name of a quantity, such as "displacement.y1", and its unit."""
+
+    name: str
+    unit: str
+
+
+def coordinate_signals(carrier: Carrier, name: str, order: int) -> tuple[Signal, ...]:
+    """Return the signals of the coordinates (`order` 0) or of their derivatives: velocities (1) or accelerations (2)."""
+    named = zip(carrier.coordinates, carrier.units, strict=True)
+    return tuple(Signal(f"{name}.{coordinate}", unit + _RATES[order]) for coordinate, unit in named)
+
+
+def force_inputs(carrier: Carrier) -> tuple[Signal, ...]:
+    """Return the signals of the forces on the coordinates, N (on angles: N m)."""
+    named = zip(carrier.coordinates, carrier.units, strict=True)
+    return tuple(Signal(f"force.{coordinate}", "N" if unit == "m" else "N m") for coordinate, unit in named)
+
+
+def foundation_forces(carrier: Carrier) -> tuple[Signal, ...]:
+    """Return the signals of the force on the foundation."""
+    return tuple(Signal(f"foundation_force.{direction}", "N") for direction in carrier.foundation_directions)
 
 
 class _AppliedForce(Effect):

@@ -16,7 +16,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, averaged_field
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, optional_module, quoted, require_writable, written
-from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces, signals_of
+from jaxvib.exchange.model import Signal, coordinate_signals, force_inputs, foundation_forces
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import SupportForce
@@ -188,7 +188,7 @@ def _at_rest(scene: Scene, speed: Array) -> StateSpace:
         for axis in scene.machine.mounting(exciter.at).axes
     ]
     outputs = (*states, *coordinate_signals(carrier, "acceleration", 2), *foundation_forces(carrier))
-    inputs = (*force_inputs(carrier), *signals_of(places, "N"))
+    inputs = (*force_inputs(carrier), *(Signal(place, "N") for place in places))
     x0, u0, y0 = (np.zeros(len(signals)) for signals in (states, inputs, outputs))
     return StateSpace(a, b, c, d, states, inputs, outputs, x0, u0, y0, _AT_REST.format(speed=float(speed)))
 
@@ -235,8 +235,8 @@ def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
     states = [signal for name, order in parts for part in ("real", "imaginary")
               for signal in coordinate_signals(carrier, f"{part}_{name}", order)]  # fmt: skip
     states += [
-        *signals_of([f"rate.load{j}" for j in loads], "rad/s"),
-        *signals_of([f"phase.load{j}" for j in loads[1:]], "rad"),
+        *(Signal(f"rate.load{j}", "rad/s") for j in loads),
+        *(Signal(f"phase.load{j}", "rad") for j in loads[1:]),
     ]
     outputs = [Signal("load_speed", "rad/s"), *coordinate_signals(carrier, "amplitude", 0), *foundation_forces(carrier)]
     about = _IN_JAM.format(omega=float(jam.omega), speed=float(jam.rotor_speed))

@@ -6,7 +6,7 @@ import contextlib
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,10 +22,10 @@ from jaxvib.motion.start import Start
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, sentence
+from jaxvib.runtime.parallel import in_parallel
 from jaxvib.sweeps.axes import AxisSpec
 from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, CaseStatus, Study, SweepStatus
-from jaxvib.sweeps.execute import Report, in_this_process, timed
-from jaxvib.sweeps.program import traced_program
+from jaxvib.sweeps.program import compute, traced_program
 from jaxvib.sweeps.store import ChunkState, Store
 from jaxvib.sweeps.study import Measures, study
 from jaxvib.units import Number, count
@@ -36,6 +36,26 @@ if TYPE_CHECKING:
 
 _MAX_WORKERS = 16
 """Maximum number of worker processes on a machine with few cores; with more than four cores, four for each core."""
+
+
+class Progress(NamedTuple):
+    """Progress of a sweep.
+
+    **Attributes**
+
+    - `done`: number of finished cases of `cases`, including those of earlier calls
+    - `rate`: cases per second in this call
+    - `left`: estimated seconds until the end
+    """
+
+    done: int
+    cases: int
+    rate: float
+    left: float
+
+
+Report = Callable[[Progress], None]
+"""Type of a function that is called after every chunk."""
 
 
 class CaseCount(NamedTuple):
@@ -246,11 +266,11 @@ def _compute_missing(
         kept.clear(int(chunk))
     finished = states == ChunkState.finished
     sizes = np.asarray([_cases(new_study, chunk) for chunk in range(finished.size)])
-    add = timed(new_study.grid.cases, int(np.sum(sizes[finished])), report)
+    add = _reporter(new_study.grid.cases, int(np.sum(sizes[finished])), report)
     todo = np.flatnonzero(~finished).tolist()
     if todo:
         if workers is None and scheduler is None:
-            source = in_this_process(new_study, todo)
+            source = in_parallel(lambda chunk: compute(new_study, chunk), todo)
         else:
             from jaxvib.sweeps.cluster import on_a_cluster  # needs Dask
 
@@ -261,6 +281,20 @@ def _compute_missing(
                 add(int(sizes[chunk]))
     states[:] = ChunkState.finished
     return _sweep_result(kept, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged])))
+
+
+def _reporter(cases: int, done: int, report: Report | None) -> Callable[[int], None]:
+    """Return a function that takes the number of cases of each finished chunk and reports the progress."""
+    begun, before, now = time.perf_counter(), done, done
+
+    def add(more: int) -> None:
+        nonlocal now
+        now += more
+        if report is not None:
+            rate = (now - before) / max(time.perf_counter() - begun, 1e-9)
+            report(Progress(now, cases, rate, (cases - now) / rate))
+
+    return add
 
 
 def _cases(new_study: Study, chunk: int) -> int:

@@ -11,9 +11,8 @@ from PIL import Image
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.show.layout import Tie, order_of_ties
 from jaxvib.show.motion import motion_of_orbit, motion_of_run
-from jaxvib.show.views import view_of
+from jaxvib.show.views import Tie, order_of_ties, view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest
 
 SCENE = jv.Scene(

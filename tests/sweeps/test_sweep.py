@@ -11,7 +11,8 @@ import zarr
 from scenes import published, scene
 
 import jaxvib as jv
-from jaxvib.sweeps import execute, program
+from jaxvib.sweeps import program
+from jaxvib.sweeps import sweep as sweep_module
 from jaxvib.sweeps.study import study
 from jaxvib.sweeps.sweep import run_study
 from optimize import Quantity, jam_frequency
@@ -101,7 +102,7 @@ def test_neither_chunks_nor_neighbours_change_a_number(whole, tmp_path):
 def test_interrupted_anywhere_and_resumed_it_is_the_same_store(whole, tmp_path, monkeypatch):
     store, computed = tmp_path / "study.zarr", []
     real = program.compute
-    monkeypatch.setattr(execute, "compute", lambda *a: computed.append(a[1]) or real(*a))
+    monkeypatch.setattr(sweep_module, "compute", lambda *a: computed.append(a[1]) or real(*a))
 
     def stop(now):
         raise KeyboardInterrupt

@@ -13,8 +13,7 @@ from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError, quoted
 
 if TYPE_CHECKING:
-    from jaxvib.sweeps.execute import Progress
-    from jaxvib.sweeps.sweep import Sweep
+    from jaxvib.sweeps.sweep import Progress, Sweep
 
 _QUIET = 10.0
 """Time between lines of progress, s, if the output is not a terminal."""
