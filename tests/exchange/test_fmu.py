@@ -314,6 +314,21 @@ def test_written_operations_equal_jax(tmp_path):
         np.testing.assert_allclose(list(found), np.array(operations(jnp.asarray(x), jnp.asarray(y))), rtol=1e-14)
 
 
+def test_events_are_comparisons_of_changing_real_numbers():
+    """A comparison of parameters changes at no event between two communication points, nor does one of whole numbers."""
+
+    def operations(parameter, x):
+        return (
+            jnp.maximum(parameter, 0.2) + jnp.clip(parameter, 0.0, 1.0),
+            jnp.maximum((3.0 * x).astype(int), 1),
+            jnp.maximum(x, 0.4),
+        )
+
+    program = scalar_program(operations, jnp.asarray(0.5), jnp.asarray(0.25))
+    written = write_program(program, ["p", "x"], 1, ["y[0]", "y[1]", "y[2]"], has_events=True)
+    assert written.branches == 1 and [line for line in written.body if "indicators" in line] == ["indicators[0] = x - 0.4;"]
+
+
 @needs_compiler
 def test_force_on_a_platform_enters_its_equation(opened):
     found = exported("two masses")

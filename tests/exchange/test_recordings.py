@@ -252,6 +252,7 @@ def test_rate_of_a_recording_does_not_depend_on_its_start(tmp_path):
     (tmp_path / "run.csv").write_text("time [s],frame [g]\n" + "\n".join(rows) + "\n")
     (found,) = map(overview_of, jv.read_recording(tmp_path / "run.csv"))
     assert found.rate == pytest.approx(100.0, rel=1e-6) and (found.start, found.end) == (5.0, 6.99)
+    assert (found.low, found.high) == pytest.approx((-1.0, 1.0), abs=0.02) and found.low < 0.0 < found.high
 
 
 def test_file_above_the_limit_of_size_is_refused(tmp_path, monkeypatch):

@@ -86,6 +86,13 @@ def test_responses_have_a_reference_for_each_exciter(home):
     np.testing.assert_allclose(read[1].values, read[2].values, rtol=1e-9, atol=1e-16)  # reciprocity
 
 
+def test_nodes_of_a_matrix_model_are_the_places_of_its_exciters(home):
+    machine = jv.from_matrices(np.diag([2.0, 3.0]), np.diag([4.0, 5.0]), np.diag([2e4, 8e4]), places=[[0], [1]])
+    exciters = [jv.Exciter(at=at, drive=jv.ConstantSpeed(50.0), unbalance=0.01) for at in (1, 2)]
+    read = jv.read_uff(jv.export_uff(jv.Scene(machine, exciters=exciters), home / "matrices.unv", frequencies=[1.0, 2.0]))
+    assert read.nodes == {1: (1.0, 0.0, 0.0), 2: (2.0, 0.0, 0.0)}
+
+
 def test_histories_of_a_body_are_those_of_its_points(home):
     run = jv.simulate(screen(), 1.0, estimate=False)
     read = {e.response: e for e in jv.read_uff(jv.export_uff(run, home / "screen_run.unv")).functions if e.kind == "history"}

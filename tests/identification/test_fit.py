@@ -8,6 +8,7 @@ import pytest
 from run_ups_by_scipy import TOP, TRUTH, Ramp, accelerations, bound, free_motions, ramp, record, scene_of
 
 import jaxvib as jv
+from jaxvib.identification.directions import _in_common_factor
 
 T = 0.002 * np.arange(8000)
 NOISE = 0.05
@@ -54,6 +55,7 @@ def test_fit_finds_the_numbers_from_wrong_first_values():
     np.testing.assert_allclose(fit.noise[0], NOISE, rtol=0.03)
     assert fit.estimate("machine.link_stiffness[0]").error < 40.0
     np.testing.assert_allclose(fit.scene.machine.stiffness, [5e4, 6e4], rtol=3e-3)
+    assert float(fit.scene.exciters[0].unbalance) == pytest.approx(fit.estimate("exciters[0].unbalance").value, rel=1e-12)
 
 
 def test_model_agrees_with_scipy_without_noise():
@@ -103,6 +105,12 @@ def test_common_factor_of_all_numbers_is_undetermined():
     model = jv.natural_frequencies(scene_of(TRUTH))
     np.testing.assert_allclose([each.value for each in fit.frequency], model, rtol=1e-3)
     assert all(each.error < 1e-3 * each.value for each in fit.frequency)
+
+
+def test_places_and_torques_do_not_share_the_common_factor():
+    inside = ("machine.mass[0]", "machine.link_damping", "exciters[1].unbalance", "exciters[0].drive.inertia")
+    assert all(map(_in_common_factor, inside))
+    assert not any(map(_in_common_factor, ("machine.supports[0].angle", "machine.supports[1].at[0]")))
 
 
 def test_known_mass_that_is_added_determines_all_numbers():

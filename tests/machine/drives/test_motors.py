@@ -144,6 +144,8 @@ def test_speed_profile_is_consistent_with_its_derivatives():
         assert float(jax.grad(drive.speed_at)(t)) == pytest.approx(float(drive.acceleration_at(t)), rel=1e-12)
     assert float(drive.angle_at(9.0)) == pytest.approx(20.0 + 60.0 + 400.0 + 100.0, rel=1e-12)
     assert float(drive.speed) == 100.0
+    kept = jv.SpeedProfile([1.0, 2.0], [20.0, 100.0])
+    assert float(kept.angle_at(5.0)) == pytest.approx(20.0 + 60.0 + 300.0, rel=1e-12)
 
 
 def test_converter_follows_its_ramp():
