@@ -57,7 +57,7 @@ def agreement_maps(
             log_ticks(axis)
         axis.set_xlabel(f"rotor speed, {unit}")
         axis.set_title(title, loc="right", fontsize="medium")
-    axes[0].set_ylabel("load mass, times the scene's")
+    axes[0].set_ylabel("load mass / load mass of the scene")
     entries = [Patch(color=colour, label=label) for label, colour in _KINDS]
     if ax is None:
         figure.legend(handles=entries, loc="outside upper left", ncols=2, fontsize="small", frameon=False)

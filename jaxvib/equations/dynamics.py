@@ -190,7 +190,7 @@ def vector_field(scene: Scene) -> Dynamics:
 
     Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,
     equation (1). The gyroscopic force depends on the rotor speed only. The term of the rotor's acceleration, C theta'' psi / 2,
-    is neglected as in the paper.
+    is neglected as by Artyunin.
     """
     return dynamics_of(assemble(validate_scene(scene)))
 

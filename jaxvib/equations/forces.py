@@ -182,8 +182,8 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
         M_j = b_W R^2 (speed - phi_j') + friction
 
     T is the torque with which an ideal drive turns its rotor against loads, their spin and the imbalance d. Loads that slide
-    dissipate in addition the power -F_t.c of the contact force F_t at the slip c. The rate of the energy is the difference,
-    dE/dt = P_in - P_diss.
+    dissipate in addition the power -F_t.c of the contact force F_t at the sliding velocity c. The rate of the energy is the
+    difference, dE/dt = P_in - P_diss.
 
     **Arguments**
 

@@ -158,7 +158,7 @@ class UnbalancedModel(ExcitedModel):
 
     @property
     def highest_speed(self) -> Array | None:
-        """Speed without a load, up to a small distance; None if an ideal drive turns an unbalance."""
+        """No-load speed, up to a small distance; None if an ideal drive turns an unbalance."""
         if any(self.balance.is_prescribed):
             return None
         return self.balance.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
@@ -260,7 +260,7 @@ def response_of(balance: TorqueBalance, omega: Array) -> Array:
 
 
 def torques_at(unbalance: Array, influence: Array, omega: Array, turn: Array) -> Array:
-    """Return V (count,) N m from unbalances (count,), influence coefficients (count, count) and exp(i alpha) (count,)."""
+    """Return V (count,), N m, from unbalances (count,), influence coefficients (count, count) and exp(i alpha) (count,)."""
     return mean_torque(unbalance, -(omega**4) * jnp.conj(turn) * times(influence, unbalance * turn))
 
 

@@ -42,7 +42,7 @@ _AT_REST = (
 )
 _IN_JAM = (
     "averaged equations linearized about a jam at the load speed {omega:.6g} rad/s and the rotor speed {speed:.6g} rad/s; "
-    "signals are deviations from the operating point and change slowly against the vibration; amplitudes are zero to peak; "
+    "signals are deviations from the operating point, slow compared with the vibration; amplitudes are zero to peak; "
     "the common phase of all loads is left out"
 )
 

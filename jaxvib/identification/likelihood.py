@@ -50,8 +50,8 @@ class _Profile:
     floor: float
 
     def rise(self, distance: float, is_exact: bool) -> float:
-        """Return the rise of the cost at a `distance` in standard errors. The others are fitted if `is_exact`, otherwise they
-        follow the quadratic form, but for the linear ones."""
+        """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted;
+        otherwise only the linear ones are fitted, and the others follow the quadratic form."""
         target = self.center + distance * self.spread
         problem, own_cost = self._held(target)
         x = self.fitted.x + distance * self.spread * self.slopes

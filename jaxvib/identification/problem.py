@@ -354,7 +354,7 @@ def with_noise(problem: Problem, noise: Sequence[Sequence[Noise]], differences: 
                 moved, factor = limited(white, valid, each.outliers, each.width)
                 readings[:n, k] += np.where(valid, each.deviation * (moved - white), 0.0)
                 weights[:n, k] /= factor
-            if longest == 1:  # the bound of a reading says little if the noise has a memory
+            if longest == 1:  # the bound of a reading says little if the noise is coloured
                 at = np.flatnonzero(problem.bounds[r][:, k])
                 side = problem.bounds[r][at, k]
                 moved, weight = bounded(side * differences[r][at, k] / each.deviation)

@@ -93,7 +93,7 @@ class Samples(eqx.Module):
     - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
     - `taps` (m + 1, C): filter of the model's readings
     - `step` h, s
-    - `amounts`: what the run adds to, sets or multiplies the numbers `changed` of the scene by
+    - `amounts` by which the `actions` change the numbers `changed` of the scene in this run
     - `channels` that are compared, `changed` and `actions`, `turn`: index of the run's unknown zero of the angle, or None
     - `errors`: place of the first error of the rotor's angle among the unknowns, and their number
     """

@@ -23,7 +23,8 @@ _KINDS = {1: "one_mass", 2: "two_mass", 3: "three_mass"}
 
 
 class Dimensionless(eqx.Module):
-    """Platform machine in the dimensionless parameters of the papers; the exciter is on platform 2, or on the only platform.
+    """Platform machine in the dimensionless parameters of the antiphase paper or the criterion paper (see the source). The
+    exciter is on platform 2, or on the only platform.
 
     With the exciter's total mass M2S = M2 + N m (loads included), time tau = w t, unbalance scale s~ and length y~ = s~/M2S:
 
@@ -106,7 +107,7 @@ class Dimensionless(eqx.Module):
         n_i = numbers(natural, "", "natural", None, low=0.0)
         n = 1 if n_i.ndim == 0 else n_i.shape[0]
         if n not in _LINKS:
-            raise InputError("natural", f"has {n} values; the papers' machines have 1, 2 or 3 platforms")
+            raise InputError("natural", f"has {n} values; the machines of these papers have 1, 2 or 3 platforms")
         self.form = form
         self.count = whole(count, "count")
         self.natural = jnp.broadcast_to(n_i, (n,))

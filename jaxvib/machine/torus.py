@@ -157,8 +157,8 @@ def torus_balls(
     - `mass` m of a ball, kg, one number or N; typical: 0.03 to 0.1, steel balls of 10 to 15 mm radius
     - `radius` R of the tube's middle line, m; typical: 0.2
     - `tube`: radius of the tube's cross-section, m; typical: 0.015
-    - `ball_radius` r of a ball, m, less than `tube`; typical: 0.01 to 0.0145. The difference is the gap in which the ball's
-      angle in the cross-section moves
+    - `ball_radius` r of a ball, m, less than `tube`; typical: 0.01 to 0.0145. The difference is the gap, in which the ball
+      moves up and down the wall
     - `drag`: viscous resistance against the wall at the ball's centre, N s/m, one number or N; typical: 0 (the default) in air,
       0.5 to 5 in oil
 

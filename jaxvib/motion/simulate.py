@@ -77,8 +77,8 @@ def simulate(
     - `estimate`: True to estimate the `error` of the run by a second run with larger steps, which needs about half as many
       evaluations. The default is True, but False under a JAX transformation and with a step size controller of diffrax
     - `stepsize_controller`: choice of the steps, see below
-    - `solver` and `adjoint` of diffrax. The default solver is `Rodas4` for scenes in which loads or carrier decay 100 times as
-      fast as the motion (not under a JAX transformation), otherwise the method of Dormand and Prince of order 8:
+    - `solver` and `adjoint` of diffrax. The default solver is `Rodas4` for scenes in which drag or damping causes a decay 100
+      times as fast as the motion (not under a JAX transformation), otherwise the method of Dormand and Prince of order 8:
       `UnrolledDopri8`, or `LoopDopri8` for large scenes and under JAX transformations. The default adjoint gives reverse
       derivatives of exactly the steps that were taken. Forward derivatives, `diffrax.ForwardMode()`, take less time for up to
       about ten parameters

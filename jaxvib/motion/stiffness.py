@@ -34,7 +34,7 @@ _MAX_IMPLICIT_SIZE = 64
 
 @cached
 def fastest_decay(scene: Scene) -> Array:
-    """Return the fastest decay rate, 1/s, of the loads by drag and of the carrier by damping.
+    """Return the fastest decay rate, 1/s, due to the drag of the loads or the damping of the carrier.
 
         max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j),      the largest eigenvalue of M^-1 C
 
@@ -54,7 +54,7 @@ def fastest_decay(scene: Scene) -> Array:
 
 
 def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
-    """Return the fastest rate of decay of the loads of an exciter, 1/s; `accelerance` mu of its place."""
+    """Return the fastest decay rate due to the drag of an exciter's loads, 1/s; `accelerance` mu of its place."""
     angle = tuple(jnp.broadcast_to(jnp.asarray(x, speed.dtype), (loads.count,)) for x in loads.rest())
     turning = tuple(jnp.full_like(x, speed) if i == 0 else jnp.zeros_like(x) for i, x in enumerate(angle))
     kappa, metric = loads.inertia_factor(), kinematics(loads, angle, turning).metric

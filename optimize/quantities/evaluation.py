@@ -35,7 +35,7 @@ _RUN_UP_SAMPLES = 4000
 
 
 class Case(Protocol):
-    """Scenes that are derived from the scene of a design: a load case, an operating point, or samples of tolerances."""
+    """Scenes that are derived from the scene of a design: a load case, or samples of tolerances."""
 
     def scenes(self, scene: Scene) -> Scene:
         """Return the scene in this case; if the case has several scenes, its arrays have a leading axis."""

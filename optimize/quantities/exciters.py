@@ -279,7 +279,7 @@ def _distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
 
 
 def least_torque() -> Quantity:
-    """Return the factor by which the torques of all motors can be multiplied until they just pass the resonances on the way up.
+    """Return the smallest factor of the torques of all motors with which they still pass the resonances on the way up.
 
         max_r max_w (w^4/2) sum_ik S_i S_k |A_ik(w)| / sum_i L_i(w),      A = (H^H - H)/(2 i),    w near w_r
 

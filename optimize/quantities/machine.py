@@ -28,7 +28,7 @@ def _make_quantity(name: str, unit: str, function: Callable[..., Array], text: s
 
 
 def support_frequency_squared() -> Quantity:
-    """Return the stiffness budget of the supports, (rad/s)^2: sum_i k_i/M_i over the platforms, n_1^2 + n_2^2 in the papers.
+    """Return the stiffness budget of the supports, (rad/s)^2: sum_i k_i/M_i over the platforms, n_1^2 + n_2^2 in the source.
 
     M_i includes the mass of the loads.
 

@@ -34,7 +34,8 @@ _UNREACHABLE_DECREASE = 1e-10
 of exact motions have this size."""
 
 _HIDDEN_DECREASE, _ROUNDING = 1e-13, 1e-15
-"""Relative decrease of the objective that rounding can hide, and relative rounding error of the objective."""
+"""Relative decrease of the objective that can be smaller than its rounding error, and relative rounding error of the
+objective."""
 
 _KINK_STEPS = 4
 """Number of first-order steps that move a design back onto a kink."""
@@ -302,7 +303,8 @@ def _dual(model: Step) -> np.ndarray:
 def _move(
     problem: Problem, searches: _Searches, index: np.ndarray, here: Point, models: list[Step], penalty_is_small: np.ndarray
 ) -> None:
-    """Take the better one of the steps if it improves the design, adapt the trust region, and end searches at rest."""
+    """Take the better one of the steps if it improves the design, adapt the trust region, and end searches that
+    make no further progress."""
     size, penalty, radius = searches.size[index], searches.penalty[index], searches.trust_radius[index]
     remaining_decrease = searches.remaining_decrease[index]
     trials = [_trial_point(problem, here, each, size, penalty) for each in models]
@@ -331,7 +333,8 @@ def _is_better(
     predict."""
     kept = violation(problem, new) < np.maximum(FEASIBILITY_TOLERANCE, violation(problem, here))
     better = new_merit < merit
-    # The last step converges quadratically: rounding hides the decrease of the objective, but derivatives are still exact.
+    # The last step converges quadratically: the decrease of the objective is below its rounding error, but derivatives are
+    # exact.
     better |= kept & (remaining_decrease < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
     better |= kept & (violation(problem, here) > FEASIBILITY_TOLERANCE) & new.exists()
     return better

@@ -54,8 +54,8 @@ def audit(
     """Report by how much each effect and each tier changes the results of SCENE, and their cost: negligible and missing
     effects.
 
-    Each effect of the scene is removed in turn, and each effect that it lacks is added with typical values. --out adds the
-    figure."""
+    The effects of the scene are removed one at a time, and each effect that it lacks is added with typical values. --out adds
+    the figure."""
     if count_operations:
         from jaxvib.study.audit.operation_counts import operation_counts  # slow import, which --help does not need
 

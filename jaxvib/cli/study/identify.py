@@ -52,9 +52,9 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Identify numbers of a machine from recorded runs, or the friction of a bearing from a recorded swing.
 
     RECORD is an identification file (TOML) that names a scene file, recorded runs and their channels; --out adds the fitted
-    scene (found.toml), the picture and the fit (fit.npz). For a bearing, it is a CSV file of time and angle of a pendulum that
-    swings down on it, or a measurement file (TOML) that names one; options replace the values in the file, and --out adds the
-    picture and the fit (fit.csv)."""
+    scene (found.toml), the picture and the fit (fit.npz). For a bearing, it is a CSV file of time and angle of a pendulum whose
+    swing on the bearing decays, or a measurement file (TOML) that names one; options replace the values in the file, and --out
+    adds the picture and the fit (fit.csv)."""
     import numpy as np  # slow imports, which --help does not need
 
     from jaxvib.machine.files import read_toml

@@ -110,7 +110,7 @@ def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes |
         color = COLORS[k % len(COLORS)]
         axis.plot(factor * x, factor * y, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)
         axis.plot(factor * x[-1:], factor * y[-1:], "o", color=color, mec="black", zorder=3)
-    axis.plot([], [], "o", color="white", mec="black", label="where it ends")
+    axis.plot([], [], "o", color="white", mec="black", label="end of the path")
     axis.plot([0.0], [0.0], "+", color="black", ms=9.0)
     axis.set_aspect("equal", adjustable="datalim")
     axis.locator_params(nbins=6)

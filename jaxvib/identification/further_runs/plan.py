@@ -81,7 +81,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
       the mark of the runs so far
     - The model of the fit gives the expected readings. An added mass, other places of sensors, and sensors that change places
       are `change` and `channels` of a candidate
-    - With `limits`, the speed of the best candidate is varied at 9 evenly spaced times so that the errors become small, by
+    - With `limits`, the speeds of the best candidate at 9 evenly spaced times are optimized for the smallest errors, by
       gradients and sequential quadratic programming. The result is one more candidate, of the same duration, if it is better
 
     **Arguments**

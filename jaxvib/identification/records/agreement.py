@@ -32,7 +32,7 @@ _OTHER_UNITS = {
 """Units that a file may have in place of the stated one."""
 
 _SPEED_ERROR, _MOTION_ERROR, _UNIT_ERROR = 0.03, 0.3, 0.15
-"""Largest relative differences between two speeds and between two motions, and between the latter if another unit explains
+"""Largest relative differences between two speeds and between two motions, and between two motions if another unit explains
 them."""
 
 _COHERENT, _STRONG = 0.9, 1e-3

@@ -46,12 +46,12 @@ class TorqueTable(Motor):
         self.speeds, self.torques = _points(TorqueTable, speeds=speeds, torques=torques)
         self.inertia = read_numbers(TorqueTable, "drive", inertia=inertia)["inertia"]
         self.kind = "torque_table"
-        problem = "must begin with a positive torque and end with 0 or a negative one, at the motor's speed without a load"
+        problem = "must begin with a positive torque and end with 0 or a negative one, at the no-load speed of the motor"
         require_if_known(lambda torques: torques[0] > 0.0 >= torques[-1], self.torques, field="drive.torques", problem=problem)
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Speed without a load: the last one at which the torque becomes 0, rad/s."""
+        """No-load speed: the last one at which the torque becomes 0, rad/s."""
         torque, after = self.torques[:-1], self.torques[1:]
         is_zero = (torque > 0.0) & (after <= 0.0)  # within the segment
         share = torque / jnp.where(is_zero, torque - after, 1.0)
@@ -160,7 +160,7 @@ class Converter(MotorWrapper):
 
         T(t, theta') = T_motor(theta' + n_motor - n(t))
 
-    n_motor is the motor's own speed without a load (`motor.speed`). With the converter the torque depends on theta' - n(t) as
+    n_motor is the motor's own no-load speed (`motor.speed`). With the converter the torque depends on theta' - n(t) as
     without it on theta' - n_motor. This is exact for a `DCMotor` whose voltage is changed, and for Kloss's formula at constant
     flux (voltage in proportion to the frequency).
 

@@ -25,7 +25,7 @@ class Drive(Part):
 
     **Attributes**
 
-    - `speed`: working speed without a load, rad/s; typical: 60 to 320 (600 to 3000 rpm)
+    - `speed`: working speed, for a motor its no-load speed, rad/s; typical: 60 to 320 (600 to 3000 rpm)
     - `kind`: its name in scene files
 
     An `IdealDrive` prescribes the rotor speed. With a `Motor` the rotor's angle and speed are states.
@@ -387,7 +387,7 @@ class DCMotor(Motor):
 
     **Arguments** (SI, or strings with a unit; all greater than 0)
 
-    - `speed` without a load, rad/s; typical: 100 to 320 (1000 to 3000 rpm)
+    - `speed`: no-load speed, rad/s; typical: 100 to 320 (1000 to 3000 rpm)
     - `stall_torque`, N m; typical: 1 to 50
     - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
@@ -410,7 +410,7 @@ class DCMotor(Motor):
         self.kind = "dc_motor"
 
     def torque(self, speed: Array) -> Array:
-        """Return the torque on the straight line from the stall torque to 0 at the speed without a load."""
+        """Return the torque on the straight line from the stall torque to 0 at the no-load speed."""
         return self.stall_torque * (1.0 - speed / self.speed)
 
 
@@ -473,7 +473,7 @@ class MotorWrapper(Motor):
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Speed of the motor without a load."""
+        """No-load speed of the motor."""
         return self.motor.speed
 
     @property

@@ -140,7 +140,7 @@ class DCMotorElectrical(Motor):
 
     @property
     def speed(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Speed without a load, V/K."""
+        """No-load speed, V/K."""
         return self.voltage / self.torque_constant
 
     def torque(self, speed: Array) -> Array:

@@ -226,12 +226,13 @@ class StaticImbalance(Effect):
 class MomentImbalance(Effect):
     """Moment imbalance: the rotor's principal axis is inclined to its axis of rotation by a small angle delta.
 
-    The moment about the tilts of the machine is - (A - C) delta d^2/dt^2 (cos(theta + angle), sin(theta + angle)).
+    The moment about the tilts of the machine is - (A - C) delta d^2/dt^2 (cos(theta + angle), sin(theta + angle)). theta is the
+    rotor's angle, A the transverse and C the polar moment of inertia of the rotor.
 
     **Arguments** (SI, or strings with a unit)
 
     - `moment` (A - C) delta, kg m^2, of either sign; typical: 1e-5 to 1e-3
-    - `angle` (- gamma in the paper), rad; typical: 0 (the default)
+    - `angle` (- gamma in the source), rad; typical: 0 (the default)
 
     **Raises** `InputError` for a wrong unit. A scene raises it for a machine that cannot tilt.
 

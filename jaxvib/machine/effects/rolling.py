@@ -38,7 +38,7 @@ class RollingFriction(Effect):
 
     - `coefficient` k, m, at least 0; typical: about 2e-5 to 4e-5 for steel balls on steel, 0 for none
     - `direction`: "along" the rolling (the default), or "each": for each coordinate separately, d_i = tanh(v_i/width), as
-      printed in the paper, so that motion around the axis does not reduce the friction against motion in the cross-section
+      printed in the source; motion around the axis then does not reduce the friction against motion in the cross-section
     - `width`, m/s: range of speeds v over which the sign is smoothed; typical: 0.01 (the default) to 0.1. A smaller width is
       more exact and needs more steps
 

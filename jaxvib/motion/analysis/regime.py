@@ -74,7 +74,7 @@ class Regime(Result):
       mean load speed. Mode 2 k begins at this frequency; mode 2 k + 1 ends at the next one, or at the rotor speed if that is
       lower. The estimate is the mode whose end is nearer to the mean load speed. Beyond the last of nd frequencies, loads close
       to the rotor speed are therefore in mode 2 nd + 1
-    - `caught`: True if the rotor itself stays at a resonance, below the speed at which its motor would turn without a load
+    - `caught`: True if the rotor itself stays at a resonance, below the no-load speed of its motor
     - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor speed; the motion
       is steady below 0.003
     """

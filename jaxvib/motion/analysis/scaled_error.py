@@ -22,8 +22,8 @@ def natural_units(scene: Scene) -> State:
     """Return the natural units of the state.
 
     They are the unbalance radius S/M for displacements, S/M times the rotor speed for velocities, 1 rad for angles, the rotor
-    speed for rates of angles, and, for a slip, the rotor speed times the distance of the loads from the axis. S is the
-    unbalance of the loads, or that of the rotor if it is larger.
+    speed for rates of angles, and, for a sliding velocity, the rotor speed times the distance of the loads from the axis. S is
+    the unbalance of the loads, or that of the rotor if it is larger.
     """
     carrier, pairs = scene.machine.carrier(), [_exciter_units(exciter) for exciter in scene.exciters]
     unbalances = [unbalance for each, _ in pairs for unbalance in each]

@@ -379,7 +379,8 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
     growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
-    # Half as many steps have at least 64 times the error: the order is 11 if all is resolved, and 6 if loads decay in a step.
+    # Half as many steps have at least 64 times the error: the order is 11 if all is resolved, and 6 if the motion of loads
+    # decays in a step.
     error = float(np.max(np.min(np.abs(fine[:, None] - coarse[None, :]), axis=1))) / 63.0
     # Neutral multipliers are 1; their difference from 1 is rounding, which grows with the number of steps.
     rounding = float(np.max(np.sort(np.abs(fine - 1.0))[:neutral], initial=fine.size * np.finfo(fine.real.dtype).eps))
@@ -473,7 +474,9 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
     """Return validated angles at which the loads cancel each other, and the number of their neutral directions."""
     sides = _sides(turning_loads(scene))
     if not np.min(np.asarray(natural_frequencies(scene))) > 0.0:
-        problem = "lets the machine drift; this neutral motion hides the growth or decay of the loads, add a support"
+        problem = (
+            "lets the machine drift; this neutral motion hides the growth or decay of deviations of the loads, add a support"
+        )
         raise InputError("machine.stiffness", problem)
     if angles is None:
         states = balanced_states(scene)

@@ -49,7 +49,7 @@ class PhaseBranch(Result):
         return (
             f"{np.sum(there)} of {omega.size} load speeds have a jam, {np.sum(np.asarray(self.stable))} a stable one, from "
             f"{speed_text([np.min(omega[there]), np.max(omega[there])], 6, ' to ')}, at {np.min(factor[there]):.4g} to "
-            f"{np.max(factor[there]):.4g} times the scene's drag"
+            f"{np.max(factor[there]):.4g} times the drag of the scene"
         )
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
@@ -62,7 +62,7 @@ class PhaseBranch(Result):
         from jaxvib.draw.phases import drag_diagram  # slow import
 
         alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
-        times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag, times the scene's")
+        times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag / drag of the scene")
         factor, omega, stable = drag_curve(self)
         curve = ("loads", times * factor, omega, stable)
         return drag_diagram([curve], float(self.rotor_speed), label=label, at=times, unit=unit, ax=ax)

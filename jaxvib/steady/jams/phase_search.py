@@ -108,7 +108,7 @@ class PhaseJams(AbstractPhaseJam):
                     factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE_DIFFERENCE * factor), np.nan, factor)
                 curves.append((sentence(jam.pattern), factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
-        label = "drag, times the scene's"
+        label = "drag / drag of the scene"
         return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN_DRAG_FACTOR, unit=unit, ax=ax)
 
 

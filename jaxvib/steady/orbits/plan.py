@@ -36,7 +36,7 @@ from jaxvib.units.known import is_known
 __all__ = ["OrbitPlan", "SynchronousPlan", "plan_orbit", "plan_synchronous"]
 
 _COLLOCATION_POINTS = (16, 32, 64, 128)
-"""Collocation points on half a period, tried in turn until the accuracy is reached."""
+"""Collocation points on half a period, tried one after the other until the accuracy is reached."""
 
 _BYTES_PER_POINT = 16.0
 
@@ -47,9 +47,9 @@ class OrbitPlan:
 
     **Attributes**: the `scene`; `given`: the name of the prescribed speed; its `value`, and the `start` of the other speed,
     rad/s; `exists`: true if the mode exists in leading order; `direction`: the sign of dn/dOmega that the mode needs, or None;
-    `mode`: its number, or None; `points`: numbers of collocation points to try in turn; relative `accuracy`; `implicit`: true
-    for implicit integration of the multipliers; `is_known`: true if no parameter is traced; `is_settled_first`: true if
-    Newton's method starts from the motion at the load speed `start`.
+    `mode`: its number, or None; `points`: numbers of collocation points to try one after the other; relative `accuracy`;
+    `implicit`: true for implicit integration of the multipliers; `is_known`: true if no parameter is traced;
+    `is_settled_first`: true if Newton's method starts from the motion at the load speed `start`.
     """
 
     scene: Scene
@@ -152,7 +152,7 @@ def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
 
 
 _SYNCHRONOUS_POINTS = (17, 33, 65, 129)
-"""Collocation points on a period, tried in turn until the accuracy is reached."""
+"""Collocation points on a period, tried one after the other until the accuracy is reached."""
 
 _SYNCHRONOUS_TERMS = (GravityField, LoadPotential, RotorImbalance, ContactFriction, SupportForce)
 """Terms that exact synchronous motions include."""
@@ -163,7 +163,7 @@ class SynchronousPlan:
     """Plan of an exact synchronous motion.
 
     **Attributes**: the `scene` with its drives in their final state; starts of `speed`, rad/s, and `phases` (N,), rad; numbers
-    of collocation `points` to try in turn; relative `accuracy`; `is_known`: True if no parameter is traced.
+    of collocation `points` to try one after the other; relative `accuracy`; `is_known`: True if no parameter is traced.
     """
 
     scene: Scene

@@ -71,7 +71,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 
 
 def _ends_before(scene: Scene, low: float, high: float, target: float, looks: int = 2) -> bool:
-    """Return True if the exact branch turns back, between two load speeds, before it reaches the rotor speed `target`.
+    """Return True if the exact branch has a fold between two load speeds, before it reaches the rotor speed `target`.
 
     The fold is bracketed in smaller and smaller intervals; the zero of the slope locates it to rounding.
     """

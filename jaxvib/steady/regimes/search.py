@@ -167,14 +167,15 @@ def _related(phases: np.ndarray, prescribed: np.ndarray) -> np.ndarray:
 
 
 def _solutions(balance: TorqueBalance, omega: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return speeds, phases and numbers of neutral directions of the solutions to which starts (n,), (n, count) lead."""
+    """Return speeds, phases and numbers of neutral directions of the solutions to which starts lead: speeds (n,), phases (n,
+    count)."""
     omega, phases, neutral, good = in_chunks(_STARTS_PER_PROGRAM, _solved, omega, phases, shared=(balance,))
     return omega[good], phases[good], neutral[good]
 
 
 @cached
 def _solved(omega: Array, phases: Array, balance: TorqueBalance) -> tuple[Array, Array, Array, Array]:
-    """Return `solve_near` for starts (n,), (n, count)."""
+    """Return `solve_near` for starts: speeds (n,) and phases (n, count)."""
     return jax.vmap(lambda w, phase: solve_near(w, phase, balance))(omega, phases)
 
 

@@ -225,7 +225,7 @@ def ten_periods(
       interval; typical: 0.01 to 0.03 (default 0)
     - `turns`: turning points of the record, if they are known already
 
-    **Returns** `Decrement`; typical: mu1 of 3e-4 to 2e-3 N m s, 0.0015 in the paper. **Raises** `InputError` if the record is
+    **Returns** `Decrement`; typical: mu1 of 3e-4 to 2e-3 N m s, 0.0015 in the source. **Raises** `InputError` if the record is
     shorter.
 
     >>> import numpy as np, jaxvib as jv

@@ -42,7 +42,7 @@ class IdentifyStatus(eqx.Enumeration):
     found = "the fit explains the record up to noise"
     patterned = "the residuals of the fit are not noise: the friction law is incomplete, and its numbers depend on the swing"
     negative = "a coefficient of friction is below 0: the swing grows, or its decay does not follow this law"
-    contradicted = "the period contradicts the length and inertia of the pendulum, and mu1 is proportional to them"
+    contradicted = "the period contradicts the length and inertia of the pendulum: check both, because mu1 is proportional to J"
     undetermined = "the record does not determine the friction: it is too short, too noisy, or has swings of one amplitude only"
     not_converged = "no fit was found: the record does not resemble a swing of this pendulum"
 
@@ -150,7 +150,7 @@ def identify_bearing(
     - `dry`: True to identify the dry friction mu2 as well (the pendulum then needs the diameter `bearing`)
     - `air`: True to identify b as well; `torque`: True to identify M as well. Only large swings distinguish M from the offset
     - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
-      intervals; typical: 0.01 to 0.03 (0.03 in the paper; default 0)
+      intervals; typical: 0.01 to 0.03 (0.03 in the source; default 0)
     - `throw`: raise if no fit is found
 
     **Returns** `Identified`. **Raises** `InputError` for a record that cannot be fitted, `ComputationError` "not_converged".

@@ -134,7 +134,7 @@ def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     """Return the state with the carrier at rest, and the loads side by side on the equator of the tube with a common speed.
 
     **Arguments**: `speed` psi'/w relative to the rotor, -1 for loads at rest in space; `shift`, rad, of the loads along the
-    ring, a scalar or (count,). The angle between neighbouring loads is 2 atan(r/R), as in the paper.
+    ring, a scalar or (count,). The angle between neighbouring loads is 2 atan(r/R), as in the source of `capture`.
 
     **Returns** `State`. **Raises** `InputError` for loads that are not in a torus.
 

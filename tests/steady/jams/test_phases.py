@@ -197,7 +197,7 @@ def test_figure_of_a_branch_is_solid_where_it_is_stable():
 def test_figure_of_all_jams_has_each_on_a_line():
     jams = jv.phase_jams(planar(), starts=8)
     (axis,) = jams.plot(unit="rad/s").axes
-    assert axis.get_xlabel() == "drag, times the scene's" and axis.get_xlim() == (1.0 / 30.0, 30.0)
+    assert axis.get_xlabel() == "drag / drag of the scene" and axis.get_xlim() == (1.0 / 30.0, 30.0)
     lines = [line.get_xydata() for line in axis.lines if len(line.get_xdata()) > 2 and line.get_linestyle() != "None"]
     for w in np.asarray(jams.omega):
         assert any(np.min(np.abs(line - [1.0, w])[np.isfinite(line[:, 0])].sum(axis=1)) < 1e-6 for line in lines)
