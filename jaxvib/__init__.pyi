@@ -58,7 +58,7 @@ from jaxvib.equations.linear import natural_frequencies
 from jaxvib.motion.start import initial_state, with_spin
 
 # Measures of a vibration
-from jaxvib.steady.measures import VibrationMeasures, conveying_speed, vibration_measures, vibration_zone
+from jaxvib.steady.measures import Vibration, VibrationMeasures, conveying_speed, vibration_measures, vibration_zone
 
 # Motion of points
 from jaxvib.motion.analysis.points import PointMotion
@@ -252,6 +252,7 @@ __all__ = [
     "normal_force",
     # Measures of a vibration
     "vibration_measures",
+    "Vibration",
     "VibrationMeasures",
     "vibration_zone",
     "conveying_speed",

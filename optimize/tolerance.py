@@ -128,17 +128,17 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
     for text in tolerances:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
-            raise InputError("tolerance", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+            raise InputError("tolerances", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
         if share := _SHARE_PATTERN.fullmatch(value):
             size = float(share[1]) / 100.0
             if not 0.0 < size < 1.0:
-                raise InputError("tolerance", f"is {quoted(text)}; the share must be greater than 0 % and less than 100 %")
+                raise InputError("tolerances", f"is {quoted(text)}; the share must be greater than 0 % and less than 100 %")
             short = [each for each in _SHORT_NAMES.get(name, ()) if each in there]
-            errors += [(each, size) for each in short or [find_number(scene, name, "tolerance").name]]
+            errors += [(each, size) for each in short or [find_number(scene, name, "tolerances").name]]
         elif ends := _RANGE.fullmatch(value):
             ranges.append(_range(scene, name, ends[1], ends[2]))
         else:
-            raise InputError("tolerance", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+            raise InputError("tolerances", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
     random = random_numbers(seed)
     batch = Sampled(tuple(errors), samples, seed).scenes(scene) if errors else None
     shares = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
@@ -154,10 +154,10 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
 def _range(scene: Scene, name: str, low: str, high: str) -> _NumberRange:
     """Return a range; its first end may lack the unit of the second."""
     material = _MATERIAL.fullmatch(name)
-    found = find_number(scene, f"machine.mass[{int(material[1] or 1) - 1}]" if material else name, "tolerance")
+    found = find_number(scene, f"machine.mass[{int(material[1] or 1) - 1}]" if material else name, "tolerances")
     unit = "".join(re.findall(r"[^\d.eE+\-\s].*$", high.strip()))
     ends = [low if re.search(r"[^\d.eE+\-\s]", low) else f"{low.strip()} {unit}".strip(), high]
-    first, last = (float(number(end.strip(), found.unit, f"tolerance.{name}")) for end in ends)
+    first, last = (float(number(end.strip(), found.unit, f"tolerances.{name}")) for end in ends)
     if not first < last:
-        raise InputError(f"tolerance.{name}", f"is {low}..{high}; the second must be larger than the first")
+        raise InputError(f"tolerances.{name}", f"is {low}..{high}; the second must be larger than the first")
     return _NumberRange(found, first, last, material is not None)

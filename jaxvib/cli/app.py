@@ -22,7 +22,19 @@ if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
     from optimize import ToleranceRange
 
-__all__ = ["SPEED", "TOLERANCE", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table", "tolerance_table"]
+__all__ = [
+    "SPEED",
+    "TOLERANCE",
+    "WITHOUT",
+    "Output",
+    "app",
+    "loaded_scene",
+    "ranges_within",
+    "run",
+    "shared",
+    "table",
+    "tolerance_table",
+]
 
 
 def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
@@ -91,6 +103,29 @@ TOLERANCE = click.option(
     help="Ranges over machines with deviations, repeatable: stiffness=5%, damping=30%, load=0..20kg (material on platform 1).",
 )
 """Option of commands that show ranges over machines within tolerances."""
+
+
+def ranges_within(scene: Scene, modes: Sequence[int] | None, tolerances: Sequence[str]) -> list[ToleranceRange]:
+    """Return the ranges of speed, amplitudes and foundation force in jam modes, or in the working regime if `modes` is None."""
+    if not tolerances:
+        return []
+    from optimize import amplitude, foundation_force, jam_frequency, tolerance_ranges
+    from optimize.quantities.exciters import working_amplitude, working_speed
+
+    count = len(scene.machine.structure().coordinates)
+    if modes is None:
+        quantities = [working_speed(), *(working_amplitude(scene, k) for k in range(count)), foundation_force()]
+        return tolerance_ranges(scene, quantities, list(tolerances))
+    quantities = [
+        quantity
+        for mode in modes
+        for quantity in (
+            jam_frequency(mode=mode),
+            *(amplitude(mode=mode, of=k + 1) for k in range(count)),
+            foundation_force(mode=mode),
+        )
+    ]
+    return tolerance_ranges(scene, quantities, list(tolerances))
 
 
 def tolerance_table(found: Sequence[ToleranceRange], tolerances: Sequence[str]) -> str:

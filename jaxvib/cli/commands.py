@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, loaded_scene, shared
-from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
+from jaxvib.cli.document import SEPARATION, chosen_steps, deck_options, run_document, run_measures
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
@@ -59,10 +59,11 @@ def new(kind: str, output: Output) -> None:
 @click.option("--mode", type=int, help="Number of the jam mode, with --start jam.")
 @SEPARATION
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
-@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-8].")
+@click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-8].")
 @click.option("--accuracy", type=float, help="Allowed error of the final state, in place of a tolerance.")
 @click.option("--max-steps", type=int, help="Largest number of time steps.")
 @click.option("--window", is_flag=True, help="Save only the measurements over the last turns, and no trajectory.")
+@deck_options
 @csv_options
 @shared
 def simulate(
@@ -71,6 +72,8 @@ def simulate(
     """Integrate the full equations of SCENE; --out saves the motion (run.npz) and its picture."""
     from jaxvib.ode.progress import ProgressBar  # slow import, which --help does not need
 
+    if tolerance is not None and accuracy is not None:
+        raise InputError("--accuracy", "cannot be combined with --step-tolerance; give one of them")
     if csv is not None and window:
         raise InputError("--csv", "needs a trajectory, which --window does not save; leave one of them out")
     loaded = loaded_scene(scene)
@@ -79,7 +82,7 @@ def simulate(
         output.end_waiting()
     run = jv.simulate(
         loaded,
-        stepsize_controller=chosen_steps(tolerance, accuracy),
+        stepsize_controller=chosen_steps(tolerance) if accuracy is None else jv.Accuracy(accuracy),
         save="window" if window else "all",
         progress_meter=meter,
         **options,
@@ -87,7 +90,8 @@ def simulate(
     output.picture("history.png", lambda: run.plot())
     output.keep("run.npz", run)
     output.csv(csv, run, "time")
-    output.done(run_document(run), run.summary, "simulate", run)
+    measures = run_measures(run)
+    output.done(run_document(run, measures), lambda: run.summary(measures), "simulate", run)
 
 
 def _long(scene: jv.Scene, until: str) -> bool:

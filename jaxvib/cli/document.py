@@ -1,6 +1,9 @@
-"""Common parts of commands with time integration: choice of steps, JSON documents of runs."""
+"""Common parts of commands: measures of a vibration, choice of steps, JSON documents of runs."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
 
 import click
 
@@ -14,12 +17,58 @@ SEPARATION = click.option(
 )
 
 
-def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:
-    """Return the step-size controller of the options. **Raises** `InputError` if both options are present."""
-    if tolerance is not None and accuracy is not None:
-        raise InputError("accuracy", "cannot be combined with tolerance; give one of them")
-    if accuracy is not None:
-        return jv.Accuracy(accuracy)
+_POINT = "jaxvib.deck_point"
+"""Name of the options in the context of click."""
+
+
+def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options --deck and --slope of commands that show the measures of a vibration, for `measures_of`."""
+
+    def keep(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+        if value is not None:
+            context.meta.setdefault(_POINT, {})[parameter.name] = value
+
+    slope = click.option(
+        "--slope", expose_value=False, callback=keep, help="Slope of the deck of a body in a plane, such as '-15 deg' [0]."
+    )
+    deck = click.option(
+        "--deck",
+        "at",
+        metavar="X,Y",
+        expose_value=False,
+        callback=keep,
+        help="Point of the deck of a body in a plane for throw and conveying speed, m, such as 1.5,0.1 [centre of mass].",
+    )
+    return deck(slope(command))
+
+
+def measures_of(scene: jv.Scene, motion: jv.Jam | jv.Vibration) -> jv.VibrationMeasures:
+    """Return the measures of a vibration, at the point of the option --deck.
+
+    **Raises** `InputError` for a point that is not two numbers, and for a machine that is not a body in a plane.
+    """
+    import jax  # slow import, which --help does not need
+
+    given = dict(click.get_current_context().meta.get(_POINT, {}))
+    if given and scene.machine.places != "plane":
+        raise InputError("--deck", f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
+    if "at" in given:
+        given["at"] = [part.strip() for part in given["at"].split(",")]
+    return jax.device_get(jv.vibration_measures(scene, motion, **given))
+
+
+def run_measures(run: jv.Run) -> jv.VibrationMeasures | None:
+    """Return the measures of a run; None if its window has too few turns."""
+    return measures_of(run.scene, run.vibration()) if run.has_vibration else None
+
+
+def indented(title: str, measures: jv.VibrationMeasures) -> str:
+    """Return the measures as text below a title."""
+    return "\n".join([title, *(f"  {line}" for line in measures.summary().splitlines())])
+
+
+def chosen_steps(tolerance: float | None) -> jv.Tolerance | None:
+    """Return the step-size controller of the option --step-tolerance."""
     return None if tolerance is None else jv.Tolerance(tolerance)
 
 
@@ -39,10 +88,11 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
     }
 
 
-def run_document(run: jv.Run) -> dict[str, object]:
+def run_document(run: jv.Run, measures: jv.VibrationMeasures | None) -> dict[str, object]:
     """Return the quantities of a run over its last turns, its error and its cost."""
     return {
         **measured_document(run, run.scene),
+        **({} if measures is None else {"measures": measures.document()}),
         **({"regime": _regime(run.regime)} if run.scene.is_plain else {}),
         **({} if run.trajectory is None else fields_of(run, "largest_displacement", "largest_force")),
         **fields_of(run, "coincident", "error", "evaluations", "seconds"),

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED, TOLERANCE, WITHOUT, Output, app, loaded_scene, shared, table, tolerance_table
+from jaxvib.cli.app import SPEED, TOLERANCE, WITHOUT, Output, app, loaded_scene, ranges_within, shared, table, tolerance_table
+from jaxvib.cli.document import indented, measures_of
 from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
-
-if TYPE_CHECKING:
-    from optimize import ToleranceRange
 
 
 @app.command("modes")
@@ -78,9 +75,9 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
     jams = [found.select(k) for k in found.mode_numbers()]
     growth = dict(zip(found.mode.tolist(), growth_of_free_loads(scene, found.omega).tolist(), strict=True))
     staying = [jam for jam in jams if bool(jam.stable) and not growth[int(jam.mode)] > 0.0]
-    measures = {int(jam.mode): jax.device_get(jv.vibration_measures(scene, jam)) for jam in staying}
+    measures = {int(jam.mode): measures_of(scene, jam) for jam in staying}
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
-    ranges = _ranges(scene, [int(jam.mode) for jam in staying], tolerances)
+    ranges = ranges_within(scene, [int(jam.mode) for jam in staying], tolerances)
     document = {
         "rotor_speed": scene.drive.speed,
         "resonances": found.resonances,
@@ -94,7 +91,7 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
             }
             for jam in jams
         ],
-        "measures": [_measures_document(jam, measures[int(jam.mode)]) for jam in jams if int(jam.mode) in measures],
+        "measures": [{"mode": mode, **each.document()} for mode, each in measures.items()],
         "folds": [{"omega": found.folds.omega[k], "rotor_speed": found.folds.rotor_speed[k]} for k in folds],
         **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {}),
     }
@@ -116,38 +113,13 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
         for mode, each in measures.items():
-            lines.append("\n".join([f"mode {mode}:", *(f"  {line}" for line in each.summary().splitlines())]))
+            lines.append(indented(f"mode {mode}:", each))
         if folds:
             pairs = [[f"{scale * found.folds.omega[k]:.5g}", f"{scale * found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
         return "\n".join([*lines, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
-
-
-def _ranges(scene: jv.Scene, modes: list[int], tolerances: tuple[str, ...]) -> list[ToleranceRange]:
-    """Return the ranges of load speed, amplitudes and foundation force in some modes."""
-    if not tolerances:
-        return []
-    from optimize import amplitude, foundation_force, jam_frequency, tolerance_ranges
-
-    count = len(scene.machine.structure().coordinates)
-    asked = [
-        quantity
-        for mode in modes
-        for quantity in (
-            jam_frequency(mode=mode),
-            *(amplitude(mode=mode, of=k + 1) for k in range(count)),
-            foundation_force(mode=mode),
-        )
-    ]
-    return tolerance_ranges(scene, asked, list(tolerances))
-
-
-def _measures_document(jam: jv.Jam, measures: jv.VibrationMeasures) -> dict[str, object]:
-    """Return the measures of a jam, with its mode."""
-    named = ("stroke", "acceleration", "velocity", "exciter_force", "transmissibility", "isolation_efficiency")
-    return {**fields_of(jam, "mode"), **fields_of(measures, *named, "static_load", "dynamic_load", "torque", "power")}
 
 
 def _left_out(scene: jv.Scene) -> list[str]:

@@ -27,6 +27,7 @@ from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torqu
 from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive
 from jaxvib.machine.effects.base import total_gravity
+from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve, times
 from jaxvib.runtime.programs import cached
@@ -179,8 +180,6 @@ def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
     """Assemble the model of a scene whose exciters have unbalances with `phases` (count,), rad."""
     balance = assemble_torque_balance(scene)
     model, turn = balance.model, jnp.exp(1j * phases)
-    each = balance.unbalance * turn
-    ways = [rotating_direction(mount, exciter.direction) for mount, exciter in zip(model.mounts, scene.exciters, strict=True)]
     return UnbalancedModel(
         scene=model.scene,
         carrier=model.carrier,
@@ -189,10 +188,29 @@ def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
         mass=model.mass,
         balance=balance,
         turn=turn,
-        resultant=each @ jnp.stack(ways),
+        resultant=resultant_of(model, turn),
         unbalance=jnp.ones((), model.mass.dtype),
-        force_direction=each @ balance.direction,
+        force_direction=(balance.unbalance * turn) @ balance.direction,
     )
+
+
+def resultant_of(model: LinearModel, turn: Array) -> Array:
+    """Return the resultant of the centrifugal forces per w^2, (np,) kg m complex: sum_j S_j exp(i alpha_j) e_j.
+
+    `turn` (mass,): exp(i alpha) of the unbalance or of the loads of each exciter. The result is NaN for loads that do not move
+    on a circle.
+    """
+    found, first = jnp.zeros((), turn.dtype), 0
+    for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
+        loads = exciter.loads
+        if loads is None:
+            each = turn[first] * (0.0 if exciter.unbalance is None else exciter.unbalance)
+        else:
+            size = loads.mass * loads.radius if isinstance(loads, CircularLoads) else jnp.nan
+            each = jnp.sum(size * turn[first : first + loads.count])
+        found = found + each * rotating_direction(mount, exciter.direction)
+        first += 1 if loads is None else loads.count
+    return found
 
 
 @cached

@@ -157,6 +157,18 @@ class Machine(Part):
         problem = f"is of kind {quoted(self.kind)}; the moment on the foundation is defined for bodies in a plane"
         raise InputError("machine", problem)
 
+    def support_rows(self) -> tuple[Array, Array]:
+        """Return the rows (support, directions, nd) of the force on each support: N per q and N per q'.
+
+        The default is one support that carries the whole force on the foundation.
+        """
+        carrier = self.carrier()
+        return carrier.foundation_stiffness[None], carrier.foundation_damping[None]
+
+    def upward(self) -> np.ndarray | None:
+        """Return the coordinates (nd,) of a translation upward by 1 m; None if they are unknown."""
+        return None
+
     @property
     def is_split(self) -> bool:
         """True if horizontal and vertical values of a rotor's supports differ.

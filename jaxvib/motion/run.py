@@ -21,8 +21,8 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.mount import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory
-from jaxvib.motion.analysis.points import PointMotion, fit_harmonic, motion_of_point
+from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory
+from jaxvib.motion.analysis.points import PointMotion, fit_harmonic, motion_of_point, vibration_of
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.separation import would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
@@ -30,7 +30,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.measures import acceleration_of, rms_velocity_of
+from jaxvib.steady.measures import Vibration, VibrationMeasures, vibration_measures
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.units import Number
@@ -143,8 +143,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     def _whole(self) -> Trajectory:
         return self.window if self.trajectory is None else self.trajectory
 
-    def summary(self) -> str:
-        """Return the outcome of the run as text; amplitudes zero to peak."""
+    def summary(self, measures: VibrationMeasures | None = None) -> str:
+        """Return the outcome of the run as text; amplitudes zero to peak.
+
+        **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
+        """
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         rotors = [w[-1] for w in self.window.rotor_speeds]
         rotor = "rotor" if len(rotors) == 1 else "rotors"
@@ -165,7 +168,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 f"  {self._turning} turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), "
                 f"{rotor} at {speed_text(rotors, 6)}",
                 f"  {self.amplitude_text(self.scene)}",
-                f"  {self._severity()}",
+                *(f"  {line}" for line in self._measures_text(measures)),
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
@@ -173,16 +176,10 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
             ]
         )
 
-    def _severity(self) -> str:
-        """Return strokes, accelerations and velocities of the coordinates that are lengths, at the speed of the loads."""
-        structure, speed = self.scene.machine.structure(), abs(float(self.omega))
-        named = [
-            f"{name} {quantity_text(2.0 * float(a), 'm', 4)}, {float(acceleration_of(a, speed)):.3g} g, "
-            f"{1e3 * float(rms_velocity_of(a, speed)):.4g} mm/s"
-            for name, a, unit in zip(structure.coordinates, np.asarray(self.amplitude), structure.units, strict=True)
-            if unit == "m"
-        ]
-        return f"stroke, peak to peak, acceleration, RMS velocity: {'; '.join(named)}"
+    def _measures_text(self, measures: VibrationMeasures | None) -> list[str]:
+        if not self.has_vibration:
+            return []
+        return (measures or vibration_measures(self.scene, self.vibration())).summary().splitlines()
 
     def _on_the_way(self) -> str:
         structure = self.scene.machine.structure()
@@ -283,6 +280,21 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         amplitude, rest = fit_harmonic(self.window.time, self.window.state.displacement, self.omega)
         return Harmonic(self.scene.machine, self.omega, amplitude, rest)
 
+    @property
+    def has_vibration(self) -> bool:
+        """True if the window contains the 3 turns of the exciters that `vibration` needs."""
+        return bool(_turns(np.asarray(self.window.time), float(self.omega)) >= _MIN_TURNS)
+
+    def vibration(self) -> Vibration:
+        """Return the vibration over the window, for `vibration_measures`: the fitted harmonic, measured amplitudes and force,
+        mean torques and powers of the drives.
+
+        **Raises** `InputError` if the exciters make fewer than 3 turns in the window.
+        """
+        when_known(_require_turns, self.window.time, self.omega)
+        measured = Measured(self.omega, self.load_speed, self.amplitude, self.foundation_force, self.drift)
+        return vibration_of(self.scene, self.window, measured)
+
     @validated
     def plot_path(self, *, ax: Axes | None = None) -> Drawn:
         """Plot the path of a rotor's axis over the last three periods, mm; the path at each station if the rotor tilts.
@@ -316,10 +328,15 @@ def _histories(kept: Trajectory) -> list[np.ndarray]:
     return [np.asarray(kept.time), np.asarray(kept.state.displacement), speeds, rotors, np.asarray(kept.foundation_force)]
 
 
+def _turns(time: np.ndarray, speed: float) -> float:
+    return abs(speed) * (time[-1] - time[0]) / (2.0 * np.pi)
+
+
 def _require_turns(time: np.ndarray, speed: float) -> None:
-    turns = abs(speed) * (time[-1] - time[0]) / (2.0 * np.pi)
-    if not turns >= _MIN_TURNS:
-        raise InputError("run", f"has {turns:.2g} turns in its window; an ellipse needs {_MIN_TURNS}, simulate with more turns")
+    if not (turns := _turns(time, speed)) >= _MIN_TURNS:
+        raise InputError(
+            "run", f"has {turns:.2g} turns in its window; ellipses and measures need {_MIN_TURNS}, simulate with more turns"
+        )
 
 
 def with_separation_status(run: Run) -> Run:

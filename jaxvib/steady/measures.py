@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -14,10 +14,11 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import quantity_text
 from jaxvib.equations.coincident import friction_on_light_loads
-from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model
+from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
+from jaxvib.machine.mount import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene
@@ -26,8 +27,8 @@ from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit, is_single
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
-from jaxvib.steady.points import STANDARD_GRAVITY
-from jaxvib.units import Number, number, numbers
+from jaxvib.steady.points import STANDARD_GRAVITY, ellipse_at, rows_in_plane
+from jaxvib.units import Number, known_number, number, numbers
 from jaxvib.units.known import when_known
 
 ZONE_LIMITS = {
@@ -43,6 +44,10 @@ for a comparison, and public pages contradict each other."""
 _MIN_SLIP = 1e-4
 """Slip n - Omega, relative to n, below which the torque is computed from the dissipation of the carrier. At this slip both
 ways to compute the torque have a relative rounding error of 1e-12."""
+
+
+_NEGLIGIBLE = 1e-9
+"""Strokes and loads below this fraction of the largest are not shown: they are rounding errors."""
 
 
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
@@ -95,35 +100,64 @@ def vibration_zone(
     return "ABCD"[int(np.searchsorted(ends, size))]
 
 
+class Vibration(NamedTuple):
+    """Vibration of a machine at one speed of its exciters, q = Re(displacement exp(i w t)).
+
+    Returned by `Run.vibration`, and by the same method of synchronous regimes and responses.
+
+    **Attributes** (nd coordinates)
+
+    - `speed` w, rad/s
+    - `displacement` (nd,): complex amplitudes, and `amplitude` (nd,), zero to peak, m (rad for rotations)
+    - `foundation_force` and `exciter_force`, N zero to peak: force on the foundation, and resultant of the centrifugal forces
+    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
+    """
+
+    speed: Array
+    displacement: Array
+    amplitude: Array
+    foundation_force: Array
+    exciter_force: Array
+    torque: Array
+    power: Array
+
+
 class VibrationMeasures(eqx.Module):
-    """Measures of the vibration in a jam, at the fundamental.
+    """Measures of a vibration as data sheets state them.
 
     Returned by `vibration_measures`.
 
-    **Attributes** (nd platforms, each with one coordinate and one support)
+    **Attributes** (nt coordinates that are displacements, ns supports)
 
-    - `speed` of the loads, rad/s
-    - `stroke` (nd,), m peak to peak; typical: 2 to 20 mm
-    - `acceleration` (nd,), amplitude in g; typical: 2 to 6 for screens
-    - `velocity` (nd,), m/s root mean square; typical: 50 to 300 mm/s
-    - `exciter_force`, N: centrifugal force S Omega^2 of the loads
+    - `speed` of the loads or unbalances, rad/s
+    - `stroke` (nt,), m peak to peak; typical: 2 to 20 mm
+    - `acceleration` (nt,), amplitude in g; typical: 2 to 6 for screens
+    - `velocity` (nt,), m/s root mean square; typical: 50 to 300 mm/s
+    - `exciter_force`, N zero to peak: resultant of the centrifugal forces
     - `transmissibility`: foundation force divided by `exciter_force`
-    - `static_load` (nd,), N: weight that each support carries
-    - `dynamic_load` (nd,), N zero to peak: force of the vibration on each support
-    - `torque`, N m, and `power`, W: means at the shaft of the rotor
-    - `coordinates`: the names of the coordinates
+    - `static_load` (ns,), N: weight that each support carries; NaN if the directions of the coordinates are unknown
+    - `dynamic_load` (ns,), N zero to peak, vertical, and `side_load` (ns,), horizontal, of each support
+    - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
+    - `point` (2,) of a body in a plane, its `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s,
+      the estimate of `jaxvib.conveying_speed`; None for other machines
+    - `coordinates` (nt,): names of the coordinates
     """
 
     speed: Array = eqx.field(metadata=in_unit("rad/s"))
-    stroke: Array = eqx.field(metadata=in_unit("m", "coordinate"))
-    acceleration: Array = eqx.field(metadata=in_unit("", "coordinate"))
-    velocity: Array = eqx.field(metadata=in_unit("m/s", "coordinate"))
+    stroke: Array = eqx.field(metadata=in_unit("m", "translation"))
+    acceleration: Array = eqx.field(metadata=in_unit("", "translation"))
+    velocity: Array = eqx.field(metadata=in_unit("m/s", "translation"))
     exciter_force: Array = eqx.field(metadata=in_unit("N"))
     transmissibility: Array = eqx.field(metadata=in_unit(""))
-    static_load: Array = eqx.field(metadata=in_unit("N", "coordinate"))
-    dynamic_load: Array = eqx.field(metadata=in_unit("N", "coordinate"))
-    torque: Array = eqx.field(metadata=in_unit("N m"))
-    power: Array = eqx.field(metadata=in_unit("W"))
+    static_load: Array = eqx.field(metadata=in_unit("N", "support"))
+    dynamic_load: Array = eqx.field(metadata=in_unit("N", "support"))
+    side_load: Array = eqx.field(metadata=in_unit("N", "support"))
+    torque: Array = eqx.field(metadata=in_unit("N m", "exciter"))
+    power: Array = eqx.field(metadata=in_unit("W", "exciter"))
+    point: Array | None = eqx.field(metadata=in_unit("m", "direction"), default=None)
+    throw_angle: Array | None = eqx.field(metadata=in_unit("rad"), default=None)
+    throw_number: Array | None = eqx.field(metadata=in_unit(""), default=None)
+    conveying_speed: Array | None = eqx.field(metadata=in_unit("m/s"), default=None)
     coordinates: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
@@ -131,71 +165,137 @@ class VibrationMeasures(eqx.Module):
         """Share of the exciter's force that does not reach the foundation: 1 - transmissibility, negative above 1."""
         return 1.0 - self.transmissibility
 
+    def document(self) -> dict[str, object]:
+        """Return all measures by name."""
+        named: dict[str, object] = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
+        there = {name: value for name, value in named.items() if value is not None}
+        return there | {"isolation_efficiency": self.isolation_efficiency}
+
     def summary(self) -> str:
-        """Return the measures as text."""
-        moving = [
+        """Return the measures as text, one line for each coordinate, each support, the isolation, each shaft and the point."""
+        lines = [
             f"{name}: stroke {quantity_text(self.stroke[k], 'm', 4)} peak to peak, {float(self.acceleration[k]):.3g} g, "
-            f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS"
+            f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS{_zone_text(float(self.velocity[k]))}"
             for k, name in enumerate(self.coordinates)
+            if not float(self.stroke[k]) < _NEGLIGIBLE * float(np.max(self.stroke))
         ]
-        supports = [
-            f"support {k + 1}: {float(weight):.4g} N static, {float(load):.4g} N dynamic"
-            for k, (weight, load) in enumerate(zip(self.static_load, self.dynamic_load, strict=True))
-            if weight > 0.0 or load > 0.0
-        ]
+        loads = np.stack([np.asarray(each) for each in (self.static_load, self.dynamic_load, self.side_load)], axis=1)
+        for k, each in enumerate(loads):
+            named = zip(each, ("static", "dynamic", "to the sides"), strict=True)
+            parts = [f"{load:.4g} N {word}" for load, word in named if load > _NEGLIGIBLE * np.nanmax(each)]
+            lines += [f"support {k + 1}: {', '.join(parts)}"] if np.nansum(each) > 0.0 else []
         ratio = float(self.transmissibility)
-        passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
-        isolated = f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""
-        shaft = f"shaft: {float(self.torque):.4g} N m, {float(self.power):.4g} W"
-        return "\n".join([*moving, *supports, passed + isolated, shaft])
+        if np.isfinite(ratio):
+            passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
+            lines.append(passed + (f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""))
+        shafts = [f"{float(t):.4g} N m, {float(p):.4g} W" for t, p in zip(self.torque, self.power, strict=True)]
+        number = [""] if len(shafts) == 1 else [f" {k + 1}" for k in range(len(shafts))]
+        lines += [f"shaft{k}: {text}" for k, text in zip(number, shafts, strict=True) if "nan" not in text]
+        return "\n".join([*lines, *self._throw_text()])
+
+    def _throw_text(self) -> list[str]:
+        if self.point is None or self.throw_angle is None or self.throw_number is None or self.conveying_speed is None:
+            return []
+        place, speed = ", ".join(f"{float(x):.4g}" for x in self.point), float(self.conveying_speed)
+        conveys = "flights over a turn" if np.isnan(speed) else f"conveys {speed:.3f} m/s"
+        angle = f"thrown at {quantity_text(self.throw_angle, 'rad', 4)}"
+        return [f"point ({place}) m: {angle}, throw number {float(self.throw_number):.3g}, {conveys}"]
 
     def __repr__(self) -> str:
         return self.summary() if is_single(self) else super().__repr__()
 
 
+def _zone_text(velocity: float) -> str:
+    return f" (zone {vibration_zone(velocity)})" if np.isfinite(velocity) else ""
+
+
 @validated
-def vibration_measures(scene: Scene, jam: Jam) -> VibrationMeasures:
-    """Return stroke, acceleration, velocity, isolation, forces on supports, torque and power of a jam of light loads.
+def vibration_measures(
+    scene: Scene,
+    motion: Jam | Vibration,
+    *,
+    at: int | Number | Sequence[Number] | None = None,
+    body: int = 0,
+    slope: Number = 0.0,
+) -> VibrationMeasures:
+    """Return stroke, acceleration, velocity, isolation, loads on supports, torque, power and throw of a vibration.
 
         stroke = 2 |Y|,    acceleration = Omega^2 |Y| / g,    velocity = Omega |Y| / sqrt 2,
-        dynamic load of support i = |k_i + i Omega b_i| |Y_i|,    static load = k_i s_i with K s = M g
+        dynamic load of a support = |k u + i Omega c u|,    static load = k s with K s = M g
 
-    **Arguments**: `scene` with a machine of platforms; `jam` of it, such as `jam_modes(scene).select(3)`.
+    u and s are the displacements of the support by the vibration and by the weight of machine and loads.
 
-    **Returns** `VibrationMeasures`, with derivatives. **Raises** `InputError` for a machine without platforms.
+    **Arguments**
+
+    - `scene`
+    - `motion` of it: a jam of light loads such as `jam_modes(scene).select(3)`, or the `vibration()` of a run, of a synchronous
+      regime or of a response
+    - `at`: point of a deck, (x, y) of the body number `body`, m; default: its centre of mass; typical: the middle of the deck
+    - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
+
+    **Returns** `VibrationMeasures`, with derivatives. **Raises** `InputError` for a point that the machine does not have.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0),
     ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("400 rpm"))
     >>> print(vibration_measures(scene, jv.jam_modes(scene).select(1)).summary())
-    y1: stroke 17.11 mm peak to peak, 0.638 g, 163.6 mm/s RMS
+    y1: stroke 17.11 mm peak to peak, 0.638 g, 163.6 mm/s RMS (zone D)
     support 1: 500.1 N static, 349.1 N dynamic
     of the exciter's 73.14 N, 477 % reach the foundation
     shaft: 0.2969 N m, 12.43 W
     """
     scene = validate_scene(scene)
-    require_platforms(scene, "measures of a jam")
-    return _measures(scene, jam.omega, jam.displacement, jam.foundation_force)
+    place = on_body(read_place(at, "at"), scene.machine.require_body(body))
+    if isinstance(motion, Jam):
+        motion = _vibration_of(scene, motion.omega, motion.displacement, motion.foundation_force)
+    return _measures(scene, motion, place, known_number(slope, "rad", "slope"))
 
 
 @cached
-def _measures(scene: Scene, omega: Array, displacement: Array, force: Array) -> VibrationMeasures:
-    model, amplitude = jammed_model(scene), magnitude(displacement)
-    exciter = model.unbalance * omega**2
-    torque = shaft_torque(model, omega, displacement)
-    static, dynamic = support_loads(model, omega, displacement)
-    return VibrationMeasures(
-        speed=omega,
+def _vibration_of(scene: Scene, omega: Array, displacement: Array, force: Array) -> Vibration:
+    """Return the vibration in a jam of light loads."""
+    model = jammed_model(scene)
+    torque = shaft_torque(model, omega, displacement)[None]
+    size = magnitude(displacement)
+    return Vibration(omega, displacement, size, force, exciter_force(model, omega), torque, scene.drive.speed * torque)
+
+
+def exciter_force(model: JammedModel, omega: Array) -> Array:
+    """Return the centrifugal force of coincident loads, N zero to peak, as `peak_force`."""
+    return peak_force(model.unbalance * omega**2 * rotating_direction(model.mount))
+
+
+@cached
+def _measures(scene: Scene, motion: Vibration, place: Place, slope: Array) -> VibrationMeasures:
+    model = linear_model(scene)
+    lengths = np.flatnonzero(np.asarray(model.carrier.units) == "m")
+    amplitude, w = motion.amplitude[lengths], jnp.abs(motion.speed)
+    static, dynamic, side = support_loads(model, w, motion.displacement)
+    forced = motion.exciter_force > 0.0
+    ratio = jnp.where(forced, motion.foundation_force / jnp.where(forced, motion.exciter_force, 1.0), jnp.inf)
+    found = VibrationMeasures(
+        speed=motion.speed,
         stroke=2.0 * amplitude,
-        acceleration=acceleration_of(amplitude, omega),
-        velocity=rms_velocity_of(amplitude, omega),
-        exciter_force=exciter,
-        transmissibility=force / exciter,
+        acceleration=acceleration_of(amplitude, w),
+        velocity=rms_velocity_of(amplitude, w),
+        exciter_force=motion.exciter_force,
+        transmissibility=ratio,
         static_load=static,
         dynamic_load=dynamic,
-        torque=torque,
-        power=scene.drive.speed * torque,
-        coordinates=model.carrier.coordinates,
+        side_load=side,
+        torque=motion.torque,
+        power=motion.power,
+        coordinates=tuple(model.carrier.coordinates[k] for k in lengths),
+    )
+    if scene.machine.places != "plane":
+        return found
+    moved = rows_in_plane(scene.machine, place) @ motion.displacement
+    path = ellipse_at(moved, w, slope, jnp.zeros_like(w))
+    at = place.at if isinstance(place, BodyPoint) else place
+    point = jnp.zeros(2, amplitude.dtype) if at is None else jnp.asarray(at, amplitude.dtype)
+    speed = conveying_speed_at(moved, w, slope)
+    return dataclasses.replace(
+        found, point=point, throw_angle=path.direction, throw_number=path.throw_number, conveying_speed=speed
     )
 
 
@@ -223,12 +323,36 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
     return jnp.where(close, taken / omega, torque)
 
 
-def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tuple[Array, Array]:
-    """Return the weight on the support of each platform, and the force of the vibration on it, zero to peak, (nd,) N each."""
-    machine = require_platforms(model.scene, "the force on a support")
-    static = machine.stiffness * jnp.nan_to_num(static_deflections(model.scene))
-    spring = magnitude(jax.lax.complex(machine.stiffness, omega * machine.damping))
-    return static, spring * magnitude(displacement)
+def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tuple[Array, Array, Array]:
+    """Return the static load, and the vertical and the horizontal dynamic load, zero to peak, of each support, (ns,) N each.
+
+    The static load is NaN if the directions of the coordinates are unknown. Supports that are effects are not included.
+    """
+    machine = model.scene.machine
+    stiffness, damping = machine.support_rows()
+    forces = magnitude((stiffness + 1j * omega * damping) @ displacement)
+    sag = weight_deflection(model)
+    static = jnp.full(forces.shape[0], jnp.nan) if sag is None else stiffness[:, -1] @ sag
+    side = jnp.zeros_like(forces[:, 0]) if forces.shape[1] == 1 else forces[:, 0]
+    return static, forces[:, -1], side
+
+
+def weight_deflection(model: LinearModel) -> Array | None:
+    """Return the displacement (nd,), m, of all coordinates under the weight of the machine and its loads, positive downward.
+
+    It is 0 for a platform that no support carries, and None if the directions of the coordinates are unknown.
+    """
+    machine = model.scene.machine
+    up = machine.upward()
+    if up is None:
+        return None
+    stiffness, weight = model.carrier.stiffness, STANDARD_GRAVITY * (model.mass @ jnp.asarray(up, model.mass.dtype))
+    if not isinstance(machine, Platforms):
+        return jnp.linalg.solve(stiffness, weight)
+    # The stiffness matrix of platforms without supports is singular up to rounding. They are attached to the ground here.
+    carried = has_support(machine)
+    held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(up))
+    return jnp.where(carried, jnp.linalg.solve(stiffness + held, weight), 0.0)
 
 
 def static_deflections(scene: Scene) -> Array:
@@ -237,15 +361,12 @@ def static_deflections(scene: Scene) -> Array:
     It is NaN for a platform that no support carries, directly or by links.
     """
     machine = require_platforms(scene, "the deflection")
-    model, carried = linear_model(scene), _has_support(machine)
-    # The stiffness matrix of platforms without supports is singular up to rounding. They are attached to the ground here, and
-    # their deflection is replaced by NaN.
-    held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
-    sag = jnp.linalg.solve(model.carrier.stiffness + held, STANDARD_GRAVITY * jnp.diagonal(model.mass))
-    return jnp.where(carried, jnp.abs(sag), jnp.nan)
+    sag = weight_deflection(linear_model(scene))
+    assert sag is not None
+    return jnp.where(has_support(machine), jnp.abs(sag), jnp.nan)
 
 
-def _has_support(machine: Platforms) -> Array:
+def has_support(machine: Platforms) -> Array:
     """Return True (n,) for each platform that has a support or is connected by links to a platform with one."""
     n = machine.mass.shape[0]
     joined = jnp.eye(n, dtype=bool)
@@ -297,8 +418,8 @@ def _require_finite(amplitude: np.ndarray) -> None:
         raise InputError("amplitude", f"is {quoted(amplitude)}; finite numbers are needed")
 
 
-@cached
-def _conveying_speed(amplitude: Array, w: Array, slope: Array) -> Array:
+def conveying_speed_at(amplitude: Array, w: Array, slope: Array) -> Array:
+    """Return `conveying_speed` for validated values."""
     along = jnp.cos(slope) * amplitude[0] + jnp.sin(slope) * amplitude[1]
     normal = -jnp.sin(slope) * amplitude[0] + jnp.cos(slope) * amplitude[1]
     size = magnitude(normal)
@@ -325,3 +446,6 @@ def _conveying_speed(amplitude: Array, w: Array, slope: Array) -> Array:
     step = rate * time - (path(begin + flight) - path(begin)) - STANDARD_GRAVITY * jnp.sin(slope) * time**2 / 2.0
     speed = w / (2.0 * np.pi) * step
     return jnp.where(flies, jnp.where(lands, speed, jnp.nan), 0.0)
+
+
+_conveying_speed = cached(conveying_speed_at)

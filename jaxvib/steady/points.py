@@ -112,7 +112,7 @@ def ellipse_of(amplitude: Array | complex, speed: Number, *, slope: Number = 0.0
         raise InputError("amplitude", f"has the shape {jnp.shape(amplitude)}; give two amplitudes, horizontal and up")
     when_known(_require_finite, amplitude)
     w, along = number(speed, "rad/s", "speed"), number(slope, "rad", "slope")
-    return _ellipse_of(jnp.asarray(amplitude), w, along, number(remainder, "", "remainder", low=0.0))
+    return ellipse_at(jnp.asarray(amplitude), w, along, number(remainder, "", "remainder", low=0.0))
 
 
 def _require_finite(amplitude: np.ndarray) -> None:
@@ -120,7 +120,7 @@ def _require_finite(amplitude: np.ndarray) -> None:
         raise InputError("amplitude", f"is {quoted(amplitude)}; finite numbers are needed")
 
 
-def _ellipse_of(amplitude: Array, speed: Array, slope: Array, remainder: Array) -> Ellipse:
+def ellipse_at(amplitude: Array, speed: Array, slope: Array, remainder: Array) -> Ellipse:
     """Return `ellipse_of` for validated values."""
     x, y = amplitude[0], amplitude[1]
     forward, backward = (x + 1j * y) / 2.0, jnp.conj(x - 1j * y) / 2.0
@@ -297,4 +297,4 @@ def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellips
     amplitude = rows @ motion.amplitude
     on = 0.5 * jnp.sum(jnp.abs(amplitude) ** 2)
     off = jnp.zeros_like(on) if motion.rest is None else jnp.sum((rows @ motion.rest) * rows)
-    return amplitude, _ellipse_of(amplitude, motion.speed, slope, jnp.sqrt(off / on))
+    return amplitude, ellipse_at(amplitude, motion.speed, slope, jnp.sqrt(off / on))

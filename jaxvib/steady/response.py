@@ -26,7 +26,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, fold_points, scanned_speed, spread_points
-from jaxvib.steady.measures import acceleration_of, rms_velocity_of
+from jaxvib.steady.measures import Vibration, acceleration_of, rms_velocity_of
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.regimes.local import decays, regime_growth
 from jaxvib.units import Number, Numbers, count, number, numbers
@@ -76,6 +76,16 @@ class AbstractResponse(eqx.Module):
     motor_torque: Array = eqx.field(metadata=in_unit("N m", "*", "exciter"))
     torque_share: Array = eqx.field(metadata=in_unit("", "*"))
     power: Array = eqx.field(metadata=in_unit("W", "*", "exciter"))
+
+    @validated
+    def vibration(self, index: int = 0) -> Vibration:
+        """Return the vibration at the speed with this `index`, counted from 0, for `vibration_measures`.
+
+        **Raises** `InputError` if there are fewer speeds.
+        """
+        if not 0 <= index < (number := self.speed.shape[0]):
+            raise InputError("index", f"is {index}; there are {number} speeds, counted from 0")
+        return Vibration(*(getattr(self, name)[index] for name in Vibration._fields))
 
 
 class OperatingPoints(AbstractResponse):

@@ -13,8 +13,10 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import suggest_name
+from jaxvib.motion.analysis.points import vibration_of
 from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.batch import BatchRun
+from jaxvib.steady.measures import vibration_measures
 from optimize.quantities.quantity import Quantity
 
 _SETTLED_SPEED_SHARE = 0.01
@@ -63,6 +65,27 @@ def _settling(run: BatchRun) -> Array:
     return jnp.where(run.regime.change < _SETTLED_SPEED_SHARE, late, run.window.time[-1])
 
 
+def _of_vibration(name: str, unit: str, field: str, axis: str = "") -> RunMeasure:
+    """Return a measure with the name of a `field` of `VibrationMeasures`."""
+
+    def read(run: BatchRun) -> Array:
+        motion = vibration_of(run.scene, run.window, run.measured)
+        value = getattr(vibration_measures(run.scene, motion), field)
+        if value is None:
+            raise InputError("measure", f"is {name}, which needs a body in a plane, not a {quoted(run.scene.machine.kind)}")
+        return value
+
+    return RunMeasure(name, unit, read, axis)
+
+
+def _support_load(run: BatchRun) -> Array:
+    return _STATIC.read(run) + _DYNAMIC.read(run)
+
+
+_STATIC = _of_vibration("", "N", "static_load", "support")
+_DYNAMIC = _of_vibration("", "N", "dynamic_load", "support")
+
+
 RUN_MEASURES = {
     measure.name: measure
     for measure in (
@@ -75,12 +98,22 @@ RUN_MEASURES = {
         RunMeasure("run.rotor_speed", "rad/s", "regime.rotor_speed"),
         RunMeasure("run.drift", "", "measured.drift"),
         RunMeasure("run.settling_time", "s", _settling),
+        _of_vibration("run.stroke", "m", "stroke", "translation"),
+        _of_vibration("run.acceleration", "", "acceleration", "translation"),
+        _of_vibration("run.velocity", "m/s", "velocity", "translation"),
+        _of_vibration("run.transmissibility", "", "transmissibility"),
+        _of_vibration("run.shaft_torque", "N m", "torque", "exciter"),
+        _of_vibration("run.shaft_power", "W", "power", "exciter"),
+        RunMeasure("run.support_load", "N", _support_load, "support"),
+        _of_vibration("run.throw_number", "", "throw_number"),
+        _of_vibration("run.conveying_speed", "m/s", "conveying_speed"),
     )
 }
 """Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
 foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time, with
 a resolution of 1/64 of the run, after which each load speed differs from its final value by less than 1 % of the rotor
-speed."""
+speed. Stroke to conveying speed: see `VibrationMeasures`, at the centre of mass; the support load is the sum of the static and
+the vertical dynamic load."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

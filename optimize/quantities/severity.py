@@ -7,7 +7,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.steady import measures
-from jaxvib.steady.measures import acceleration_of, rms_velocity_of, support_loads
+from jaxvib.steady.measures import acceleration_of, exciter_force, rms_velocity_of, support_loads
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.jams import jam_amplitude, jam_force, jam_quantity, jam_speed, pair_of, pair_text
@@ -118,8 +118,7 @@ def transmissibility(*, mode: int, tier: Tier = "leading") -> Quantity:
 
 
 def _transmissibility(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
-    exciter = evaluation.jammed.unbalance * jam_speed(evaluation, tier, mode) ** 2
-    return jam_force(evaluation, tier, mode, None) / exciter
+    return jam_force(evaluation, tier, mode, None) / exciter_force(evaluation.jammed, jam_speed(evaluation, tier, mode))
 
 
 @validated
@@ -150,10 +149,11 @@ def support_load(*, mode: int, of: int) -> Quantity:
     """Return the greatest force on a support in a jam mode, N: the weight on it plus the amplitude of the force of the
     vibration.
 
-    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `of`: the platform on the support; typical: 1 to 3.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `of`: the support, on platforms that of the platform with
+    this number; typical: 1 to 3.
 
-    **Returns** `Quantity`, NaN if the mode does not exist; typical: 200 N to 50 kN. A machine without platforms, or without
-    that one, raises `InputError` when the quantity is computed.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 200 N to 50 kN. A machine without this support raises
+    `InputError` when the quantity is computed.
 
     >>> from optimize import support_load
     >>> support_load(mode=3, of=2).words
@@ -167,7 +167,7 @@ def support_load(*, mode: int, of: int) -> Quantity:
 
 def _support_load(evaluation: Evaluation, tier: Tier, mode: int, of: int) -> Array:
     jam = evaluation.jam(mode)
-    static, dynamic = support_loads(evaluation.jammed, jam.omega, jam.displacement)
+    static, dynamic, _ = support_loads(evaluation.jammed, jam.omega, jam.displacement)
     if of > static.shape[0]:
-        raise InputError("of", f"is {of}; the machine has platforms 1 to {static.shape[0]}")
+        raise InputError("of", f"is {of}; the machine has supports 1 to {static.shape[0]}")
     return static[of - 1] + dynamic[of - 1]

@@ -253,7 +253,7 @@ def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, say
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "9"), 2, "numbered 1 to 5"),
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "1"), 1, "does not exist at rotor speed"),
         (("simulate", "machine.toml", "--until", "9s", "--max-steps", "50"), 1, "max_steps_reached"),
-        (("simulate", "machine.toml", "--until", "1s", "--tolerance", "1e-30"), 2, "tolerance is 1e-30"),
+        (("simulate", "machine.toml", "--until", "1s", "--step-tolerance", "1e-30"), 2, "--step-tolerance is 1e-30"),
         (("optimize", "machine.toml"), 2, "machine is not part of a design file: this is a scene file; `jaxvib new design`"),
         (("modes", "design.toml"), 2, "scene is not part of a scene file: this is a design file; give the scene file"),
         (("new", "four-mass"), 2, "four-mass"),
@@ -407,4 +407,8 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert code == 0 and [regime["stable"] for regime in regimes] == [True, False]
     np.testing.assert_allclose(np.abs([regime["phases"][1] for regime in regimes]), [np.pi, 0.0], atol=1e-9)
     assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
-    assert "954.887" in typed("regimes", "screen.toml")[1]
+    out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg")[1]
+    assert "954.887" in out and "point (0.4, 0.1) m: thrown at" in out and max(map(len, out.splitlines())) <= 80
+    shown = float(out.split("throw number ")[1].split(",")[0])
+    scene = jv.load_scene(tmp_path / "screen.toml")
+    np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)

@@ -126,11 +126,95 @@ def test_conveying_speed_has_the_limits_of_handbooks():
     assert np.isnan(jv.conveying_speed(level, 1.01 * w))
 
 
-def test_measures_need_platforms(jam):
-    rotor = jv.Scene(
-        jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0),
-        jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04),
-        jv.ConstantSpeed(460.0),
-    )
-    with pytest.raises(jv.InputError, match=r"'planar_rotor'; measures of a jam needs a machine of platforms"):
-        jv.vibration_measures(rotor, jam[1])
+def rows_of(place):
+    """Rows of the motion of a point of a body in a plane."""
+    return np.array([[1.0, 0.0, -place[1]], [0.0, 1.0, place[0]]])
+
+
+TILTED = [((-1.2, -0.3), (2e5, 4e5), (9e3, 9e3), 0.3), ((0.9, -0.1), (1e5, 5e5), (6e3, 9e3), -0.2)]
+
+
+@pytest.fixture(scope="module")
+def screen():
+    supports = [jv.support(at=at, stiffness=k, damping=c, angle=a) for at, k, c, a in TILTED]
+    body = jv.plane_body(mass=2000.0, inertia=900.0, supports=supports)
+    drive = jv.ConstantSpeed("950 rpm")
+    exciters = [jv.Exciter(at=(x, 0.4), unbalance=2.0, drive=drive, direction=way) for x, way in ((0.0, 1), (0.3, -1))]
+    return jv.Scene(body, exciters=exciters)
+
+
+def test_loads_of_inclined_supports_follow_from_their_springs(screen):
+    found = jv.response(screen, speeds=[90.0]).vibration()
+    measures = jv.vibration_measures(screen, found, at=(1.0, 0.2), slope="-10 deg")
+    w, z = float(found.speed), np.asarray(found.displacement)
+    weight, moment = 0.0, 0.0
+    sag = np.zeros((3, 3))
+    for at, k, _, a in TILTED:
+        turn = np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
+        sag += rows_of(at).T @ turn.T @ np.diag(k) @ turn @ rows_of(at)
+    sunk = np.linalg.solve(sag, [0.0, 2000.0 * G, 0.0])
+    for j, (at, k, c, a) in enumerate(TILTED):
+        turn = np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
+        force = turn.T @ np.diag(np.asarray(k) + 1j * w * np.asarray(c)) @ turn @ rows_of(at) @ z
+        np.testing.assert_allclose([measures.side_load[j], measures.dynamic_load[j]], np.abs(force), rtol=1e-9)
+        static = turn.T @ np.diag(k) @ turn @ rows_of(at) @ sunk
+        np.testing.assert_allclose(measures.static_load[j], static[1], rtol=1e-9)
+        weight, moment = weight + static[1], moment + at[0] * static[1] - at[1] * static[0]
+    np.testing.assert_allclose([weight, moment], [2000.0 * G, 0.0], atol=1e-6)
+    u = rows_of((1.0, 0.2)) @ z
+    np.testing.assert_allclose(measures.conveying_speed, jv.conveying_speed(jnp.asarray(u), w, slope="-10 deg"), rtol=1e-12)
+    path = jv.ellipse_of(jnp.asarray(u), w, slope="-10 deg")
+    np.testing.assert_allclose(measures.throw_number, path.throw_number, rtol=1e-12)
+    np.testing.assert_allclose(measures.throw_angle, path.direction, rtol=1e-12)
+
+
+def test_run_regime_and_response_have_the_same_measures(screen):
+    """Two equal unbalances under ideal drives of one speed: regime, response and run describe one motion."""
+    run = jv.simulate(screen, "14 s", save="window")
+    motions = [
+        jv.response(screen, speeds=[screen.exciters[0].drive.speed]).vibration(),
+        jv.working_regime(screen).vibration(),
+        run.vibration(),
+    ]
+    first, second, third = (jv.vibration_measures(screen, motion) for motion in motions)
+    for other, tolerance in ((second, 1e-9), (third, 2e-4)):
+        for name, value in first.document().items():
+            if name == "coordinates":
+                continue
+            np.testing.assert_allclose(getattr(other, name), value, rtol=tolerance, atol=tolerance, err_msg=name)
+    states, carrier = run.window.state, screen.machine.carrier()
+    lost = np.einsum("ti,ij,tj->t", states.velocity, carrier.damping, states.velocity)
+    np.testing.assert_allclose(np.sum(third.power), np.mean(lost), rtol=0.02)  # the window is not a whole number of turns
+
+
+def test_one_mass_has_the_measures_of_the_closed_form():
+    m, k, c, unbalance, w = 200.0, 8e5, 600.0, 0.2, 120.0
+    table = jv.one_mass(mass=m, stiffness=k, damping=c)
+    scene = jv.Scene(table, exciters=[jv.Exciter(drive=jv.ConstantSpeed(w), unbalance=unbalance, direction=-1)])
+    y = abs(unbalance * w**2 / (k - m * w**2 + 1j * w * c))
+    for motion in (jv.response(scene).operating.vibration(), jv.simulate(scene, "14 s", save="window").vibration()):
+        measures = jv.vibration_measures(scene, motion)
+        np.testing.assert_allclose(measures.stroke, [2.0 * y], rtol=1e-4)
+        np.testing.assert_allclose(measures.power, [c * (w * y) ** 2 / 2.0], rtol=1e-3)
+        np.testing.assert_allclose(measures.torque, measures.power / w, rtol=1e-6)
+        np.testing.assert_allclose(measures.static_load, [m * G], rtol=1e-12)
+        np.testing.assert_allclose(measures.dynamic_load, [abs(k + 1j * w * c) * y], rtol=1e-4)
+        np.testing.assert_allclose(measures.transmissibility, abs(k + 1j * w * c) * y / (unbalance * w**2), rtol=1e-4)
+
+
+def test_bearings_of_a_rotor_carry_weight_and_whirl():
+    machine = jv.rotor(
+        mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(6e5, 5e5), damping=(400.0, 300.0),
+        position=(0.165, -0.155), stiffness_up=(9e5, 8e5),
+    )  # fmt: skip
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(300.0), unbalance=1e-3, at=0.1)])
+    motion = jv.response(scene).operating.vibration()
+    measures = jv.vibration_measures(scene, motion)
+    y, z, theta, psi = np.asarray(motion.displacement)
+    for j, place in enumerate((0.165, -0.155)):
+        across = ((6e5, 5e5)[j] + 300j * (400.0, 300.0)[j]) * (y + place * theta)
+        up = ((9e5, 8e5)[j] + 300j * (400.0, 300.0)[j]) * (z + place * psi)
+        np.testing.assert_allclose([measures.side_load[j], measures.dynamic_load[j]], [abs(across), abs(up)], rtol=1e-9)
+    np.testing.assert_allclose(np.sum(measures.static_load), 37.0 * G, rtol=1e-9)
+    np.testing.assert_allclose(measures.static_load @ np.array([0.165, -0.155]), 0.0, atol=1e-9)
+    assert measures.throw_number is None and len(measures.stroke) == 2

@@ -2,10 +2,14 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxvib as jv
+from jaxvib.motion.batch import BatchPlan, run_in_batch
+from jaxvib.motion.start import initial_state
 from jaxvib.sweeps.measures import RUN_MEASURES
 
 
@@ -37,3 +41,23 @@ def test_settling_ends_with_the_last_part_that_is_away(second, settled):
     np.testing.assert_allclose(measure(watched(speeds)), settled)
     np.testing.assert_allclose(measure(watched(speeds[:, ::-1])), settled)
     np.testing.assert_allclose(measure(watched(speeds, change=0.02)), 10.0)
+
+
+def test_measures_of_data_sheets_follow_from_a_run():
+    table = jv.one_mass(mass=49.0, stiffness=4e4, damping=100.0)
+    scene = jv.Scene(table, jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0))
+    state = initial_state(scene, "jam", mode=1, separation=0.0)
+    plan = BatchPlan(until=20.0, window=4.0, samples=1024, each=400, between=2)
+
+    @jax.jit
+    def computed(scene):
+        run = run_in_batch(scene, state, plan)
+        names = ("stroke", "transmissibility", "shaft_torque", "shaft_power", "support_load")
+        return run.measured, [RUN_MEASURES[f"run.{name}"].read(run) for name in names]
+
+    measured, (stroke, ratio, torque, power, load) = computed(scene)
+    np.testing.assert_allclose(stroke, 2.0 * measured.amplitude, rtol=1e-12)
+    np.testing.assert_allclose(ratio, measured.foundation_force / (0.1 * measured.omega**2), rtol=1e-3)
+    np.testing.assert_allclose(torque, [2 * 0.5 * 0.1**2 * (60.0 - measured.omega)], rtol=1e-3)
+    np.testing.assert_allclose(power, 60.0 * torque, rtol=1e-9)
+    np.testing.assert_allclose(load, [50.0 * 9.80665 + measured.foundation_force], rtol=2e-2)

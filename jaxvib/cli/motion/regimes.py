@@ -8,12 +8,14 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.document import deck_options, indented, measures_of
 from jaxvib.cli.output import csv_options, fields_of
 
 
 @app.command("regimes")
 @click.argument("scene", type=click.Path(path_type=Path))
 @WITHOUT
+@deck_options
 @csv_options
 @shared
 def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
@@ -22,8 +24,10 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
     from jaxvib.results.status import status_name  # slow imports, which --help does not need
     from jaxvib.steady.jams.phases import degrees
 
-    found = jv.synchronous_regimes(loaded_scene(scene, without))
+    loaded = loaded_scene(scene, without)
+    found = jv.synchronous_regimes(loaded)
     each = [found.select(k) for k in range(found.speed.shape[0])]
+    measures = [measures_of(loaded, regime.vibration()) if regime.stable else None for regime in each]
     output.picture("regimes.png", found.plot)
     output.csv(csv, found, "regime")
     document = {
@@ -34,13 +38,14 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
                 "status": regime.message,
                 **fields_of(regime, "speed", "phases", "stable", "growth", "quasi_static", "margin"),
                 **fields_of(regime, "torque", "vibrational_torque", "power", "can_start", "amplitude", "foundation_force"),
+                **({} if own is None else {"measures": own.document()}),
             }
-            for regime in each
+            for regime, own in zip(each, measures, strict=True)
         ],
     }
 
     def text() -> str:
-        from jaxvib.display import speed_unit  # slow import, which --help does not need
+        from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
         rows = [
@@ -58,6 +63,8 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
         if not rows:
             return found.summary()
         head = [unit, "", " ", "phases, degrees", "margin", "power, W", "foundation force, N"]
-        return table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
+        drawn = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
+        stable = [(regime, own) for regime, own in zip(each, measures, strict=True) if own is not None]
+        return "\n".join([drawn, *(indented(f"at {speed_text(regime.speed)}, stable:", own) for regime, own in stable)])
 
     output.done(document, text, "regimes", found)

@@ -8,6 +8,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.document import deck_options, indented, measures_of
 from jaxvib.cli.output import csv_options
 
 
@@ -16,6 +17,7 @@ from jaxvib.cli.output import csv_options
 @click.option("--most", type=SPEED_TYPE, help="Highest speed, such as '2000 rpm' [4/3 of the working speed].")
 @click.option("--points", type=int, default=500, show_default=True, help="Number of speeds.")
 @WITHOUT
+@deck_options
 @csv_options
 @shared
 def response(scene: Path, most: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
@@ -38,6 +40,8 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
     operating = np.flatnonzero(found.operating.exists).tolist()
     folds = np.flatnonzero(found.folds.exists).tolist()
     peaks = found.peaks()
+    stays = found.operating.stable
+    sizes = [measures_of(loaded, found.operating.vibration(k)) if stays[k] else None for k in operating]
     measures = ("speed", "amplitude", "phase", "acceleration", "velocity", "exciter_force", "foundation_force")
     rest = ("transmissibility", "torque", "motor_torque", "power")
 
@@ -47,7 +51,10 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
     document = {
         "resonances": found.resonances,
         "phases": phases,
-        "operating_points": rows_of(found.operating, operating, *measures, *rest, "growth", "stable"),
+        "operating_points": [
+            row | ({} if own is None else {"measures": own.document()})
+            for row, own in zip(rows_of(found.operating, operating, *measures, *rest, "growth", "stable"), sizes, strict=True)
+        ],
         "peaks": rows_of(found, peaks, *measures, *rest),
         "folds": rows_of(found.folds, folds, "speed", "factor", "torque", "lands_at"),
     }
@@ -61,9 +68,9 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
         moves = [f"{name}, {shown}" for name, (shown, _) in zip(structure.coordinates, kinds, strict=True)]
 
         def motion(of: jv.Response, k: int, *texts: str) -> list[str]:
-            sizes = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
+            moved = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
             last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
-            return [f"{scale * of.speed[k]:.5g}", *texts, *sizes, *last]
+            return [f"{scale * of.speed[k]:.5g}", *texts, *moved, *last]
 
         lines = [f"natural frequencies {speed_text(found.resonances)}"]
         end = ["force, N", "torque, N m"]
@@ -71,7 +78,8 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
             points = found.operating
             rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]
             lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
-            lines += [_measures(found, k) for k in operating if points.stable[k]]
+            stable = [(k, own) for k, own in zip(operating, sizes, strict=True) if own is not None]
+            lines += [indented(f"at {speed_text(points.speed[k])}:", own) for k, own in stable]
         elif len(found.scene.exciters) > 1:
             written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases))
             lines.append(f"phases of the unbalances {written} deg; for speeds and stability use: jaxvib regimes")
@@ -94,26 +102,3 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
         return "\n".join(lines)
 
     output.done(document, text, "response", found)
-
-
-def _measures(found: jv.Response, k: int) -> str:
-    """Return the measures of a stable operating point as text."""
-    import numpy as np
-
-    from jaxvib.display import quantity_text, speed_text
-
-    points, structure = found.operating, found.scene.machine.structure()
-    lengths = [name for name, unit in zip(structure.coordinates, structure.units, strict=True) if unit == "m"]
-    amplitudes = points.amplitude[k][[unit == "m" for unit in structure.units]]
-    lines = [
-        f"  {name}: stroke {quantity_text(2.0 * a, 'm', 4)} peak to peak, {g:.3g} g, {1e3 * v:.4g} mm/s RMS "
-        f"(zone {jv.vibration_zone(float(v))}, ISO 20816-3)"
-        for name, a, g, v in zip(lengths, amplitudes, points.acceleration[k], points.velocity[k], strict=True)
-    ]
-    ratio = float(points.transmissibility[k])
-    lines.append(
-        f"  of the exciter's {quantity_text(points.exciter_force[k], 'N', 4)}, {100.0 * ratio:.4g} % reach the foundation"
-    )
-    power = float(np.sum(points.power[k]))
-    lines.append(f"  shaft: {float(np.sum(points.torque[k])):.4g} N m, {power:.4g} W")
-    return "\n".join([f"at {speed_text(points.speed[k])}:", *lines])

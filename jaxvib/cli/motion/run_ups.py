@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, loaded_scene, shared, table
-from jaxvib.cli.document import SEPARATION
+from jaxvib.cli.document import SEPARATION, chosen_steps
 
 
 @app.command("run-ups")
@@ -19,7 +19,7 @@ from jaxvib.cli.document import SEPARATION
 @click.option("--starts", type=int, help="Number of random sets of initial angles [1: loads next to each other at the bottom].")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random angles.")
 @SEPARATION
-@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-7].")
+@click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-7].")
 @click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups computed in parallel.")
 @shared
 def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
@@ -27,8 +27,7 @@ def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output
     from jaxvib.units import number
 
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
-    steps = None if tolerance is None else jv.Tolerance(tolerance)
-    found = jv.run_ups(loaded_scene(scene), drag=each, stepsize_controller=steps, **options)
+    found = jv.run_ups(loaded_scene(scene), drag=each, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("run_ups.png", found.plot)
     output.keep("run_ups.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))

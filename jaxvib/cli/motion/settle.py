@@ -8,8 +8,18 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared
-from jaxvib.cli.document import SEPARATION, chosen_steps, measured_document, run_document
+from jaxvib.cli.app import (
+    SPEED,
+    TOLERANCE,
+    WITHOUT,
+    Output,
+    app,
+    loaded_scene,
+    ranges_within,
+    shared,
+    tolerance_table,
+)
+from jaxvib.cli.document import SEPARATION, chosen_steps, deck_options, measured_document, run_document, run_measures
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
@@ -25,21 +35,46 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode near which
 @_MODE
 @SEPARATION
 @click.option("--drift", type=float, help="Largest drift (relative change) of a settled motion [1e-6, or steady in the mean].")
-@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-9].")
+@click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-9].")
 @click.option("--stretches", type=int, default=200, show_default=True, help="Largest number of stretches.")
 @SPEED
+@TOLERANCE
+@deck_options
 @shared
-def settle(scene: Path, speed: str | None, tolerance: float | None, output: Output, **options: Any) -> None:
+def settle(
+    scene: Path,
+    speed: str | None,
+    tolerance: float | None,
+    tolerances: tuple[str, ...],
+    output: Output,
+    **options: Any,
+) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change, or change without a trend.
 
     --out saves the last stretch. With --drift, the motion must settle to this drift; a motion that is only steady in the mean
     does not suffice.
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
-    run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance, None), **options)
+    run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("history.png", run.plot)
     output.keep("run.npz", run)
-    output.done(run_document(run), run.summary, "settle", run)
+    measures = run_measures(run)
+    ranges = ranges_within(run.scene, _modes_of(run) if tolerances else [], tolerances)
+    document = run_document(run, measures) | ({"tolerances": [each._asdict() for each in ranges]} if tolerances else {})
+    table = [tolerance_table(ranges, tolerances)] if tolerances else []
+    output.done(document, lambda: "\n".join([run.summary(measures), *table]), "settle", run)
+
+
+def _modes_of(run: jv.Run) -> list[int] | None:
+    """Return the jam mode of a run; None for rotating masses of several exciters or without loads.
+
+    **Raises** `InputError` for loads that are not jammed.
+    """
+    if len(run.scene.exciters) > 1 or run.scene.exciter.loads is None:
+        return None
+    if not (mode := int(run.regime.mode)):
+        raise InputError("--tolerance", f"is for jams; these loads are {run.regime.label.replace('_', ' ')}, leave it out")
+    return [mode]
 
 
 @app.command("envelope")
@@ -49,7 +84,7 @@ def settle(scene: Path, speed: str | None, tolerance: float | None, output: Outp
 @_MODE
 @SEPARATION
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
-@click.option("--tolerance", type=float, help="Allowed error of one time step [1e-4].")
+@click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-4].")
 @WITHOUT
 @csv_options
 @shared
@@ -58,8 +93,7 @@ def envelope(
 ) -> None:
     """Integrate the averaged equations of SCENE, with steps of many turns, for long run-ups; --out saves envelope.npz."""
     loaded = loaded_scene(scene, without)
-    steps = None if tolerance is None else jv.Tolerance(tolerance)
-    run = jv.envelope(loaded, stepsize_controller=steps, **_with_start(options))
+    run = jv.envelope(loaded, stepsize_controller=chosen_steps(tolerance), **_with_start(options))
     output.picture("envelope.png", run.plot)
     output.keep("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")

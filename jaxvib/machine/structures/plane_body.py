@@ -175,6 +175,19 @@ class _Bodies(Machine):
             raise InputError(name, f"is {quoted(point)}; on a body in a plane give (x, y), m from its centre of mass")
         return self._point_rows(jnp.asarray(point, dtype), body)
 
+    def support_rows(self) -> tuple[Array, Array]:
+        """Return the rows of all supports, also of those between two bodies."""
+        found: dict[str, list[Array]] = {"stiffness": [], "damping": []}
+        for each in self.supports:
+            rows, along = self._support_rows(each)
+            for name, of_kind in found.items():
+                of_kind.append(_force_rows(each, rows, along, name))
+        return jnp.stack(found["stiffness"]), jnp.stack(found["damping"])
+
+    def upward(self) -> np.ndarray:
+        """Return a translation of all bodies."""
+        return np.tile([0.0, 1.0, 0.0], self.body_count)
+
     def moment_rows(self, about: Array) -> Array:
         """Return the rows (2, nd), see `Machine.moment_rows`.
 

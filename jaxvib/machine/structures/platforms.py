@@ -70,6 +70,14 @@ class Platforms(Machine):
         """Return the vertical motion of the exciter's platform, `at` its number."""
         return Mount(rows=(self.rows_at(self.exciter if at is None else at, "at"),), axes=(1,))
 
+    def support_rows(self) -> tuple[Array, Array]:
+        """Return the rows of the support of each platform."""
+        return jnp.diag(self.stiffness)[:, None], jnp.diag(self.damping)[:, None]
+
+    def upward(self) -> np.ndarray:
+        """Return a translation of all platforms."""
+        return np.ones(self.mass.shape[0])
+
     def rows_at(self, place: Place, name: str = "place") -> Array:
         """Return the row of a platform's coordinate; None is the first platform."""
         n, which = self.mass.shape[0], 1 if place is None else place

@@ -133,6 +133,22 @@ class Rotor(Machine):
         """Return rows (2, 4) of the centre of mass, and of the tilt of the axis."""
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
+    def support_rows(self) -> tuple[Array, Array]:
+        """Return the rows of both supports; those of the foundation if the terms are not those of the supports."""
+        if self.stiffness_terms is not None or self.damping_terms is not None:
+            return super().support_rows()
+        translation, tilt = self._directions()
+        moved = translation[None] + self.position[:, None, None] * tilt[None]
+
+        def rows(across: Array, up: Array | None) -> Array:
+            return jnp.stack([across, across if up is None else up], axis=1)[..., None] * moved
+
+        return rows(self.stiffness, self.stiffness_up), rows(self.damping, self.damping_up)
+
+    def upward(self) -> np.ndarray:
+        """Return a translation of the axis, which is horizontal."""
+        return np.array([0.0, 1.0, 0.0, 0.0])
+
     @property
     def is_split(self) -> bool:
         """True if horizontal and vertical values of the supports differ."""
@@ -304,6 +320,10 @@ class PlanarRotor(Machine):
     def is_split(self) -> bool:
         """True if horizontal and vertical values of the support differ."""
         return self.stiffness_up is not None or self.damping_up is not None
+
+    def upward(self) -> np.ndarray:
+        """Return a translation of the axis, which is horizontal."""
+        return np.array([0.0, 1.0])
 
     def mount(self, at: Place = None) -> Mount:
         """Return the mount, at the rotor's centre. **Raises** `InputError` if a place `at` is given."""

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.dynamics import dynamics_of
+from jaxvib.equations.forces import drive_torques
+from jaxvib.equations.linear import linear_model, peak_force
+from jaxvib.equations.model import assemble
+from jaxvib.equations.torque_balance import resultant_of
 from jaxvib.machine.carrier import Machine
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.mount import Place
-from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, turning_angles, turning_directions
 from jaxvib.results.fields import in_unit
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.measures import Vibration
 from jaxvib.steady.points import rows_in_plane
 
 _HARMONICS = 3
@@ -49,7 +61,7 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
     `Harmonic.rest` (nd, nd).
     """
     count = time.shape[0]
-    weight = jnp.asarray(np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2, time.dtype)[:, None]
+    weight = jnp.asarray(_hann(count), time.dtype)[:, None]
     angle = speed * (time - 0.5 * (time[0] + time[-1]))
     orders = jnp.arange(1, _HARMONICS + 1, dtype=time.dtype)
     waves = jnp.outer(angle, orders)
@@ -58,3 +70,37 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
     own = jnp.array([0, _HARMONICS])
     rest = displacement - found[None, -1] - basis[:, own] @ found[own]
     return found[0] - 1j * found[_HARMONICS], rest.T @ (weight * rest) / jnp.sum(weight)
+
+
+@cached
+def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -> Vibration:
+    """Return the harmonic with the mean speed of the loads that is fitted to a window, the measured amplitudes and the mean
+    torques of the drives.
+
+    The exciter's force is NaN for a rotor with an imbalance, which can turn faster than the loads, and the torque is NaN for
+    loads that spin or slide.
+    """
+    time, states, model = window.time, window.state, assemble(scene)
+    found, _ = fit_harmonic(time, states.displacement, measured.omega)
+    torques = jax.vmap(partial(drive_torques, model, dynamics_of(model)))(time, states)
+    hann = _hann(time.shape[0])
+    weight = jnp.asarray(hann / np.sum(hann), time.dtype)
+    torque, power = (weight @ each for each in torques)
+    slips = np.array([own.spin is not None for own in states.exciters])
+    angles, _ = turning_angles(scene, lambda: time, states)
+    phases = turning_directions(scene)[None] * angles - (measured.omega * (time - 0.5 * (time[0] + time[-1])))[:, None]
+    force = peak_force(measured.omega**2 * resultant_of(linear_model(scene), weight @ jnp.exp(1j * phases)))
+    return Vibration(
+        speed=measured.omega,
+        displacement=found,
+        amplitude=measured.amplitude,
+        foundation_force=measured.foundation_force,
+        exciter_force=jnp.where(has_term(scene.all_effects, RotorImbalance), jnp.nan, force),
+        torque=jnp.where(slips, jnp.nan, torque),
+        power=jnp.where(slips, jnp.nan, power),
+    )
+
+
+def _hann(count: int) -> np.ndarray:
+    """Return weights (count,) that vanish at both ends."""
+    return np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 2

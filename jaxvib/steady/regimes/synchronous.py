@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, Onto, speed_text
 from jaxvib.equations.averaged import require_rotating_masses
-from jaxvib.equations.linear import peak_force
+from jaxvib.equations.linear import linear_model, peak_force
 from jaxvib.equations.torque_balance import (
     TorqueBalance,
     assemble_for_search,
@@ -25,6 +25,7 @@ from jaxvib.equations.torque_balance import (
     motion_of,
     owners_of,
     response_of,
+    resultant_of,
     torques_at,
     unknowns_of,
 )
@@ -41,6 +42,7 @@ from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import degrees
+from jaxvib.steady.measures import Vibration
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 from jaxvib.steady.regimes.local import (
@@ -143,6 +145,10 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         """Return the vibration of the coordinates at Omega."""
         return Harmonic(self.scene.machine, self.speed, self.displacement)
 
+    def vibration(self) -> Vibration:
+        """Return the vibration, for `vibration_measures`."""
+        return _vibration_of(self)
+
     def summary(self) -> str:
         """Return one line of text; phases in degrees."""
         if not np.isfinite(self.speed):
@@ -161,6 +167,16 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         from jaxvib.draw.results import phase_circles  # slow import
 
         return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], ax=ax)
+
+
+@cached
+def _vibration_of(regime: SynchronousRegime) -> Vibration:
+    scene, speed = regime.scene, regime.speed
+    exciter = peak_force(speed**2 * resultant_of(linear_model(scene), jnp.exp(1j * regime.phases)))
+    rotors = jnp.stack([speed if exciter.loads is None else exciter.drive.speed for exciter in scene.exciters])
+    return Vibration(
+        speed, regime.displacement, regime.amplitude, regime.foundation_force, exciter, regime.power / rotors, regime.power
+    )
 
 
 class SynchronousRegimes(AbstractSynchronousRegime):
