@@ -187,81 +187,13 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     return quantity, {k: table[k] for k in more if k in table}
 
 
-TEMPLATE = """# A design: free parameters of the scene, held quantities, demands and the objective.
-scene = "machine.toml"            # path of the scene file, relative to this file
+_FOLDER = Path(__file__).with_name("templates")
 
-[free]                            # bounds, SI or with units, for every support of the scene; entries of 0 stay 0;
-                                  # machine.stiffness[0] frees one entry, also that of a new support
-"machine.stiffness" = ["10 N/mm", "200 N/mm"]
-"machine.link_stiffness" = ["50 N/mm", "500 N/mm"]    # remove this line for a single platform
-
-[[hold]]                          # a quantity that keeps its value during the search
-quantity = "jam_frequency"        # or amplitude, foundation_force, support_frequency_squared, total
-mode = 3                          # number of the jam mode: 2 r - 1 is the jam just below resonance r (1 for one platform)
-value = "570 rpm"                 # default: the value in the scene
-
-[[hold]]
-quantity = "support_frequency_squared"   # sum of k/M over the supports: total stiffness of the suspension
-
-# [[demand]]                      # at_most, at_least or both
-# quantity = "amplitude"
-# mode = 3
-# of = [1, 2]
-# at_least = "2 mm"
-# tier = "exact"                  # "exact": exact motion (default); "leading": light loads
-
-# [ties]                          # parameter = source, [source, factor], or [source, "keep"] for the present ratio
-# "machine.stiffness[1]" = "machine.stiffness[0]"
-
-# [choices]                       # allowed values, such as springs of a catalogue, or numbers of loads
-# "machine.stiffness[0]" = ["20 N/mm", "25 N/mm", "32 N/mm"]
-# "machine.stiffness[1]" = { file = "springs.csv", column = "rate" }    # head of the column: rate (N/mm)
-# "loads.count" = [2, 3, 4]
-
-[objective]
-# tolerances = { "machine.stiffness" = 0.05, "machine.damping" = 0.3 }    # relative tolerances of manufacture
-# statistic = "worst"             # the worst machine within the tolerances; "expected": the mean
-quantity = "force_per_amplitude"  # or amplitude, foundation_force, jam_frequency
-mode = 3
-of = [1, 2]                       # amplitude of platform 1 (y1) relative to platform 2 (y2); of = 1: amplitude of platform 1
-# maximize = true
-
-[search]
-starts = 256
-seed = 0
-# iterations = 100                # number of iterations of the descent
-# rate = 0.05                     # first step of the descent, relative to the range of a free parameter
-# polishing = 12                  # steps of Newton's method at the end
-"""
+TEMPLATE = (_FOLDER / "design.toml").read_text(encoding="utf-8")
 """Commented example of a design file."""
 
 SCREEN_TEMPLATES = {
-    "linear-screen-design": """# A linear screen: all points of the deck move in the same way, along a line.
-scene = "screen.toml"
-
-[recipe]
-name = "linear_screen"
-points = [[-1.5, 0.1], [1.5, 0.1]]   # feed end and discharge end, m from the centre of mass
-angle = "45 deg"
-stroke = "7 mm"                      # peak to peak
-""",
-    "circular-screen-design": """# A circular screen: all points of the deck move in the same way, on a circle.
-scene = "circular_screen.toml"
-
-[recipe]
-name = "circular_screen"
-points = [[-1.3, 0.1], [1.3, 0.1]]   # feed end and discharge end, m from the centre of mass
-stroke = "8 mm"                      # peak to peak
-""",
-    "feeder-design": """# A feeder: least foundation force divided by the amplitude of the trough.
-scene = "feeder.toml"
-
-[recipe]
-name = "feeder"
-points = [[-0.8, 0.1], [0.8, 0.1]]   # rear end and front end, m from the centre of mass
-angle = "25 deg"
-stroke = "4 mm"                      # peak to peak
-spread = 0.1                         # largest spread of the motions over these points
-""",
+    name: (_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+    for name in ("linear-screen-design", "circular-screen-design", "feeder-design")
 }
 """Design files of screens and feeders by their names in `jaxvib new`."""

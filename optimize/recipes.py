@@ -176,7 +176,7 @@ def linear_screen(
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine.
 
     >>> import jaxvib as jv
-    >>> from jaxvib.machine.structures.screens import SCREENS
+    >>> from jaxvib.machine.files import SCREENS
     >>> from optimize.recipes import linear_screen
     >>> linear_screen(jv.scene_from_toml(SCREENS["linear_screen"]), points=[(-1.5, 0.1), (1.5, 0.1)]).space.size
     5

@@ -32,8 +32,7 @@ def new(kind: str, output: Output) -> None:
     machine; design, linear-screen-design, circular-screen-design or feeder-design for `optimize`; sweep (a study) for `sweep`;
     identification (recorded runs of a machine) for `identify` and `plan`; measurement (a recorded swing) for `identify`."""
     from jaxvib.exchange.recordings.fit_file import TEMPLATE as IDENTIFICATION
-    from jaxvib.machine.files import TEMPLATES
-    from jaxvib.machine.structures.screens import SCREENS
+    from jaxvib.machine.files import SCREENS, TEMPLATES
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
     from optimize.files import SCREEN_TEMPLATES

@@ -25,9 +25,7 @@ from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.scene import Exciter, Scene, unbalance
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
-from jaxvib.machine.structures.rotor import TEMPLATES as ROTORS
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
-from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
 from jaxvib.units.known import require_known, when_known
 from jaxvib.units.tables import csv_column
@@ -35,6 +33,7 @@ from jaxvib.units.tables import csv_column
 __all__ = [
     "DRIVES",
     "EFFECTS",
+    "SCREENS",
     "SECTIONS",
     "TEMPLATES",
     "Tables",
@@ -438,74 +437,20 @@ def _plain(value: np.ndarray | float, *, unwrap: bool) -> float | list:
     return array.item() if array.ndim == 0 or (array.size == 1 and unwrap) else array.tolist()
 
 
-_REST = """
-[loads]
-kind = "ball"               # ball, roller, pendulum
-count = 3
-mass = "800 g"              # of one load
-radius = "120 mm"           # radius of the circle on which the centres of the loads run
-drag = "1.5 N s/m"          # viscous resistance of one load to motion relative to the rotor
-# ball_radius = "20 mm"     # of a ball or roller: gathered loads touch; without it they can be at one point
-# inertia = 0.0             # kg m^2 about the centre of mass, pendulums only
+def _template(kind: str, ending: str = "", speed: str = "") -> str:
+    """Return the text of a template; `ending` names the loads, the drive and the effects that machines of one sort share."""
+    folder = Path(__file__).with_name("templates")
+    parts = [(folder / f"{name}.toml").read_text(encoding="utf-8") for name in (kind, ending) if name]
+    return "\n".join(parts).replace("{speed}", speed)
 
-[drive]
-kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
-speed = "{speed}"
-
-[effects]                   # effects of the scene; none by default
-# gravity = true            # gravity on the loads
-# static_imbalance = {{ moment = "5 g m" }}
-# cubic_support = [{{ stiffness = 1e9, platform = 1 }}]
-"""
 
 TEMPLATES: dict[str, str] = {
-    "one_mass": """# A platform on a support, with an exciter.
-# Numbers are in SI units; text can have any unit of the same dimension.
-[machine]
-kind = "one_mass"
-mass = 120.0                # kg, with the body of the exciter, without the loads
-stiffness = "50 N/mm"       # of the support
-damping = 40.0              # N s/m
-"""
-    + _REST.format(speed="600 rpm"),
-    "two_mass": """# Two platforms on supports, joined by a link; platform 2 carries the exciter.
-# Numbers are in SI units; text can have any unit of the same dimension.
-[machine]
-kind = "two_mass"
-mass = [120.0, 117.6]       # kg; platform 2 includes the body of the exciter, without the loads
-stiffness = [5.0e4, 5.0e4]  # N/m, of the supports to the foundation
-damping = [40.0, 40.0]      # N s/m
-link_stiffness = 2.0e5      # N/m, between the platforms
-link_damping = 60.0         # N s/m
-# exciter = 2               # number of the platform with the exciter
-"""
-    + _REST.format(speed="1500 rpm"),
-    "three_mass": """# Three platforms; the links are those between 1-2, 1-3 and 2-3 (0: no link).
-# Numbers are in SI units; text can have any unit of the same dimension.
-[machine]
-kind = "three_mass"
-mass = [60.0, 80.0, 57.6]   # kg; the exciter's platform includes the body of the exciter, without the loads
-stiffness = [0.0, 5.0e4, 0.0]
-damping = [0.0, 40.0, 0.0]
-link_stiffness = [1.0e5, 0.0, 1.0e5]
-link_damping = [20.0, 0.0, 20.0]
-exciter = 3                 # number of the platform with the exciter
-"""
-    + _REST.format(speed="1500 rpm"),
-    "network": """# Any number of platforms, supports and links.
-# Numbers are in SI units; text can have any unit of the same dimension.
-[machine]
-kind = "network"
-mass = [40.0, 40.0, 40.0, 37.6]       # kg; the exciter's platform includes the body of the exciter, without the loads
-stiffness = [2.0e4, 0.0, 0.0, 2.0e4]  # N/m, 0 for a platform without a support
-damping = [20.0, 0.0, 0.0, 20.0]      # N s/m
-links = [[1, 2], [2, 3], [3, 4]]      # pairs of platforms
-link_stiffness = [1.0e5, 1.0e5, 1.0e5]
-link_damping = [20.0, 20.0, 20.0]
-exciter = 4                           # number of the platform with the exciter
-"""
-    + _REST.format(speed="1500 rpm"),
-    **ROTORS,
-    "torus": TORUS,
+    "one_mass": _template("one_mass", "platforms_end", "600 rpm"),
+    **{kind: _template(kind, "platforms_end", "1500 rpm") for kind in ("two_mass", "three_mass", "network")},
+    **{kind: _template(kind, "rotors_end") for kind in ("planar_rotor", "rotor")},
+    "torus": _template("torus"),
 }
-"""Scene files with comments for every kind of machine, and for a rotor with balls in a torus."""
+"""Scene files with comments for every kind of platforms and rotors, and for a rotor with balls in a torus."""
+
+SCREENS = {kind: _template(kind) for kind in ("linear_screen", "circular_screen", "feeder")}
+"""Scene files of a linear screen, a circular screen and a feeder, with the numbers of a data sheet."""

@@ -193,32 +193,3 @@ def _require_room(count: int, radius: float, tube: float, ball_radius: float) ->
         hint = "give a smaller one, or use balls(...) for balls that only run around the axis"
         raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m, which {problem} of {tube:.6g} m radius; {hint}")
     require_side_by_side(count, radius + tube - ball_radius, ball_radius)
-
-
-TEMPLATE = """# A vertical rotor on one support, with balls in a torus as automatic balancer.
-# Numbers are in SI units; text can have any unit of the same dimension.
-[machine]
-kind = "planar_rotor"
-mass = 6.87                 # kg, with the torus, without the balls
-stiffness = "1372 N/m"      # of the support, equal in both directions
-damping = 98.0              # N s/m
-
-[loads]
-kind = "torus_ball"         # ball, roller, pendulum, torus_ball
-count = 2
-mass = "64 g"               # of one ball
-radius = "200 mm"           # of the centre line of the tube
-tube = "15 mm"              # radius of the tube's cross-section
-ball_radius = "12.5 mm"     # of a ball; the rest of the tube is the gap in which it moves up and down
-# drag = 0.0                # N s/m, viscous resistance at the wall
-
-[drive]
-kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
-speed = "140 rad/s"
-
-[effects]                   # effects of the scene
-gravity = { along = "axis" }                   # the axis is vertical
-static_imbalance = { moment = "6.87 g m" }     # of the rotor: mass times eccentricity
-rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths the change of sign
-"""
-"""Scene file with comments."""

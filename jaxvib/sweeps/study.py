@@ -259,44 +259,5 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     return Quantity(name or function, str(table.get("unit", "")), found)
 
 
-TEMPLATE = """# A study: the parameters that vary from case to case, and the quantities measured in each case.
-# Run: jaxvib sweep study.toml
-scene = "machine.toml"            # path of the scene file, relative to this file
-# tier = "exact"                  # method for quantities of a jam: leading (light loads), exact, time [leading]
-# chunk = 1024                    # number of cases computed and written together
-
-[axes]                            # every combination of these; SI or with units; names as in a design file
-"drive.speed" = { from = "600 rpm", to = "1800 rpm", count = 40 }
-"start.rate" = { from = "0 rpm", to = "1800 rpm", count = 40 }    # initial speed of the loads; also start.angle, start.velocity
-# "loads.drag" = { from = 0.5, to = 5.0, count = 10, scale = "log" }
-# "machine.stiffness[0]" = ["40 N/mm", "50 N/mm", "60 N/mm"]
-
-# Parameters with a range but no count are sampled together, for each combination of the others:
-# samples = 256                   # (write these three lines above [axes])
-# sampling = "low_discrepancy"    # or "random"
-# seed = 0
-# "machine.damping" = { from = 30.0, to = 50.0 }
-
-[run]                             # time integration of the full equations; only for quantities that begin with run.
-until = "10 s"
-# start = "jam"                   # initial state if no axis sets it: rest or jam [rest]
-# mode = 3
-# steps = 20000                   # number of equal steps in all cases [one for each radian of the fastest motion]
-
-[[measure]]
-quantity = "run.regime"           # jammed, unbalanced (turning with the rotor), balanced, parted, swinging, unsettled
-[[measure]]
-quantity = "run.mode"             # number of the jam mode, 0 if the loads are not jammed
-[[measure]]
-quantity = "run.load_speed"       # and run.amplitude, run.foundation_force, run.settling_time, run.ripple, run.drift
-
-# [[measure]]                     # any quantity of a design file
-# quantity = "foundation_force"
-# mode = 3
-# name = "force"                  # its name in the store
-
-# [[measure]]                     # your own function of a scene, in a module that Python can import
-# function = "mine:stiffness_ratio"
-# unit = ""
-"""
+TEMPLATE = Path(__file__).with_name("study.toml").read_text(encoding="utf-8")
 """Commented study file."""

@@ -10,8 +10,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.machine.files import TEMPLATES
-from jaxvib.machine.structures.screens import SCREENS
+from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.machine.validation import implausible_numbers
 
 

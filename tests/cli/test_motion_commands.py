@@ -14,8 +14,7 @@ from small_machine import small_run
 import jaxvib as jv
 import optimize
 from jaxvib.cli.app import _HOMES, app, run
-from jaxvib.machine.files import EFFECTS, SECTIONS, TEMPLATES
-from jaxvib.machine.structures.screens import SCREENS
+from jaxvib.machine.files import EFFECTS, SCREENS, SECTIONS, TEMPLATES
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
 from optimize.files import SCREEN_TEMPLATES

@@ -133,57 +133,5 @@ def _options(unknown: object = (), known: object = None) -> tuple[tuple[str, ...
     return tuple(unknown), dict(known or {})
 
 
-TEMPLATE = """# Recorded runs of a machine, from which numbers of its scene are identified.
-[machine]
-file = "machine.toml"       # scene with first values of the unknown numbers; paths are relative to this file
-
-[[run]]
-file = "run_up.csv"         # CSV, TDMS, UFF, MAT, WAV or MF4
-# from = "2 s"              # part of the record
-# until = "40 s"
-# rate = "2 kHz"            # if the file has no times
-
-# [[run]]                   # a second run, with a mass that was added to the first platform
-# file = "heavier.csv"
-# change = { "machine.mass[0]" = "+10 kg" }
-
-[[channel]]
-name = "frame"              # as in the file
-kind = "acceleration"       # velocity, displacement, force, pulses, speed, angle, torque, current
-at = 2                      # number of the platform, or [x, y] on a body
-# unit = "g"                # if the file does not state it
-# direction = "down"        # in which a positive reading points; default: up
-# gain_error = "1 %"        # standard uncertainty of the gain; 1 % by default for accelerations
-# delay = "0.1 ms"
-# high_pass = "0.5 Hz"      # of an IEPE accelerometer
-# range = "50 g"            # readings at the end of the range are clipped
-
-[[channel]]
-name = "tacho"
-kind = "pulses"
-per_turn = 1
-
-[identify]
-unknown = ["machine.stiffness", "machine.damping"]
-# known = { "machine.mass[1]" = "95 kg +- 1 %" }
-
-# [[candidate]]             # for jaxvib plan: a run that could be recorded next
-# name = "slow, heavier"
-# drive = { kind = "run_up", speed = "1200 rpm", acceleration = "2 rad/s^2" }   # or constant_speed (dwell), speed_profile
-# duration = "60 s"
-# rate = "500 Hz"           # default: that of the first run
-# at = { frame = 1 }        # another place of a sensor; two names and places: sensors swapped
-# change = { "machine.mass[0]" = "+10 kg" }
-
-# [[candidate.channel]]     # one more sensor in this candidate
-# name = "deck"
-# kind = "acceleration"
-# at = 2
-# [candidate.noise]
-# deck = "0.05 m/s^2"
-
-# [limits]                  # of the optimized speed
-# speed = "1200 rpm"
-# acceleration = "5 rad/s^2"
-"""
+TEMPLATE = Path(__file__).with_name("identification.toml").read_text(encoding="utf-8")
 """Commented example of an identification file."""

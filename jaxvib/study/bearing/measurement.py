@@ -88,25 +88,5 @@ def _options(dry: object = False, air: object = False, torque: object = False, i
     return {**laws, "instrument": float(number(instrument, "", "identify.instrument", low=0.0))}
 
 
-TEMPLATE = """# Recorded swing of a pendulum that was released on a stationary bearing.
-[record]
-file = "swing.csv"          # two columns, for example: time (s), angle (deg); path relative to this file
-# columns = ["t", "phi"]    # names of the columns, if they are not time and angle
-# angle_unit = "deg"        # if the header does not state it
-# from = "1 s"              # start of the part to use, for example after the release
-# until = "60 s"
-
-[pendulum]
-mass = "300 g"
-length = "250 mm"           # from the axis of the bearing to the centre of mass
-inertia = 0.00625           # kg m^2 about the centre of mass: a rod of length L has m L^2/12
-bearing = "20 mm"           # diameter at which dry friction acts
-# g = 9.81                  # m/s^2
-
-[identify]
-dry = true                  # identify the dry friction mu2 as well as the viscous friction mu1
-# air = true                # and the quadratic drag of the air
-# torque = true             # and a constant torque, such as that of a cable; needs large swings
-instrument = 0.03           # relative uncertainty of the moment of inertia, from its measurement
-"""
+TEMPLATE = Path(__file__).with_name("measurement.toml").read_text(encoding="utf-8")
 """Commented example of a measurement file."""

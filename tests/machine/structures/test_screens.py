@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.machine.structures.screens import SCREENS
+from jaxvib.machine.files import SCREENS
 
 
 @pytest.mark.parametrize("name", SCREENS)
