@@ -156,6 +156,7 @@ from jaxvib.show.sketch import sketch
 # Results
 from jaxvib.report.page import html_report
 from jaxvib.results.csv import write_csv
+from jaxvib.results.estimate import Share, estimate_share
 from jaxvib.results.files import load
 from jaxvib.results.result import Result
 
@@ -315,6 +316,7 @@ __all__ = [
     "envelope",
     "run_up",
     "ensemble",
+    "estimate_share",
     "run_ups",
     "regime",
     "Tolerance",
@@ -327,6 +329,7 @@ __all__ = [
     "MotorRunUp",
     "MotorRunUpStatus",
     "Ensemble",
+    "Share",
     "Regime",
     "RegimeName",
     "Spectrum",

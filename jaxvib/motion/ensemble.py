@@ -29,6 +29,7 @@ from jaxvib.motion.plan import ENSEMBLE_PARTS, plan_ensemble
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.motion.stiffness import is_unresolved
 from jaxvib.ode.types import Y
+from jaxvib.results.estimate import Share, estimate_share
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.devices import on_device
@@ -37,6 +38,10 @@ from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import REFUSED, without_numbers
 from jaxvib.units import Number
+
+_MAX_SLIP = 0.5
+"""Largest `Ensemble.slip` of a run whose masses turn at one speed, rad. It lies between a small swing about constant phases and
+a slow drift of the phases."""
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """Results of `_run`, for one run or for many."""
@@ -72,6 +77,8 @@ class Ensemble(Result):
     - `state`: final `State` of each run, with arrays that have a leading axis over the runs; in single precision angles are
       within one turn
     - `load_speed` (B, count), rad/s: the mean speed of each load over the last quarter of the run
+    - `slip` (B,), rad: largest difference between the angles through which two masses turn, each in its direction, in the last
+      quarter of the run. A mass is a load, or the rotor of an exciter without loads
     - `error` (B,): estimated error of the final state, as for a `Run`, with displacements relative to the largest displacement
       of the same run; typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
       finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
@@ -86,6 +93,7 @@ class Ensemble(Result):
 
     state: State = eqx.field(metadata=part("run"))
     load_speed: Array = eqx.field(metadata=in_unit("rad/s", "run", "load"))
+    slip: Array = eqx.field(metadata=in_unit("rad", "run"))
     error: Array = eqx.field(metadata=in_unit("", "run"))
     allowed: Array = eqx.field(metadata=in_unit("", "run"))
     finite: Array = eqx.field(metadata=in_unit("", "run"))
@@ -105,15 +113,28 @@ class Ensemble(Result):
 
         return jax.vmap(one)(self.allowed, self.finite, self.detached, self.resolved)
 
+    @property
+    def synchronous(self) -> Array:
+        """True for runs (B,) whose masses turn at one speed: the motion stayed finite and `slip` is below 0.5 rad."""
+        return self.finite & (self.slip < _MAX_SLIP)
+
+    @property
+    def synchronous_share(self) -> Share:
+        """Share of `synchronous` runs, with its confidence interval of 95 %."""
+        return estimate_share(self.synchronous)
+
     def summary(self) -> str:
-        """Return the outcomes, the load speeds and the errors of the runs as text."""
+        """Return the outcomes, the load speeds, the share of synchronous runs and the errors of the runs as text."""
         finite = np.asarray(self.finite)
         head = f"{self.message}; {int(self.steps)} steps each, {float(self.seconds):.3g} s in all"
         if not np.any(finite):
             return head
         speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
-        return f"{head}\n  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"
+        lines = [head, f"  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"]
+        if speeds.shape[1] > 1:
+            lines.append(f"  all masses of a run turn at one speed: {self.synchronous_share.text}")
+        return "\n".join(lines)
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
@@ -194,12 +215,14 @@ def ensemble(
         # The error is the part (coarse/each)^3 of the difference, as for a method of order 3. This is conservative, because the
         # method has order 8.
         error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
+    turned = load_speed * turning_directions(plan.scenes) * (plan.end / ENSEMBLE_PARTS)
+    slip = jnp.max(turned, axis=1) - jnp.min(turned, axis=1)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
     if not plan.is_allowed:
-        numbers = last, load_speed, error, finite, resolved, detached
-        last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
-    found = Ensemble(*on_device((last, load_speed, error, plan.allowed, finite, resolved, detached, taken[0], unknown)))
+        numbers = last, load_speed, slip, error, finite, resolved, detached
+        last, load_speed, slip, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
+    found = Ensemble(*on_device((last, load_speed, slip, error, plan.allowed, finite, resolved, detached, taken[0], unknown)))
     if not plan.is_known:
         return found
     jax.block_until_ready(found)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 
 
 class Estimate(NamedTuple):
@@ -18,6 +21,53 @@ class Estimate(NamedTuple):
     error: float
     low: float
     high: float
+
+
+class Share(NamedTuple):
+    """Share of the cases in which a statement is true.
+
+    Returned by `estimate_share`.
+
+    **Attributes**: its `value`; `low` and `high`: Wilson's confidence interval of 95 % for the probability; the number of
+    `hits`, in which the statement is true, and of all `cases`.
+    """
+
+    value: float
+    low: float
+    high: float
+    hits: int
+    cases: int
+
+    @property
+    def text(self) -> str:
+        """The share in percent, with its interval and its numbers of cases."""
+        low, high = 100.0 * self.low, 100.0 * self.high
+        return f"{self.hits} of {self.cases} runs, {100.0 * self.value:.3g} % (95 % interval: {low:.3g} to {high:.3g} %)"
+
+
+@validated
+def estimate_share(flags: Any) -> Share:
+    """Return the share of True among Boolean `flags` of independent cases, with Wilson's confidence interval of 95 %.
+
+    The share of an `Ensemble` estimates a probability if the values of its runs are random samples of their distribution. The
+    width of the interval falls with the root of the number of cases.
+
+    **Arguments**: `flags`, Boolean array; typical: 100 to 10,000 runs.
+
+    **Returns** `Share`. **Raises** `InputError` for anything else than a Boolean array with at least one value.
+
+    >>> import numpy as np, jaxvib as jv
+    >>> share = jv.estimate_share(np.arange(50) < 40)
+    >>> round(share.value, 3), round(share.low, 3), round(share.high, 3)
+    (0.8, 0.67, 0.888)
+
+    Source: see `wilson`.
+    """
+    if getattr(getattr(flags, "dtype", None), "kind", "") != "b" or not np.size(flags):
+        raise InputError("flags", f"is {quoted(flags)}; it must be an array of at least one Boolean value")
+    hits, cases = int(np.sum(np.asarray(flags))), np.size(flags)
+    low, high = (float(end) for end in wilson(np.asarray(hits), np.asarray(cases)))
+    return Share(hits / cases, low, high, hits, cases)
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
@@ -41,3 +91,21 @@ def student_quantile(freedom: int) -> float:
     z = 1.959963985
     terms = (z**3 + z, (5 * z**5 + 16 * z**3 + 3 * z) / 24, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 96)
     return z + sum(term / (4.0 * freedom ** (k + 1)) for k, term in enumerate(terms))
+
+
+def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
+    """Return Wilson's confidence interval (default: 95 %) of the share `hits` / `cases`; 0 to 1 if there are no cases.
+
+    It contains all shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
+
+    >>> [round(float(end), 4) for end in wilson(np.asarray(0), np.asarray(10))]
+    [0.0, 0.2775]
+
+    Source: E. B. Wilson, Probable inference, the law of succession, and statistical inference, 1927.
+    """
+    n = np.maximum(cases, 1)
+    share, more = hits / n, z**2 / n
+    middle = (share + more / 2.0) / (1.0 + more)
+    half = z * np.sqrt(share * (1.0 - share) / n + more / (4.0 * n)) / (1.0 + more)
+    none = np.asarray(cases) == 0
+    return np.where(none, 0.0, np.maximum(middle - half, 0.0)), np.where(none, 1.0, np.minimum(middle + half, 1.0))

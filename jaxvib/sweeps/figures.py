@@ -14,6 +14,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.files import scene_from_toml, suggest_name
 from jaxvib.machine.numbers.named import find_number
+from jaxvib.results.estimate import wilson
 from jaxvib.steady.orbits.diagram import exact_branches
 from jaxvib.sweeps.axes import SAMPLE, axis_of, put
 from jaxvib.sweeps.store import Store
@@ -37,24 +38,6 @@ class _Labels(NamedTuple):
 
     codes: np.ndarray
     names: list[str]
-
-
-def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
-    """Return Wilson's confidence interval (default: 95 %) of the share `hits` / `cases`; 0 to 1 if there are no cases.
-
-    It contains all shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
-
-    >>> [round(float(end), 4) for end in wilson(np.asarray(0), np.asarray(10))]
-    [0.0, 0.2775]
-
-    Source: E. B. Wilson, Probable inference, the law of succession, and statistical inference, 1927.
-    """
-    n = np.maximum(cases, 1)
-    share, more = hits / n, z**2 / n
-    middle = (share + more / 2.0) / (1.0 + more)
-    half = z * np.sqrt(share * (1.0 - share) / n + more / (4.0 * n)) / (1.0 + more)
-    none = np.asarray(cases) == 0
-    return np.where(none, 0.0, np.maximum(middle - half, 0.0)), np.where(none, 1.0, np.minimum(middle + half, 1.0))
 
 
 def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:

@@ -8,7 +8,7 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.draw.sweeps import label_map
-from jaxvib.sweeps.figures import plot_distribution, plot_map, plot_shares, plot_tornado, wilson
+from jaxvib.sweeps.figures import plot_distribution, plot_map, plot_shares, plot_tornado
 from jaxvib.sweeps.study import study
 from jaxvib.sweeps.sweep import run_study
 from optimize import Quantity
@@ -39,19 +39,6 @@ def sampled(tmp_path_factory):
     axes = {"loads.drag": {"from": 1.0, "to": 2.0}, "drive.speed": {"from": 40.0, "to": 80.0}}
     asked = study(SCENE, axes, [Quantity("weighted", "N", weighted)], samples=3000, chunk=1024)
     return run_study(asked, tmp_path_factory.mktemp("sampled") / "sampled.zarr")
-
-
-@pytest.mark.parametrize(("hits", "cases"), [(0, 7), (3, 10), (10, 10), (250, 1000)])
-def test_the_ends_of_an_interval_are_shares_just_not_excluded(hits, cases):
-    for end in wilson(np.asarray(hits), np.asarray(cases)):
-        np.testing.assert_allclose((hits / cases - end) ** 2, 1.959964**2 * end * (1.0 - end) / cases, atol=1e-15)
-
-
-def test_intervals_hold_the_share_as_often_as_they_say():
-    hits = np.random.default_rng(0).binomial(40, 0.1, 20000)
-    low, high = wilson(hits, np.full(hits.shape, 40))
-    assert 0.93 < np.mean((low <= 0.1) & (high >= 0.1)) < 0.98
-    assert wilson(np.asarray(0), np.asarray(0)) == (0.0, 1.0)
 
 
 def test_a_map_has_the_values_at_their_place(grid):

@@ -69,6 +69,27 @@ def test_ensembles_of_two_motors_obey_the_equations_by_hand():
     assert many.load_speed.shape == (3, 2) and not bool(jnp.any(many.detached))
 
 
+def test_share_that_synchronises_jumps_at_the_closed_form():
+    """Opposite motors on soft supports: up to a half difference of their torques of W = w^2 S^2 l_1 l_2 / (2 J)."""
+    springs = [jv.support(at=(x, 0.0), stiffness=(1e4, 1e4), damping=(500.0, 500.0)) for x in (-1.0, 1.0)]
+    body, speed, slope = jv.plane_body(mass=2000.0, inertia=600.0, supports=springs), 100.0, 3.0
+
+    def screen(difference):
+        parts = ((-0.9, 1, speed + difference / 2.0), (0.8, -1, speed - difference / 2.0))
+        motors = [(x, way, jv.DCMotor(n, stall_torque=slope * n, inertia=0.2)) for x, way, n in parts]
+        return jv.Scene(body, exciters=[jv.Exciter(drive=m, unbalance=1.5, at=(x, 0.0), direction=w) for x, w, m in motors])
+
+    limit = 2.0 * (speed**2 * 1.5**2 * 0.9 * 0.8 / (2.0 * 600.0)) / slope
+    many = jv.ensemble(screen, limit * jnp.asarray([0.3, 0.6, 0.9, 0.95, 1.05, 1.1, 1.3, 1.6]), 10.0, estimate=False)
+    assert many.synchronous.tolist() == [True] * 4 + [False] * 4
+    turned = 2.5 * (many.load_speed[:, 0] + many.load_speed[:, 1])  # the second motor turns clockwise
+    np.testing.assert_allclose(many.slip, np.abs(turned), atol=1e-9)
+    # Wilson's interval of 4 of 8 cases.
+    half = 1.959964 * np.sqrt(0.25 / 8.0 + 1.959964**2 / (4.0 * 64.0)) / (1.0 + 1.959964**2 / 8.0)
+    np.testing.assert_allclose(many.synchronous_share, (0.5, 0.5 - half, 0.5 + half, 4, 8), rtol=1e-9)
+    assert "all masses of a run turn at one speed: 4 of 8 runs, 50 % (95 % interval: 21.5 to 78.5 %)" in many.summary()
+
+
 def test_saved_runs_of_several_exciters_are_read_back(tmp_path):
     run = jv.simulate(SCENE, 0.5, samples=16, estimate=False)
     again = jv.load(run.save(tmp_path / "run"))

@@ -61,6 +61,28 @@ def test_motion_stays_inside_the_limit_and_is_lost_outside(case):
     assert abs(phase_at_end(outside, near, 60.0) - phase) > 2.0 * np.pi
 
 
+def run_up_shares(inertia, fold, away):
+    """Shares that synchronise after a run-up from rest, for speeds of the second motor within the fold and beyond it."""
+    motor = jv.DCMotor(100.0, stall_torque=300.0, inertia=inertia)
+    scene = scene_of([motor, motor], (1, -1))
+    speeds = jnp.concatenate([fold - away, fold + away])
+    found = jv.ensemble(lambda n: eqx.tree_at(lambda s: s.exciters[1].drive.speed, scene, n), speeds, 15.0, estimate=False)
+    return [jv.estimate_share(part) for part in np.split(np.asarray(found.synchronous), 2)]
+
+
+@pytest.mark.slow
+def test_share_that_synchronises_jumps_at_the_exact_limit():
+    """Speeds 3 to 20 % of the range within the fold and beyond it. Heavy rotors keep different speeds within the fold too."""
+    motor = jv.DCMotor(100.0, stall_torque=300.0, inertia=0.2)
+    scene = scene_of([motor, motor], (1, -1))
+    limit = jv.synchronization_limit(scene, jv.synchronous_regimes(scene).select(0), over="exciters[1].drive.speed")
+    fold = float(limit.value[1])
+    away = jnp.linspace(0.03, 0.2, 40) * (fold - 100.0)
+    inside, outside = run_up_shares(0.2, fold, away)
+    assert inside.value == 1.0 and inside.low > 0.91 and outside.value == 0.0 and outside.high < 0.09
+    assert run_up_shares(0.5, fold, away)[0].value == 0.0
+
+
 def central(torque):
     """One motor at the centre of a body on equal springs: the body moves on circles, and averaging is exact."""
     springs = [jv.support(at=(x, 0.0), stiffness=(3e4, 3e4), damping=(300.0, 300.0)) for x in (-0.6, 0.6)]
