@@ -44,6 +44,8 @@ _DIGITS = 5
 
 _MAX_UNEVEN = 1e-6
 _MAX_BYTES = 2**28
+_TAIL = 200
+"""Number of bytes at the end of a file that are examined for the end of its last dataset."""
 
 
 class _Node(NamedTuple):
@@ -360,6 +362,8 @@ def read_uff(path: str | Path) -> UffFile:
     try:
         with open_regular(path) as file:
             size = file.seek(0, os.SEEK_END)
+            file.seek(max(size - _TAIL, 0))
+            tail = file.read().split()
     except OSError as error:
         raise InputError("path", f"is {quoted(str(path))}, which cannot be read ({error.strerror}); give a UFF file") from error
     if size > _MAX_BYTES:
@@ -370,6 +374,13 @@ def read_uff(path: str | Path) -> UffFile:
         why = " ".join(str(error).split())
         raise InputError("path", f"is {quoted(str(path))}, which cannot be read as a UFF file ({why})") from error
     sets = sets if isinstance(sets, list) else [sets]
+    if sets and tail[-1:] != [b"-1"]:
+        raise InputError("path", f"is {quoted(str(path))}, whose last dataset was cut off; export it again")
+    for k, each in enumerate(each for each in sets if each.get("type") == 58):
+        stated, there = int(each["num_pts"]), np.size(each["data"])
+        if stated != there:
+            problem = f"whose function {k + 1} has {there} values where its header states {stated}"
+            raise InputError("path", f"is {quoted(str(path))}, {problem}; export it again")
     length, force = next(((each["length"], each["force"]) for each in sets if each.get("type") == 164), (1.0, 1.0))
     functions = tuple(_read_function(each, length, force) for each in sets if each.get("type") == 58)
     if not functions:

@@ -211,6 +211,40 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, name):
         jv.read_recording(tmp_path / f"missing_{name}")
 
 
+def write_wav(path):
+    wavfile = pytest.importorskip("scipy.io.wavfile")
+    wavfile.write(path, 1000, np.stack([FRAME, BASE], axis=1).astype(np.float32))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.998])
+@pytest.mark.parametrize(
+    ("name", "write", "says"),
+    [
+        ("run.csv", write_csv, r"line \d+ has [123] columns; the lines above have 4"),
+        ("run.tdms", write_tdms, "where its header states 2000: the recording was cut off"),
+        ("run.uff", write_uff, "whose last dataset was cut off; export it again"),
+        ("run.wav", write_wav, "bytes where its header states 16058: the recording was cut off; export it again"),
+        ("run.mat", write_mat, r"cannot be read as a MATLAB file \(could not read bytes\); export it again"),
+        ("run73.mat", write_mat_73, r"cannot be read as a MATLAB file .*truncated file.*; export it again"),
+    ],
+)
+def test_recordings_that_were_cut_off_are_refused(tmp_path, name, write, says, share):
+    write(tmp_path / name)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content[: int(share * len(content)) // 36 * 36])
+    with pytest.raises(jv.InputError, match=says):
+        jv.read_recording(tmp_path / name)
+
+
+@pytest.mark.parametrize("stated", [1990, 2010])
+def test_number_of_values_in_a_header_is_compared_with_the_data(tmp_path, stated):
+    write_uff(tmp_path / "run.uff")
+    text = (tmp_path / "run.uff").read_text()
+    (tmp_path / "run.uff").write_text(text.replace("      2000 ", f"      {stated} ", 1))
+    with pytest.raises(jv.InputError, match=f"whose function 1 has 2000 values where its header states {stated}; export"):
+        jv.read_recording(tmp_path / "run.uff")
+
+
 def test_times_and_values_of_different_length_are_refused(tmp_path):
     pytest.importorskip("scipy.io").savemat(tmp_path / "run.mat", {"t": T[:-5], "frame": FRAME})
     with pytest.raises(jv.InputError, match="has 1995 times but 2000 values; save both with the same length"):

@@ -22,6 +22,9 @@ from jaxvib.results.table import read_table
 from jaxvib.units.columns import split_head, unit_factor
 
 _MAX_BYTES = 2**32
+_UNKNOWN_SIZE = 2**32 - 1
+"""Size in the header of a WAV file that was written without knowing it."""
+
 _TIME_NAMES = ("time", "t", "times", "timestamp", "x_value", "zeit", "время")
 """Names of a channel of times, in lower case."""
 
@@ -118,8 +121,17 @@ def _stated_rate(remarks: list[str]) -> float | None:
     return None
 
 
+def _cut_off(path: Path, difference: str) -> InputError:
+    """Return the error of a file whose header and data have different lengths."""
+    return InputError(str(path), f"{difference}: the recording was cut off; export it again")
+
+
 def _read_tdms(path: Path, rate: float | None) -> Iterator[Recorded]:
     tdms = optional_module("nptdms", "tdms").TdmsFile.read(str(path))
+    for name, status in (tdms.file_status.channel_statuses or {}).items():
+        if status.read_length != status.expected_length:
+            header, found = status.expected_length, status.read_length
+            raise _cut_off(path, f"has {found} readings of {name} where its header states {header}")
     for group in tdms.groups():
         channels = [each for each in group.channels() if np.issubdtype(each.dtype, np.number)]
         clock = next((each for each in channels if each.name.lower() in _TIME_NAMES), None)
@@ -143,6 +155,11 @@ def _read_uff(path: Path, rate: float | None) -> Iterator[Recorded]:
 
 def _read_wav(path: Path, rate: float | None) -> Iterator[Recorded]:
     wavfile = optional_module("scipy.io.wavfile", "mat")
+    with path.open("rb") as file:
+        head, size = file.read(8), file.seek(0, os.SEEK_END)
+    stated = int.from_bytes(head[4:], "little") + 8
+    if head[:4] == b"RIFF" and size < stated < _UNKNOWN_SIZE:
+        raise _cut_off(path, f"has {size} bytes where its header states {stated}")
     with warnings.catch_warnings():  # of chunks with notes
         warnings.simplefilter("ignore", wavfile.WavFileWarning)
         own, data = wavfile.read(path)
