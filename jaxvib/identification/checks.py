@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxvib.identification.directions import Information, eliminate, elimination, polar_unbalances
 from jaxvib.identification.fit import Fitted, angle_shares, prior_equations, run_equations
+from jaxvib.identification.records.orders import foreign_vibration
 
 CHANCE = 1e-5
 """Share of records with pure noise about the fit that get the status `patterned`."""
@@ -34,6 +35,12 @@ _DECAY_TIMES = 2.0
 _UNEXPLAINED = 0.5
 """Share of a channel's standard deviation in the residuals above which a fit counts as none."""
 
+_MOSTLY = 0.5
+"""Share of the power of a signal in one vibration above which the signal is said to be this vibration."""
+
+_NOISE_LIKE = 0.01
+"""Power of residuals relative to the readings below which a vibration of constant frequency counts as noise."""
+
 
 class FitStatus(eqx.Enumeration):
     """Outcomes of a fit of a machine. The value of each member is the message shown to the user."""
@@ -46,7 +53,8 @@ class FitStatus(eqx.Enumeration):
     )
     undetermined = "the records do not determine all unknowns: see `undetermined` for the directions and how to determine them"
     contradicted = (
-        "the records contradict one another, a known value or the calibration of a sensor: see the notes, and check that value"
+        "the records contradict one another, the scene, a known value or the calibration of a sensor: see the notes, and check "
+        "that value"
     )
     not_converged = (
         "no fit was found: the model does not resemble the records; check places and directions of the channels and the "
@@ -65,13 +73,12 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
                 f"the rotor's angle in run {k + 1} has the standard error {error:.2g} rad between its pulses, and a fit may "
                 "end in a wrong minimum: use more pulses per turn, or sample them faster"
             )
-    explained, is_inaccurate = [], False
+    is_inaccurate, has_fit = False, resembles(fitted)
+    foreign = list(_foreign_vibrations(fitted, has_fit))
+    notes += foreign
     shares = angle_shares(fitted)
-    for k, (samples, left, raw, mask) in enumerate(
-        zip(fitted.problem.runs, fitted.residuals, fitted.problem.raw, fitted.problem.masks, strict=True)
-    ):
+    for k, (samples, left) in enumerate(zip(fitted.problem.runs, fitted.residuals, strict=True)):
         for c, channel in enumerate(samples.channels):
-            valid = mask[:, c]
             if shares[k][c] > _ANGLE_SHARE:
                 is_inaccurate = True
                 notes.append(
@@ -84,18 +91,54 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
                     f"{fitted.outliers[k][c]:.1%} of the readings of channel {channel.name!r} in run {k + 1} are outliers, "
                     "which have little influence"
                 )
-            explained.append(np.std(left[valid, c]) / max(float(np.std(raw[valid, c])), 1e-300))
             one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], fitted.problem.angles[k][:, 0], fitted.x.size)
             if one < CHANCE:
                 notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with the rotor's angle")
             chance = min(chance, one)
-    if not fitted.converged or min(explained) > _UNEXPLAINED:
+    if not has_fit and not foreign:
         return FitStatus.not_converged, chance, notes
-    if contradicted:
+    if contradicted or not has_fit:
         return FitStatus.contradicted, chance, notes
-    if chance < CHANCE or is_inaccurate or max(coarse) > _COARSE_ANGLE:
+    if foreign or chance < CHANCE or is_inaccurate or max(coarse) > _COARSE_ANGLE:
         return FitStatus.patterned, chance, notes
     return FitStatus.undetermined if found.undetermined.size else FitStatus.found, chance, notes
+
+
+def resembles(fitted: Fitted) -> bool:
+    """Return True if the model resembles the records: the fit has converged, and a channel has smaller residuals than half of
+    its readings."""
+    problem = fitted.problem
+    shares = [
+        np.std(left[mask[:, c], c]) / max(float(np.std(raw[mask[:, c], c])), 1e-300)
+        for left, raw, mask in zip(fitted.differences, problem.raw, problem.masks, strict=True)
+        for c in range(raw.shape[1])
+    ]
+    return fitted.converged and bool(min(shares) <= _UNEXPLAINED)
+
+
+def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
+    """Yield sentences about vibrations that are not at the speed of the rotor: in the residuals, or in the readings if there is
+    no fit."""
+    problem = fitted.problem
+    if len(problem.unbalances) > 1:
+        return
+    for k, (samples, raw, mask, left) in enumerate(
+        zip(problem.runs, problem.raw, problem.masks, fitted.residuals, strict=True)
+    ):
+        for c, channel in enumerate(samples.channels):
+            readings = np.where(mask[:, c], raw[:, c], np.nan)
+            values = left[:, c] if has_fit else readings
+            found = foreign_vibration(values, problem.angles[k][:, 0], float(samples.step))
+            if found is None or found.share < _MOSTLY:
+                continue
+            if has_fit and found.order is None and np.nanvar(values) < _NOISE_LIKE * np.nanvar(readings):
+                continue
+            what = "residuals" if has_fit else "readings"
+            yield (
+                f"{found.share:.0%} of the power of the {what} of channel {channel.name!r} in run {k + 1} is {found.place}, "
+                "but an unbalance turns with the rotor: use the tachometer of the vibrating shaft, or leave out the part of "
+                "the record in which loads are jammed or another machine runs"
+            )
 
 
 def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found: int) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.identification.checks import FitStatus, coverage_notes, status_of
+from jaxvib.identification.checks import FitStatus, coverage_notes, resembles, status_of
 from jaxvib.identification.directions import (
     Direction,
     Information,
@@ -191,7 +191,7 @@ def identify(
     - `throw`: raise if no fit is found
 
     **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,
-    `ComputationError` "not_converged".
+    `ComputationError` "not_converged", or "contradicted" if the records vibrate at another frequency than the rotor's.
 
     >>> import numpy as np, jaxvib as jv
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
@@ -224,9 +224,10 @@ def identify(
     if free >= readings:
         raise InputError("unknown", f"has {free} unknowns with those of the runs, for {readings} readings; record longer runs")
     fitted = fit_from(problem, [np.zeros(problem.unknowns.count), track_orders(problem)])
-    found = _interpret(scene, _near_first_values(scene, problem, fitted))
-    if throw and bool(found.status == FitStatus.not_converged):
-        raise ComputationError("not_converged", found.message)
+    fitted = _near_first_values(scene, problem, fitted)
+    found = _interpret(scene, fitted)
+    if throw and not resembles(fitted):
+        raise ComputationError(found.status_name, "; ".join([found.message, *found.notes]))
     return found
 
 
@@ -262,7 +263,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         fitted_to, known.names, known.covariance, known.undetermined, known.errors, lambda scene: np.concatenate(natural(scene))
     )
     estimates = list(map(_estimate, known.values, known.scale, known.logarithmic, _spreads(known), known.determined))
-    ends = profile_intervals(fitted, known) if bool(status != FitStatus.not_converged) else {}
+    ends = profile_intervals(fitted, known) if resembles(fitted) else {}
     for name, (low, high) in ends.items():
         i = known.names.index(name)
         estimates[i] = _with_ends(estimates[i], known.scale[i], bool(known.logarithmic[i]), low, high)
