@@ -243,3 +243,12 @@ def test_numbers_of_own_parts_are_named_without_metadata():
     torque = find_number(of, "drive.stall_torque", "axes")
     assert torque.unit == "" and torque.words(of) == ["stall torque"]
     assert float(put_numbers(of, (torque,), jnp.array([4.0])).drive.stall_torque) == 4.0
+
+
+def test_entries_of_a_matrix_are_numbered_row_by_row():
+    machine = jv.from_matrices(np.eye(2), 0.1 * np.eye(2), np.array([[3.0, -1.0], [-1.0, 2.0]]), places=[[0]])
+    of = jv.Scene(machine, jv.balls(**BALLS), jv.ConstantSpeed(100.0))
+    entry = find_number(of, "machine.stiffness[2]", "unknown")
+    assert float(entry.read(of)[0]) == -1.0
+    changed = put_numbers(of, (entry,), np.array([-0.5])).machine.stiffness
+    np.testing.assert_array_equal(changed, [[3.0, -1.0], [-0.5, 2.0]])

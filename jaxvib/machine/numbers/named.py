@@ -69,7 +69,7 @@ class NamedNumber(NamedTuple):
     def read(self, scene: Scene) -> Array:
         """Return the values (size,), SI."""
         leaf = jnp.asarray(self.leaf(scene))
-        return jnp.reshape(leaf if self.entry is None else leaf[self.entry], (-1,))
+        return jnp.reshape(leaf if self.entry is None else _row_by_row(leaf)[self.entry], (-1,))
 
     def value(self, given: Number, field: str) -> float:
         """Return a user's value in SI.
@@ -220,13 +220,19 @@ def _why_unnamed(scene: Scene, name: str) -> str:
     )
 
 
+def _row_by_row(leaf: Array) -> Array:
+    """Return the entries of an array as their numbers count them."""
+    return leaf if leaf.ndim < 2 else jnp.ravel(leaf)
+
+
 def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array | np.ndarray) -> Scene:
     """Return the scene with `values` (sum of the sizes,), SI, for the parameters `found` in their order."""
     leaves: dict[_Path, Array] = {}
     start = 0
     for each in found:
         leaf, new = jnp.asarray(leaves.get(each.path, each.leaf(scene))), values[start : start + each.size]
-        leaves[each.path] = jnp.reshape(new, jnp.shape(leaf)) if each.entry is None else leaf.at[each.entry].set(new[0])
+        changed = new if each.entry is None else _row_by_row(leaf).at[each.entry].set(new[0])
+        leaves[each.path] = jnp.reshape(changed, leaf.shape)
         start += each.size
     where = {each.path: each for each in found}
     return eqx.tree_at(lambda s: [each.leaf(s) for each in where.values()], scene, list(leaves.values()))
