@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -15,6 +16,7 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
+from jaxvib.identification.records.decimation import MIN_LONG, decimated
 from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term
@@ -39,6 +41,9 @@ EXACT = 1e-4
 
 _FILTER_LENGTHS = (1, 9, 49, 129, 513)
 """Lengths to which filters are extended, so that a few programs serve all of them."""
+
+_MARGIN, _TIMES = 1.5, 64
+"""Margin of the highest natural frequency, and number of times at which the speed of a drive is evaluated for it."""
 
 _DELAY_MARGIN = 2
 """Steps by which readings and model are both delayed in addition, so that the interpolation has samples on both sides."""
@@ -156,6 +161,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
             means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
             errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
 
+    runs = [_with_own_rate(scene, run) for run in runs]
     notes = [note for run in runs for note in run.notes]
     notes += [f"{run.source}: channel {c.name!r} of kind {c.kind} is not used" for run in runs for c in run.of_kind(*UNUSED)]
     angles = [rotor_angles(_changed(scene, run), run) for run in runs]
@@ -187,6 +193,21 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
         angle_errors=tuple(max(angle.error for angle in each) for each in angles),
         notes=tuple(dict.fromkeys(notes)),
     )
+
+
+def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
+    """Return a run with a sampling rate for the highest frequency of the motion, rad/s, with a margin for the first values."""
+    if max(time.size for time in run.times.values()) < MIN_LONG:
+        return run
+    measured = run.rotor_speed()
+    if measured is not None:
+        fastest = float(np.quantile(np.abs(measured[1]), 0.999))
+    else:
+        times = jnp.linspace(*run.span, _TIMES)
+        drives = [exciter.drive for exciter in scene.exciters if exciter.drive.ideal]
+        speeds = [jax.vmap(lambda t, drive=drive: drive.rotor_speed(t, None))(times) for drive in drives]
+        fastest = float(np.max(np.abs(np.asarray(speeds)), initial=0.0))
+    return decimated(run, max(fastest, _MARGIN * float(np.max(natural(scene)[0], initial=0.0)), 1e-300))
 
 
 def _require_linear(scene: Scene) -> None:

@@ -70,6 +70,17 @@ def test_errors_are_those_of_the_cramer_rao_bound():
     np.testing.assert_allclose(found, bound(T, fit.names, NOISE), rtol=0.05)
 
 
+def test_long_record_has_the_errors_of_all_its_readings():
+    """At 2 kHz the record has four times as many readings of the same noise as at 500 Hz, and is filtered to 167 Hz."""
+    times = 0.0005 * np.arange(32_000)
+    run = record(times, accelerations(times, [TRUTH])[0], NOISE, np.random.default_rng(7))
+    fit = jv.identify(start(1.05, 1.2), run, unknown=NAMES)
+    assert fit.status_name == "found" and any("rate was lowered from 2000 to 166.667 Hz" in note for note in fit.notes)
+    assert np.max(np.abs(distances(fit))) < 4.0
+    ratio = [each.error / other.error for each, other in zip(fit.estimates, fitted().estimates, strict=True)]
+    np.testing.assert_allclose(ratio, 0.5, rtol=0.05)
+
+
 @pytest.mark.slow
 def test_intervals_hold_the_truth_in_repeated_records():
     ratios = np.array([distances(jv.identify(start(), run_of(seed), unknown=NAMES)) for seed in range(1, 25)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -33,7 +34,7 @@ class PlannedRun(eqx.Module):
       its name, and thereby its gain, at another place
     - `rate`, Hz, of the samples; typical: 200 to 2000
     - `noise`: standard deviation of the readings by the name of the channel, for channels that no run so far has, in SI units
-      or as strings; typical: "0.05 m/s^2"
+      or as strings; typical: "0.05 m/s^2". Other channels have the noise of the fit, with the same power in each frequency
     - `change`: numbers of the scene that differ in this run, as in `MeasuredRun.from_arrays`
 
     **Raises** `InputError` for a drive whose speed depends on the machine, and for values that are not positive.
@@ -101,10 +102,11 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
 
     **Raises** `InputError` for a channel whose noise is unknown, and for a scene with several exciters.
     """
+    # Noise has the same power in each frequency at all sampling rates: deviations per square root of the rate.
     deviations: dict[str, float] = {}
-    for names, noise in reversed(list(zip(fit.channels, fit.noise, strict=True))):
-        deviations |= dict(zip(names, noise, strict=True))
-    deviations |= planned.noise
+    for names, noise, time in reversed(list(zip(fit.channels, fit.noise, fit.time, strict=True))):
+        deviations |= dict(zip(names, noise * math.sqrt(time[1] - time[0]), strict=True))
+    deviations |= {name: each / math.sqrt(planned.rate) for name, each in planned.noise.items()}
     moving = [channel for channel in planned.channels if channel.kind in MOTIONS]
     for channel in moving:
         if channel.name not in deviations:
@@ -118,7 +120,8 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
         raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
     scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(None, planned.drive))
     problem = build_problem(scene, [run], fit.names, {})
-    problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name])) for c in moving]])
+    root = math.sqrt(float(problem.runs[0].step))
+    problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name]) / root) for c in moving]])
     problem = problem._replace(precisions=own_precisions(fit, problem))
     size = float(np.asarray(exciter.unbalance, float))
     fitted = information_at(problem, size * np.array([np.cos(fit.phase[0]), np.sin(fit.phase[0])]))

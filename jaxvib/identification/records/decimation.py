@@ -1,0 +1,132 @@
+"""Lower sampling rate of long records: a low-pass filter, of which every n-th reading is kept.
+
+Readings that are recorded much faster than the machine moves contain nothing but noise and other vibrations above its band. The
+filter is symmetric in time. Its gain is 1 up to 0.3 times the new rate and 0 from 0.7 times the new rate, both to 1e-5. What is
+folded back lies above 0.3 times the new rate, and white noise remains nearly white.
+
+Outliers and missing readings are replaced by the filtered signal before it is filtered again, which is exact enough because
+they are much shorter than the response of the filter.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxvib.identification.run import MeasuredRun
+
+SAMPLES_PER_PERIOD = 10.0
+"""Smallest number of samples per period of the highest frequency."""
+
+MIN_LONG = 2**14
+"""Smallest number of samples of a record that is filtered."""
+
+_MIN_FACTOR, _MIN_LEFT = 4, 1024
+"""Smallest factor between the rates, and smallest number of samples after the filter."""
+
+_HALF_LENGTH, _KAISER = 8, 10.06
+"""Half of the length of the filter, in new steps, and the parameter of its Kaiser window: 100 dB."""
+
+_PASSES, _OUTLIER_DISTANCE, _RIPPLE = 4, 6.0, 1e-3
+"""Largest number of filter passes for a record with outliers or missing readings; distance of an outlier from the filtered
+signal in standard deviations of this difference, and relative to the size of the signal, above the error of the filter."""
+
+_NEIGHBORS = 2
+"""Number of readings on each side of an outlier with which it is compared."""
+
+_PIECE = 2**18
+"""Number of readings that are filtered at once."""
+
+_KINDS = ("acceleration", "velocity", "displacement", "force", "angle", "speed")
+
+
+def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
+    """Return a run with a lower sampling rate, and a note about it, if it is long and much faster than the `highest` frequency
+    (rad/s) of the machine and its rotors; otherwise the same run.
+
+    Runs with clipped readings, which are bounds, and with channels at different times are not changed.
+    """
+    channels = run.of_kind(*_KINDS)
+    first = run.times[channels[0].name] if channels else np.zeros(0)
+    rate = (first.size - 1) / max(first[-1] - first[0], 1e-300) if first.size > 1 else 0.0
+    factor = min(math.floor(rate * 2.0 * np.pi / (SAMPLES_PER_PERIOD * highest)), first.size // _MIN_LEFT)
+    if factor < _MIN_FACTOR or first.size < MIN_LONG:
+        return run
+    for channel in channels:
+        time = run.times[channel.name]
+        same = time.size == first.size and abs(time[0] - first[0]) + abs(time[-1] - first[-1]) < 0.01 / rate
+        if not same or np.any(run.clipped[channel.name]):
+            return run
+    half = _HALF_LENGTH * factor
+    kept = slice(half, first.size - half, factor)
+    values, replaced = dict(run.values), 0
+    for channel in channels:
+        values[channel.name], count = filtered(run.values[channel.name], factor)
+        replaced += count
+    names = {channel.name for channel in channels}
+    time = first[kept].copy()
+    note = (
+        f"{run.source}: the readings were filtered to the band of the machine, and their rate was lowered from {rate:.6g} to "
+        f"{rate / factor:.6g} Hz"
+    )
+    return dataclasses.replace(
+        run,
+        times=run.times | dict.fromkeys(names, time),
+        values=values,
+        clipped=run.clipped | dict.fromkeys(names, np.zeros(time.size, bool)),
+        notes=(*run.notes, f"{note}; {replaced} readings far from the filtered ones were left out" if replaced else note),
+    )
+
+
+def filtered(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
+    """Return every `factor`-th reading after the filter, without the ends and NaN near longer gaps, and the number of outliers.
+
+    >>> t = 1e-3 * np.arange(40000)
+    >>> value = np.sin(20.0 * t) + 0.1 * np.sin(3000.0 * t)
+    >>> value[[7000, 9000]] += 5.0, np.nan
+    >>> found, outliers = filtered(value, 20)
+    >>> bool(np.max(np.abs(found - np.sin(20.0 * t[160:-160:20]))) < 1e-2), outliers
+    (True, 1)
+    """
+    half = _HALF_LENGTH * factor
+    place = np.arange(-half, half + 1)
+    taps = np.sinc(place / factor) * np.kaiser(place.size, _KAISER)
+    taps /= np.sum(taps)
+    missing = ~np.isfinite(value)
+    bad, inside = missing.copy(), slice(half, value.size - half)
+    if np.any(bad):
+        value = np.interp(np.arange(value.size), np.flatnonzero(~bad), value[~bad])
+    for _ in range(_PASSES):
+        low = _smoothed(value, taps)
+        rest = value - low
+        spread = 1.4826 * float(np.median(np.abs(rest[inside][:: max(value.size // 100_000, 1)])))
+        limit = max(_OUTLIER_DISTANCE * spread, _RIPPLE * float(np.std(value)))
+        far = np.flatnonzero(np.abs(rest[inside]) > limit) + half
+        around = np.median(rest[far[:, None] + np.arange(-_NEIGHBORS, _NEIGHBORS + 1)], axis=1)
+        bad[far[np.abs(rest[far] - around) > limit]] = True  # an outlier also moves the filtered signal around it
+        if not np.any(bad):
+            break
+        value = np.where(bad, low, value)
+    found = low[inside][::factor].copy()
+    starts = np.flatnonzero(np.diff(missing.astype(np.int8), prepend=0) == 1)
+    ends = np.flatnonzero(np.diff(missing.astype(np.int8), append=0) == -1) + 1
+    for start, end in zip(starts, ends, strict=True):
+        if end - start > factor // 2:
+            found[max(-(-(start - 2 * half) // factor), 0) : max(end // factor + 1, 0)] = np.nan
+    return found, int(np.count_nonzero(bad & ~missing))
+
+
+def _smoothed(value: np.ndarray, taps: np.ndarray) -> np.ndarray:
+    """Return values after a filter of odd length, in pieces that bound the memory."""
+    from scipy.signal import oaconvolve  # slow to import
+
+    half, found = taps.size // 2, np.empty(value.size)
+    for start in range(0, value.size, _PIECE):
+        begin, end = max(start - half, 0), min(start + _PIECE, value.size)
+        part = oaconvolve(value[begin : end + half], taps, mode="same")
+        found[start:end] = part[start - begin : end - begin]
+    return found
