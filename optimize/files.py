@@ -49,7 +49,8 @@ def load_design(path: str | Path) -> Design:
     - `[free]`: bounds for each parameter that may change
     - `[ties]`: parameters that follow others
     - `[choices]`: parameters whose values are chosen from a list, or from a catalogue: `file`, a CSV file relative to the
-      design file, and the name of its `column`
+      design file, and the name of its `column`. Rows of a catalogue, such as motors, are a word with `file` and `columns`, a
+      table from parameters to names of columns
     - every `[[hold]]`: a quantity and the value that it keeps; default: its value in the scene
     - every `[[demand]]`: a quantity that is `at_most` or `at_least` a value
     - `[objective]`: the quantity to minimize, or to maximize with `maximize = true`
@@ -141,15 +142,27 @@ def _search_options(table: Tables) -> Tables:
 
 
 def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
-    """Return the values of a choice; a table with `file`, and `column` if necessary, is a column of a CSV file."""
-    if not isinstance(values, Mapping):
+    """Return the values of a choice.
+
+    A table with `file`, and `column` if necessary, is a column of a CSV file, one with `file` and `columns` its rows.
+    """
+    if not isinstance(values, Mapping) or any("." in each for each in values):
         return values
-    if not isinstance(values.get("file"), str) or values.keys() - {"file", "column"}:
-        raise InputError(
-            f"choices.{name}", f"is {quoted(dict(values))}; write a list, or file = 'springs.csv', column = 'rate'"
+    named = values.get("columns", {name: values.get("column")})
+    if (
+        not isinstance(values.get("file"), str)
+        or values.keys() - {"file", "column", "columns"}
+        or not isinstance(named, Mapping)
+    ):
+        advice = (
+            "write a list, or file = 'springs.csv', column = 'rate', or, for rows, columns = {'drive.power' = 'power', ...}"
         )
-    unit = find_number(scene, name, "choices").unit
-    return csv_column(folder / values["file"], unit, values.get("column")).tolist()
+        raise InputError(f"choices.{name}", f"is {quoted(dict(values))}; {advice}")
+    path = folder / values["file"]
+    found = {
+        each: csv_column(path, find_number(scene, each, "choices").unit, column).tolist() for each, column in named.items()
+    }
+    return found if "columns" in values else found[name]
 
 
 def _demands(table: object, section: str) -> list[Demand]:

@@ -73,6 +73,15 @@ class Tie(NamedTuple):
     factor: tuple[float, ...]
 
 
+class Column(NamedTuple):
+    """Parameter of a row of a catalogue: `target` follows `source` through the pairs (`at`, `values`), SI, linearly between."""
+
+    target: NamedNumber
+    source: NamedNumber
+    at: tuple[float, ...]
+    values: tuple[float, ...]
+
+
 class Choice(NamedTuple):
     """Parameter with a list of allowed values, ascending, SI; `start`: its index in the design vector."""
 
@@ -94,7 +103,9 @@ class DesignSpace(eqx.Module):
     - `ties`: a mapping from the name of a parameter to its source: the name of another parameter (equal values), (name,
       factor), or (name, "keep") to keep the present ratio of both; entries of an array that are 0 stay 0, as in `free`
     - `choices`: a mapping from the name of a parameter to its allowed values, such as the springs of a catalogue, or from
-      "loads.count" to allowed numbers of loads; typical: 2 to 20 values
+      "loads.count" to allowed numbers of loads; typical: 2 to 20 values. Rows of a catalogue, such as motors, are a mapping
+      from any word to the columns: {"motor": {"drive.speed": ["1450 rpm", "970 rpm"], "drive.inertia": [0.01, 0.02]}}; the
+      values of the first column must differ
 
     Names and bounds of `free`:
 
@@ -107,7 +118,7 @@ class DesignSpace(eqx.Module):
     A search describes a design by a vector z in [0, 1]^d.
 
     **Attributes**, of the d free parameters: bounds `low` and `high` (d,), SI; `logs`: True for a logarithmically scaled range;
-    `held`: the held quantities; `counts`: the allowed numbers of loads.
+    `held`: the held quantities; `counts`: the allowed numbers of loads; `columns`: further columns of catalogues of rows.
 
     **Raises** `InputError` for
 
@@ -134,6 +145,7 @@ class DesignSpace(eqx.Module):
     free: tuple[NamedNumber, ...] = eqx.field(static=True)
     logs: tuple[bool, ...] = eqx.field(static=True)
     ties: tuple[Tie, ...] = eqx.field(static=True)
+    columns: tuple[Column, ...] = eqx.field(static=True)
     held: tuple[HeldQuantity, ...]
     choices: tuple[Choice, ...] = eqx.field(static=True)
     counts: tuple[int, ...] = eqx.field(static=True)
@@ -145,10 +157,11 @@ class DesignSpace(eqx.Module):
         hold: Sequence[HeldQuantity] = (),
         *,
         ties: Mapping[str, Source] | None = None,
-        choices: Mapping[str, Sequence[Number]] | None = None,
+        choices: Mapping[str, Sequence[Number] | Mapping[str, Sequence[Number]]] | None = None,
     ):
         _require_tables(scene, free, hold, ties, choices)
-        chosen, counts = _read_choices(scene, choices or {})
+        single, self.columns = _read_rows(scene, choices or {})
+        chosen, counts = _read_choices(scene, single)
         if not free and not chosen:
             raise InputError("free", "is empty; name at least one number that may change, such as machine.stiffness")
         ranges = [(name, *_bounds(scene, name, bounds)) for name, bounds in free.items()]
@@ -171,6 +184,10 @@ class DesignSpace(eqx.Module):
         self.scene = scene
         self.free, self.logs, self.choices = tuple(numbers), tuple(logs), tuple(choices_)
         self.low, self.high = np.asarray(lows), np.asarray(highs)
+        for column in self.columns:
+            if column.target.entries & taken:
+                raise InputError(f"choices.{column.target.name}", "is free or chosen already; give each number once")
+            taken |= column.target.entries
         self.ties = _read_ties(scene, ties or {}, taken)
         self.counts = counts
         for held in hold:
@@ -218,6 +235,9 @@ class DesignSpace(eqx.Module):
         """Return the scene with the free parameters `values` (d,), SI."""
         self._require_size(values, "values", single=True)
         scene = put_numbers(self.scene, self.free, jnp.asarray(values))
+        for each in self.columns:
+            row = jnp.interp(each.source.read(scene), jnp.asarray(each.at), jnp.asarray(each.values))
+            scene = put_numbers(scene, (each.target,), row)
         for tie in self.ties:
             scene = put_numbers(scene, (tie.target,), jnp.asarray(tie.factor) * tie.source.read(scene))
         return scene
@@ -290,6 +310,37 @@ def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, float
         if log and not low > 0.0:
             raise InputError(f"free.{name}", "has the scale 'log' and a low bound of 0; give a low bound greater than 0")
     return found, low, high, log
+
+
+def _read_rows(scene: Scene, choices: Mapping[str, Any]) -> tuple[dict[str, Sequence[Number]], tuple[Column, ...]]:
+    """Return the choices of single parameters, among them the first column of each catalogue of rows, and its other columns."""
+    single: dict[str, Sequence[Number]] = {}
+    columns: list[Column] = []
+    for label, given in choices.items():
+        if not isinstance(given, Mapping):
+            single[label] = given
+            continue
+        field = f"choices.{label}"
+        if len(given) < 2:
+            raise InputError(field, "needs at least two columns; give a parameter alone as a list of values")
+        found = {name: find_number(scene, name, field) for name in given}
+        read: dict[str, list[float]] = {}
+        for name, entry in found.items():
+            if not isinstance(given[name], (list, tuple)) or entry.size != 1:
+                raise InputError(f"{field}.{name}", "needs a list of values of a single number, such as machine.stiffness[0]")
+            read[name] = [entry.value(v, f"{field}.{name}[{k}]") for k, v in enumerate(given[name])]
+        first, *others = read
+        lengths = {name: len(values) for name, values in read.items()}
+        if len(set(lengths.values())) > 1:
+            counted = ", ".join(f"{name} {n}" for name, n in lengths.items())
+            raise InputError(field, f"has columns of different lengths ({counted}); each row needs all its values")
+        if len(set(read[first])) < len(read[first]):
+            raise InputError(field, f"has rows with equal values of {first}; name a column first whose values differ")
+        order = np.argsort(read[first])
+        at = tuple(read[first][k] for k in order)
+        single[first] = at
+        columns += [Column(found[n], found[first], at, tuple(read[n][k] for k in order)) for n in others]
+    return single, tuple(columns)
 
 
 def _read_choices(

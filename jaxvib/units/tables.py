@@ -43,7 +43,8 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
         there = f"has {len(found) or 'no'} columns {wanted}"
         raise InputError(str(path), f"{there}; name one as column, the columns are: {', '.join(map(quoted, head))}")
     (k,) = found
-    factor = unit_factor(names[k][1], unit) if names[k][1] else None
+    own = names[k][1]
+    factor = 1.0 if not unit and own in ("", "-") else unit_factor(own, unit) if own else None
     if factor is None:
         raise InputError(str(path), f"has the column {quoted(head[k])} without a unit of {unit}; write {names[k][0]} ({unit})")
     cells = [(line, row[k].strip()) for line, row in enumerate(rows, 2) if len(row) > k and row[k].strip()]

@@ -81,6 +81,13 @@ FREE = {"machine.stiffness": (1e4, 9e4)}
         (lambda: DesignSpace(SCENE, {"loads.drag": (0.0, 2.0, "log")}), "give a low bound greater than 0"),
         (lambda: DesignSpace(SCENE, {"loads.drag": (2.0, 2.0)}), "must be less than the second"),
         (lambda: DesignSpace(SCENE, {}, choices={"loads.drag": []}), "give a list of values"),
+        (lambda: DesignSpace(SCENE, {}, choices={"ball": {"loads.drag": [1.0]}}), "choices.ball needs at least two columns"),
+        (
+            lambda: DesignSpace(
+                SCENE, {"loads.mass": (1.0, 2.0)}, choices={"ball": {"loads.drag": [1, 2], "loads.mass": [1, 2]}}
+            ),
+            "choices.loads.mass is free or chosen already",
+        ),
         (lambda: DesignSpace(SCENE, {}, choices={"loads.drag": [1.0, 1.0]}), "has one value"),
         (lambda: DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, choices={"loads.drag": [1.0, 2.0]}), "is free already"),
         (lambda: DesignSpace(SCENE, FREE, ties={"machine.stiffness[0]": "loads.drag"}), "cannot be free"),

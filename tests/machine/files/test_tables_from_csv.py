@@ -85,6 +85,44 @@ def test_choices_of_a_design_come_from_a_catalogue(tmp_path):
         load_design(tmp_path / "design.toml")
 
 
+MOTORS = """motor;speed (rpm);power (kW);breakdown (-);inertia (kg m^2)
+90L;1445;1,5;2,8;0,0040
+90S;1430;1,1;2,6;0,0030
+100L;1450;2,2;2,9;0,0065
+"""
+
+
+def test_motors_are_chosen_by_rows_of_a_catalogue(tmp_path):
+    (tmp_path / "motors.csv").write_text(MOTORS)
+    drive = 'drive = { kind = "name_plate_motor", power = "1.5 kW", rated_speed = "1440 rpm", breakdown_ratio = 2.5, '
+    machine = (
+        SCENE.split("[loads]")[0]
+        + '[[exciters]]\nunbalance = "0.2 kg m"\n'
+        + drive
+        + "inertia = 0.004, frequency = '50 Hz' }\n"
+    )
+    (tmp_path / "machine.toml").write_text(machine)
+    named = {"power": "power", "rated_speed": "speed", "breakdown_ratio": "breakdown", "inertia": "inertia"}
+    columns = ", ".join(f'"drive.{name}" = "{column}"' for name, column in named.items())
+    design = f'scene = "machine.toml"\n[choices]\nmotor = {{ file = "motors.csv", columns = {{ {columns} }} }}\n'
+    objective = '[objective]\nquantity = "foundation_force"\n'
+    (tmp_path / "design.toml").write_text(design + objective)
+    space = load_design(tmp_path / "design.toml").space
+    assert [choice.values for choice in space.choices] == [(1100.0, 1500.0, 2200.0)]
+    for power, speed, ratio, inertia in ((1100.0, 1430.0, 2.6, 0.003), (2200.0, 1450.0, 2.9, 0.0065)):
+        chosen = space.scene_of(np.array([power])).drive
+        found = [chosen.power, chosen.rated_speed * 30.0 / np.pi, chosen.breakdown_ratio, chosen.inertia]
+        np.testing.assert_allclose(found, [power, speed, ratio, inertia], rtol=1e-12)
+    for wrong, words in (
+        (MOTORS.replace(";1,1;", ";;"), r"choices.motor has columns of different lengths \(drive.power 2, drive.rated_speed 3"),
+        (MOTORS.replace(";1,1;", ";1,5;"), "choices.motor has rows with equal values of drive.power; name a column first"),
+        (MOTORS.replace(";power", ";watts"), "has no columns 'power'"),
+    ):
+        (tmp_path / "motors.csv").write_text(wrong)
+        with pytest.raises(jv.InputError, match=words):
+            load_design(tmp_path / "design.toml")
+
+
 def test_a_csv_file_with_decimal_commas_is_read_back(tmp_path):
     scene = jv.Scene(
         jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),

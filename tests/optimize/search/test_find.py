@@ -143,6 +143,18 @@ def test_choices_from_catalogues_are_the_best_of_all():
     assert 2 <= found.nodes < 20 and found.drawn == found.existing == 4
 
 
+def test_chosen_rows_of_a_catalogue_are_the_best_of_all():
+    rows = [(1e4, 6.8e4), (1.5e4, 3.3e4), (2.2e4, 4.7e4), (3.3e4, 1.5e4), (4.7e4, 1e4), (6.8e4, 2.2e4)]
+    first, second = (list(column) for column in zip(*rows[::-1], strict=True))
+    space = DesignSpace(SCENE, {}, choices={"spring": {"machine.stiffness[0]": first, "machine.stiffness[1]": second}})
+    problem = problem_of(space, plain("bent", bent), (), 4)
+    found = choose(problem, OPTIONS, lambda *_: None)
+    best = space.scene_of(space.within(*found.bounds).numbers(found.point.z[found.best]))
+    least = min(rows, key=lambda row: bent(row[0] / 1e4, row[1] / 1e4))
+    np.testing.assert_allclose(best.machine.stiffness, least, rtol=1e-9)
+    np.testing.assert_allclose(found.point.values[found.best, 0], bent(least[0] / 1e4, least[1] / 1e4), rtol=1e-9)
+
+
 def test_a_choice_that_is_the_best_anyway_needs_no_bounds():
     _, found = chosen(wish=lambda x, y: (x - 1.5) ** 2 + (y - 4.7) ** 2 + 1.0)
     assert found.nodes == 0
