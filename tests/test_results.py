@@ -246,6 +246,15 @@ def test_speaks(result):
     assert result.summary().strip() and "Array(" not in result.summary() and isinstance(result.plot(), Figure)
 
 
+def test_every_array_has_a_unit(result):
+    """Tables, labelled data and stores of studies name units and axes by it."""
+    fields = dataclasses.fields(result) if dataclasses.is_dataclass(result) else ()
+    bare = [
+        each.name for each in fields if isinstance(getattr(result, each.name), (jax.Array, np.ndarray)) and not each.metadata
+    ]
+    assert not bare
+
+
 def test_a_figure_of_one_panel_goes_onto_given_axes(result):
     if type(result).__name__ in SEVERAL_PANELS:
         many = len([axes for axes in result.plot().axes if axes.axison or axes.has_data()])

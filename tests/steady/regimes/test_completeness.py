@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.equations.torque_balance import assemble_torque_balance
+from jaxvib.steady.regimes.search import _starts
 
 SPEEDS = (100.0, 98.0, 101.0, 99.0, 102.0, 97.0)
 PLACES = [(-0.55, 0.21), (0.47, 0.13), (0.08, -0.41), (-0.23, -0.35), (0.31, 0.44), (-0.12, 0.37)]
@@ -84,3 +86,16 @@ def test_equal_exciters_in_one_place_list_their_family_once():
     assert len(families) == 1 and "one of a family" in families[0].summary()
     np.testing.assert_allclose(families[0].speed, 100.0, rtol=1e-9)
     np.testing.assert_allclose(families[0].amplitude, 0.0, atol=1e-9)
+
+
+def test_starts_are_the_roots_between_two_speeds():
+    """Two motors with straight torque lines and hardly any unbalance: the sum of their torques is 0 at the mean speed."""
+    motors = [jv.DCMotor(speed, stall_torque=8.0 * speed / 100.0, inertia=0.2) for speed in (100.0, 110.0)]
+    exciters = [jv.Exciter(drive=motor, unbalance=1e-9, at=(x, 0.4)) for motor, x in zip(motors, (-0.3, 0.3), strict=True)]
+    body = jv.plane_body(
+        mass=2000.0, inertia=600.0, supports=[jv.support(at=(0.0, 0.0), stiffness=(2e5, 4e5), damping=(2e3, 4e3))]
+    )
+    balance = assemble_torque_balance(jv.Scene(body, exciters=exciters))
+    speeds, phases = _starts(balance, np.array([80.0, 101.0, 120.0]), np.array([[0.0, 0.5]]))
+    np.testing.assert_allclose(speeds, 105.0, rtol=1e-9)
+    np.testing.assert_allclose(phases, [[0.0, 0.5]])

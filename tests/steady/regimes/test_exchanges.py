@@ -16,3 +16,13 @@ def test_masses_that_differ_by_more_than_rounding_stay():
     influence = np.full((2, 2, 2), 0.1 + 0.02j) + np.eye(2)
     numbers = np.array([[0.4, 25.0], [0.4 * (1.0 + 1e-9), 25.0]])
     assert [tuple(map(int, each.order)) for each in exchanges_of(influence, numbers)] == [(0, 1)]
+
+
+def test_shifts_follow_couplings_that_some_speeds_lack():
+    """At the first speed only masses 1 and 2 are coupled, at the second one only the others with mass 0."""
+    influence = np.stack([np.eye(3, dtype=complex)] * 2)
+    influence[0, 1, 2], influence[0, 2, 1] = 0.1j, 0.1j * np.exp(1.4j)
+    influence[1, 0, 1:] = 0.2 * np.array([1.0, np.exp(-0.7j)])
+    influence[1, 1:, 0] = (0.3 + 0.1j) * np.array([1.0, np.exp(0.7j)])
+    found = {tuple(map(int, each.order)): each.shift for each in exchanges_of(influence, np.full((3, 2), 0.4))}
+    np.testing.assert_allclose(np.exp(1j * (found[0, 2, 1] - found[0, 2, 1][0])), np.exp([0.0, 0.7j, -0.7j]), atol=1e-12)
