@@ -17,6 +17,7 @@ from jaxvib.display import shown_unit
 from jaxvib.machine.files import EFFECTS, SECTIONS
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.numbers.named import find_number, numbers_of, put_numbers, read_value
+from jaxvib.machine.structures.screens import SCREENS
 from jaxvib.report.arguments import GROUPS, arguments_of, part_of
 from jaxvib.sweeps.axes import axis_of
 from optimize import DesignSpace
@@ -48,6 +49,7 @@ def test_values_are_shown_in_units_that_a_designer_reads(unit, size, shown, fact
 
 
 ONE, THREE = scene("one_mass", "rollers", effects=(jv.StaticImbalance(0.02),)), scene("three_mass", "pendulums")
+SCREEN = jv.scene_from_toml(SCREENS["linear_screen"])
 ROTOR = jv.Scene(rotor_machine(0.1), jv.balls(count=2, mass=0.2, radius=0.08, drag=5.0), jv.ConstantSpeed(460.0))
 
 
@@ -68,6 +70,8 @@ ROTOR = jv.Scene(rotor_machine(0.1), jv.balls(count=2, mass=0.2, radius=0.08, dr
         (ROTOR, "machine.mass", ["mass of the rotor"]),
         (ROTOR, "machine.stiffness[1]", ["stiffness of support 2"]),
         (ROTOR, "loads.drag", ["drag of each ball"]),
+        (SCREEN, "machine.supports[1].stiffness[1]", ["stiffness of support 2, direction 2"]),
+        (SCREEN, "machine.supports[0].at[1]", ["y of the position of support 1"]),
     ],
 )
 def test_what_a_designer_calls_numbers(of, name, words):

@@ -1,7 +1,6 @@
-"""Designs of machines with several exciters: search, brute force, demands, recipes, files, fronts, sweeps."""
+"""Designs of machines with several exciters: recipes, files, sweeps, held quantities."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -33,38 +32,6 @@ def screen(**motor):
 def place(low=0.2, high=1.2):
     """Design space: the place of the second exciter."""
     return {"exciters[1].position[0]": (low, high), "exciters[1].position[1]": (low, high)}
-
-
-def straight_at_45():
-    """Square of the spread of the motions plus that of the error of the throw angle, rad."""
-    error = (throw_angle() - "45 deg") / "1 rad"
-    return motion_spread(DECK) ** 2 + error**2
-
-
-def scan(space, objective, points=81):
-    """Least value of an objective on a grid, and then on a grid around it."""
-    low, high = np.zeros(2), np.ones(2)
-    values_of = jax.jit(lambda z: jax.lax.map(lambda one: objective(space.at(one)), z, batch_size=64))
-    for _ in range(3):
-        axes = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
-        z = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-        values = np.asarray(values_of(jnp.asarray(z)))
-        best = z[np.nanargmin(values)]
-        step = (high - low) / (points - 1)
-        low, high = np.clip(best - 2.0 * step, 0.0, 1.0), np.clip(best + 2.0 * step, 0.0, 1.0)
-    return best, float(np.nanmin(values))
-
-
-@pytest.mark.slow
-def test_straight_throw_is_that_of_a_dense_scan():
-    space, objective = DesignSpace(screen(), place()), straight_at_45()
-    best = synthesize(space, objective, starts=8, iterations=40, verify=False)
-    z, least = scan(space, objective, points=41)
-    assert best.status_name == "done"
-    assert best.values.min() <= least * (1.0 + 1e-9)
-    np.testing.assert_allclose(best.designs[np.argmin(best.values)], z, atol=1e-3)
-    np.testing.assert_allclose(throw_angle()(best.scene), np.pi / 4.0, atol=0.01)
-    assert "speed" in best.summary() and best.after.exists
 
 
 @pytest.mark.slow

@@ -111,10 +111,18 @@ class NamedNumber(NamedTuple):
             return [f"{words} of {each} {k + 1}" if np.size(leaf) > 1 else f"{words} of the {each}" for k in which]
         if np.shape(leaf) == (2,) and self.spec.unit == "m":
             return [f"{'xy'[k]} of the {words}" for k in which]
+        if several and self._is_of_support:
+            return [f"{words}, direction {k + 1}" for k in which]
         return [f"{words} {k + 1}" if several else words for k in which]
 
+    @property
+    def _is_of_support(self) -> bool:
+        return self.path[:2] == ("machine", "supports")
+
     def _numbered(self, scene: Scene, words: str) -> str:
-        """Return `words`, with the number of the effect if the scene has several effects of its kind."""
+        """Return `words`, with the number of the support, or of the effect if the scene has several effects of its kind."""
+        if self._is_of_support:
+            return words.replace("the support", f"support {1 + int(self.path[2])}")
         if self.path[0] != "effects" or not isinstance(index := self.path[1], int):
             return words
         kinds = [effect.kind for effect in scene.effects]
