@@ -14,10 +14,9 @@ from scenes import ROTOR as ROTOR_NUMBERS
 
 import jaxvib as jv
 from jaxvib.display import shown_unit
-from jaxvib.machine.files import EFFECTS, SECTIONS
+from jaxvib.machine.files import EFFECTS, SCREENS, SECTIONS
 from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.numbers.named import find_number, numbers_of, put_numbers, read_value
-from jaxvib.machine.structures.screens import SCREENS
 from jaxvib.report.arguments import GROUPS, arguments_of, part_of
 from jaxvib.sweeps.axes import axis_of
 from optimize import DesignSpace

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.machine.structures.screens import SCREENS
+from jaxvib.machine.files import SCREENS
 from optimize import (
     DesignSpace,
     foundation_force,
