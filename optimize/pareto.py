@@ -109,7 +109,7 @@ def pareto(
     - `points`: largest number of machines, at least 2; typical: 9 (the default). The time is proportional to it
     - `subject_to`, `starts`, `seed`: as for `synthesize`; typical: 32 starts (the default) for each point
 
-    **Returns** `Front`, in ascending order of `first`. It has one machine if this machine has the least values of both.
+    **Returns** `Front`, in ascending order of `first`. The front has one machine if this machine has the least values of both.
 
     **Raises** as `synthesize`; `KeyboardInterrupt` if a search is interrupted.
 

@@ -110,7 +110,7 @@ def synthesize(
     **Returns** `Synthesis`.
 
     **Raises** `InputError` for values that are not allowed, and `ComputationError` with the status "no_feasible_start" if the
-    objective does not exist for any random design, or "contradictory" if no design meets all demands. Its message states which
+    objective does not exist for any random design, or "contradictory" if no design meets all demands. The message states which
     demands are not met, and by how much.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)

@@ -81,8 +81,8 @@ def whirl_lines(speed: np.ndarray, has_sense: np.ndarray) -> np.ndarray:
 
     **Arguments**: `speed` (ns, nd): all whirl speeds; `has_sense` (ns, nd): True for whirls of the requested sense.
 
-    Line k has the k-th lowest speed of this sense, and is therefore continuous if lines of different sense cross. It is NaN at
-    rotor speeds with fewer whirls of this sense.
+    Line k has the k-th lowest speed of this sense, and is therefore continuous if lines of different sense cross. The line is
+    NaN at rotor speeds with fewer whirls of this sense.
 
     >>> import numpy as np
     >>> whirl_lines(np.array([[1.0, 2.0], [1.5, 1.4]]), np.array([[True, False], [False, True]])).tolist()

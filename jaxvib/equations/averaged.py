@@ -192,7 +192,8 @@ class Averaged(eqx.Module):
     def driving_torque(self, t: Array, speeds: Sequence[Array], rate: Array) -> Array:
         """Return the torque of the drag on each load and of the motor on each unbalance, (count,) N m.
 
-        It is 0 for an unbalance of prescribed speed. `t`, s; `speeds` of the rotors, see `rotor_speeds`; `rate` (count,) rad/s.
+        The torque is 0 for an unbalance of prescribed speed. `t`, s; `speeds` of the rotors, see `rotor_speeds`; `rate`
+        (count,) rad/s.
         """
         if len(self.drives) == 1 and self.counts[0]:
             return self.drag * (speeds[0] - rate)

@@ -103,8 +103,8 @@ class StateSpace(NamedTuple):
     def save(self, path: str | Path) -> Path:
         """Write a MAT file (".mat", added if it is missing) that MATLAB, Octave and SciPy read.
 
-        It contains A, B, C, D, x0, u0, y0, the text `about`, and names and units as cell arrays: state_names, state_units,
-        input_names, input_units, output_names, output_units.
+        The file contains A, B, C, D, x0, u0, y0, the text `about`, and names and units as cell arrays: state_names,
+        state_units, input_names, input_units, output_names, output_units.
 
         **Arguments**: `path` of the file.
 

@@ -1,8 +1,8 @@
 """Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or the schedule of the drive.
 
 Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots, whose number has the smallest Bayesian
-information criterion. Its second derivative, which the force of an unbalance needs, is smooth. Marks of a wheel that are
-unevenly spaced have one unknown offset each. The covariance of the coefficients gives functions e_m(t), such that
+information criterion. The second derivative of the spline, which the force of an unbalance needs, is smooth. Marks of a wheel
+that are unevenly spaced have one unknown offset each. The covariance of the coefficients gives functions e_m(t), such that
 
     angle(t) = spline(t) + sum_m z_m e_m(t),      z_m independent and standard normal
 

@@ -144,8 +144,8 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
 def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found: int) -> float:
     """Return the probability of residuals as far from noise as these, if they are noise.
 
-    They are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each stretch of
-    the record, by an F test.
+    The residuals are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each
+    stretch of the record, by an F test.
 
     **Arguments**: `left` (n,), NaN for samples that do not count; `taps` of the filter; `angle` (n,) rad; `found`: number of
     fitted unknowns.

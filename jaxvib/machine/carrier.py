@@ -173,7 +173,7 @@ class Machine(Part):
     def is_split(self) -> bool:
         """True if horizontal and vertical values of a rotor's supports differ.
 
-        Its whirls are then ellipses, which every rotating force excites.
+        The whirls of such a rotor are ellipses, which every rotating force excites.
         """
         return False
 

@@ -390,7 +390,7 @@ def read_effects(effects: object) -> tuple[Effect, ...]:
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
     """**Raises** `InputError` if one of two numbers that are added is lost in rounding errors. Traced numbers are not checked.
 
-    This happens if the loads are too heavy or too light for the machine, or their drag is too weak for their inertia.
+    The error occurs if the loads are too heavy or too light for the machine, or their drag is too weak for their inertia.
     """
     parts = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None), drive.speed
     when_known(functools.partial(_require_comparable, loads.count), *parts)

@@ -124,7 +124,7 @@ class TorusBalls(Loads):
     def natural_frequency(self, speed: Array) -> Array:
         """Return w sqrt((R + rho) / (kappa rho)), rad/s.
 
-        It is the frequency of small motions about the outer equator of balls that turn with the rotor.
+        This is the frequency at which balls that turn with the rotor oscillate about the outer equator.
         """
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
 

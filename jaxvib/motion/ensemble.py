@@ -174,7 +174,7 @@ def ensemble(
     **Arguments**
 
     - `make`: a function of one entry of `values` that returns the `Scene` of a run, which starts at rest, or a tuple of the
-      scene and its initial `State`. It is compiled as by `jax.jit`: later changes of variables to which it refers have no
+      scene and its initial `State`. `make` is compiled as by `jax.jit`: later changes of variables to which it refers have no
       effect
     - `values`: an array with a leading axis over the runs, or a tree of such arrays; typical: 64 to 100,000 runs
     - `until`: end time of all runs, s or text; typical: 5 to 60
@@ -182,8 +182,8 @@ def ensemble(
       for each radian of the fastest motion, or more to resolve a faster decay, by the drag of the loads or the damping of the
       carrier. If a decay is at least 100 times as fast as the motion, all runs take implicit steps, 32 for each radian. The
       time is proportional to n
-    - `estimate`: True to estimate errors by a second run with half as many steps, which takes half the time of the first. It
-      requires more than 4 steps
+    - `estimate`: True to estimate errors by a second run with half as many steps, which takes half the time of the first. The
+      estimate requires more than 4 steps
     - `batch`: number of runs that advance together; typical: the default. The memory is proportional to it
     - `equations`: a function of a scene that returns its equations of motion, as `vector_field` (the default) does; another
       function is useful to compare, for example, the equations of a paper with those of the scene

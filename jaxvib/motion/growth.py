@@ -68,7 +68,7 @@ class Growth(Result):
     - `exponent`: the largest Lyapunov exponent, 1/s, and its standard error `uncertainty`, over the later half of the stretches
     - `horizon`: the time, s, after which rounding errors have grown to the size of the motion itself, ln(1/eps)/exponent. A
       derivative with respect to a parameter has then grown by 1/eps, and predicts nothing about a change that is larger than
-      rounding. It is infinite for a regular motion; for an undecided one it is a lower bound,
+      rounding. The horizon is infinite for a regular motion; for an undecided one it is a lower bound,
       ln(1/eps)/(exponent + 3 uncertainty)
     - `rates` (stretches,): growth rate in each stretch, 1/s; `time` (stretches,): end of each stretch, s
     """

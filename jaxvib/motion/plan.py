@@ -187,7 +187,7 @@ def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
 def _enough_samples(scene: Scene, end: Array) -> int:
     """Return a number of samples that is large enough to show the vibration in a figure without aliasing.
 
-    It has one of two values, so that few programs are compiled.
+    The number has one of two values, so that few programs are compiled.
     """
 
     def samples_of(end: float, speed: float) -> int:

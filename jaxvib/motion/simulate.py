@@ -71,7 +71,7 @@ def simulate(
     - `save`: "all" keeps `samples` evenly spaced states; "window" keeps the measured quantities and the window, but no
       trajectory
     - `samples` (default: 16384; 262144 for runs of more than 1024 turns of the rotor; 2000 under a JAX transformation);
-      typical: 20 for each period of the vibration. They need memory, but hardly any time
+      typical: 20 for each period of the vibration. Samples need memory, but hardly any time
     - `turns`: length of the measuring window at the end, in periods of the lowest natural frequency (at most half the run, and
       256 turns of the rotor); typical: 20 (the default)
     - `estimate`: True to estimate the `error` of the run by a second run with larger steps, which needs about half as many

@@ -197,7 +197,8 @@ def loops_need_a_flag() -> bool:
 def wide_vectors_are_right(flags: list[str]) -> bool:
     """Return True if programs with vectors of 512 bits are correct under these XLA_FLAGS.
 
-    They are wrong with the newer code generator of jaxlib 0.10: the arctangent of an array of 64 or more numbers is then 0.
+    Such programs are wrong with the newer code generator of jaxlib 0.10: the arctangent of an array of 64 or more numbers is
+    then 0.
     """
     return "--xla_cpu_use_fusion_emitters=false" in flags or _jaxlib() >= (0, 12)
 

@@ -84,8 +84,8 @@ def prepare_cpu(devices: int | None = 1) -> str:
 def limit_blas_threads() -> None:
     """Let the linear algebra of JAX, which is SciPy's OpenBLAS, use one thread, unless OPENBLAS_NUM_THREADS is set.
 
-    Its threads wait for work in a busy loop and take the cores from all other computations: the solution of 50 equations needs
-    14 ms of processor time instead of 0.3 ms. There is no effect if SciPy's linear algebra was imported before.
+    The threads of OpenBLAS wait for work in a busy loop and take the cores from all other computations: the solution of 50
+    equations needs 14 ms of processor time instead of 0.3 ms. There is no effect if SciPy's linear algebra was imported before.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

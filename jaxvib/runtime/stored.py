@@ -104,14 +104,14 @@ class StoredFunction(Generic[T]):
         """Return the compiled program for these arguments, or None if it cannot be stored."""
         call, program = self._found(leaves, treedef)
         if program is _UNKNOWN:
-            folder, *_, home, _ = call
+            folder, *_, sharding, _ = call
             with self.lock:
                 key = (_current_code(look=True), call)
                 program = self.ready.get(key, _UNKNOWN)
                 if program is _UNKNOWN:
                     with evaluating():  # inside a transformation JAX would trace these transfers
                         moved = arrays_on_device(leaves)
-                        program = self._program(folder, moved, treedef, home)
+                        program = self._program(folder, moved, treedef, sharding)
                         if program is not None:
                             program.compile(leaf for leaf in moved if eqx.is_array(leaf))
                     self.ready[key] = program
@@ -130,7 +130,7 @@ class StoredFunction(Generic[T]):
         folder = program_folder()
         if folder is None or is_debugging():
             return (), None
-        call = (folder, treedef, tuple(map(leaf_key, leaves)), _home(leaves), _options())
+        call = (folder, treedef, tuple(map(leaf_key, leaves)), _sharding_of(leaves), _options())
         try:
             return call, self.ready.get((_current_code(), call), _UNKNOWN)
         except TypeError:  # an argument is not hashable
@@ -140,13 +140,13 @@ class StoredFunction(Generic[T]):
         args, kwargs = jax.tree.unflatten(treedef, arrays_on_device(leaves))
         return self.jitted(*args, **kwargs)
 
-    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
+    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, sharding: Sharding) -> _Program | None:
         """Read the program from disk, or trace it and write it to disk; return None if it cannot be stored."""
         if not code_state().is_on_disk:
             return None
         try:
             path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
-            return _read(path, home) or self._write(path, leaves, treedef, home)
+            return _read(path, sharding) or self._write(path, leaves, treedef, sharding)
         except Undescribable:
             return None
 
@@ -161,7 +161,7 @@ class StoredFunction(Generic[T]):
         name = f"{self.function.__module__}:{self.function.__qualname__}"
         return _digest(json.dumps([name, _sources(), _machine(), str(_options()), arguments]).encode())[:32]
 
-    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program:
+    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, sharding: Sharding) -> _Program:
         structure: list[Description] = []
         # `flat` refers to a skeleton, because the arrays of this call would otherwise stay in memory with the program.
         arguments, state = Skeleton.of(leaves, treedef), code_state()
@@ -182,7 +182,7 @@ class StoredFunction(Generic[T]):
                 raise
             return _Program.of(jitted, structure[0])
         exported = export.deserialize(bytearray(stored))  # frees the trace, 1 to 3 MB, to which the first one refers
-        program = _Program.of(_compiled(path, exported, home), structure[0], size=len(stored))
+        program = _Program.of(_compiled(path, exported, sharding), structure[0], size=len(stored))
         if code_state(look=True) != state:  # the code changed during the trace
             return program
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
@@ -273,7 +273,7 @@ def _replace(path: Path, content: bytes) -> None:
             raise
 
 
-def _read(path: Path, home: Sharding) -> _Program | None:
+def _read(path: Path, sharding: Sharding) -> _Program | None:
     """Read a program; return None if the file is missing, damaged or of another user; the caller then writes it again."""
     try:
         with path.open("rb") as file:
@@ -286,21 +286,21 @@ def _read(path: Path, home: Sharding) -> _Program | None:
         exported = export.deserialize(bytearray(stored))
     except (OSError, ImportError):
         return None
-    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"], size=len(stored))
+    return _Program.of(_compiled(path, exported, sharding), json.loads(head)["structure"], size=len(stored))
 
 
-def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable[..., list[Array]]:
+def _compiled(path: Path, exported: export.Exported, sharding: Sharding) -> Callable[..., list[Array]]:
     def run(*arrays: Array) -> list[Array]:
         return exported.call(*arrays)  # pyright: ignore[reportReturnType]
 
-    # The name is part of the key in JAX's compilation cache. It includes the processor, which JAX's key lacks. It includes no
-    # digest of the sources, because a program that is the same after an edit need not be compiled again.
+    # The name is part of the key in JAX's compilation cache. The name includes the processor, which JAX's key lacks. It
+    # includes no digest of the sources, because a program that is the same after an edit need not be compiled again.
     run.__name__ = f"{path.stem.rpartition('-')[0]}-{_digest(processor().encode())[:16]}"
     # Without shardings JAX compiles twice: for uncommitted arrays, which it may move, and for outputs of other programs.
-    return jax.jit(run, in_shardings=home)
+    return jax.jit(run, in_shardings=sharding)
 
 
-def _home(leaves: Sequence[object]) -> Sharding:
+def _sharding_of(leaves: Sequence[object]) -> Sharding:
     """Return the sharding of the first committed array, which JAX must not move; otherwise that of the default device."""
     for leaf in leaves:
         if isinstance(leaf, jax.Array) and leaf.committed:

@@ -349,7 +349,8 @@ def weight_deflection(model: LinearModel) -> Array | None:
     stiffness, weight = model.carrier.stiffness, STANDARD_GRAVITY * (model.mass @ jnp.asarray(up, model.mass.dtype))
     if not isinstance(machine, Platforms):
         return jnp.linalg.solve(stiffness, weight)
-    # The stiffness matrix of platforms without supports is singular up to rounding. They are attached to the ground here.
+    # The stiffness matrix of platforms without supports is singular up to rounding.
+    # Such platforms are attached to the ground here.
     carried = has_support(machine)
     held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(up))
     return jnp.where(carried, jnp.linalg.solve(stiffness + held, weight), 0.0)

@@ -44,7 +44,7 @@ class Ellipse(eqx.Module):
     - `semi_major` a, m; typical: 1 to 10 mm for screens and feeders
     - `semi_minor` b, m, positive if the point turns anticlockwise, negative if it turns clockwise, 0 on a straight line
     - `direction` of the long axis, rad from x anticlockwise, above -pi/2 and at most pi/2; the throw angle of a point that
-      moves on a straight line. It is 0 for a circle, which has no long axis
+      moves on a straight line. The direction is 0 for a circle, which has no long axis
     - `acceleration`, in g: w^2 a / g, with g = 9.80665 m/s^2; typical: 3 to 6
     - `throw_number`: the amplitude of the acceleration perpendicular to the deck, divided by the component of g in this
       direction; typical: 2 to 5

@@ -114,7 +114,7 @@ class TorqueFolds(eqx.Module):
       maximum above 1 the resonance catches the rotor, and a motor that runs up slowly needs `factor` times its torque to pass
     - `torque`, N m, that the vibration needs at the fold
     - `lands_at`, rad/s: speed to which a motor of `factor` times the torque jumps, up from a maximum, down from a minimum; NaN
-      if there is no such speed. It has no derivatives
+      if there is no such speed. `lands_at` has no derivatives
     - `exists`: True for a fold
     """
 

@@ -242,8 +242,8 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
         (s^2 M + s C + K) x = 0,      m s^2 + c s + k = 0 with m = x^H M x, c = x^H C x, k = x^H K x
 
     The kind is - Re(2 s + c/m). For the two real roots of a single equation it is negative at the slower one, at which damping
-    balances the spring, and positive at the faster one, at which damping stops the mass. It is the sign characteristic of the
-    Hermitian matrix polynomial, and therefore also distinguishes several overdamped motions, for any roots.
+    balances the spring, and positive at the faster one, at which damping stops the mass. The kind is the sign characteristic
+    of the Hermitian matrix polynomial, and therefore also distinguishes several overdamped motions, for any roots.
 
     The error is the step of Newton's method for the scalar equation, plus the rounding of its terms.
 

@@ -268,8 +268,8 @@ def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.nd
     """Return the samples `first` to `last` - 1 of a sequence in [0, 1)^size, as an array (last - first, size).
 
     "low_discrepancy" is the additive sequence x_k = frac(x_0 + k a) with a_j = g^-j, where g > 1 solves g^(size+1) = g + 1 and
-    x_0 is random with the seed `seed`. It is computed with 64-bit integers, so that even the billionth sample has full
-    precision. "random" samples come from a counter-based generator (Philox) with the key `seed`.
+    x_0 is random with the seed `seed`. The sequence is computed with 64-bit integers, so that even the billionth sample has
+    full precision. "random" samples come from a counter-based generator (Philox) with the key `seed`.
 
     >>> samples(0, 4, 1, 0, "low_discrepancy").round(3).ravel().tolist()
     [0.012, 0.63, 0.248, 0.866]

@@ -63,7 +63,7 @@ def on_a_cluster(
         precise, chunks = jnp.result_type(float) == np.float64, iter(todo)
         running, numbers = as_completed(loop=client.loop), {}
 
-        def give_out() -> None:
+        def submit_next() -> None:
             for chunk in chunks:
                 future = client.submit(_remote, plain, chunk, study.key, versions(), precise, pure=False)
                 numbers[future.key] = chunk
@@ -71,7 +71,7 @@ def on_a_cluster(
                 return
 
         for _ in range(_CHUNKS_PER_WORKER * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))):
-            give_out()
+            submit_next()
         for future in running:
             chunk = numbers.pop(future.key)
             try:
@@ -81,7 +81,7 @@ def on_a_cluster(
             future.release()
             if isinstance(found, str):
                 raise InputError("worker", f"{found}; install the same versions everywhere")
-            give_out()
+            submit_next()
             yield chunk, found
 
 

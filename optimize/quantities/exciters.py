@@ -1,7 +1,7 @@
 """Quantities of machines whose exciters synchronise: motion of a deck, force, power, margins.
 
-They are those of the working regime, see `jaxvib.working_regime`. A scene that has no stable synchronous regime raises
-`ComputationError` with the status "none_stable"; in a search, its designs do not exist.
+The quantities are those of the working regime, see `jaxvib.working_regime`. A scene that has no stable synchronous regime
+raises `ComputationError` with the status "none_stable"; in a search, its designs do not exist.
 """
 
 from __future__ import annotations

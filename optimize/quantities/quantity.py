@@ -120,7 +120,7 @@ class Quantity:
     def simplified(self) -> Quantity:
         """Leading-order quantity of the machine with its nominal parameters, for a first search.
 
-        The first search is faster, and its best machines are near the final ones.
+        A search with it takes less time than one with the quantity itself, and its best machines are near the final ones.
         """
         return replace(self, parts=tuple(part.simplified for part in self.parts)) if self.parts else self
 

@@ -109,10 +109,10 @@ def curvatures(
 ) -> list[np.ndarray]:
     """Return second derivatives (s, d, d) of the Lagrangian, in units of the objective, made positive semidefinite.
 
-    They are projected onto the directions in which active constraints and pieces do not determine the step; in the other
-    directions the linear model determines it. If the objective f is positive, a second set is returned, with (f^2/2)''/f in
-    place of f''. It is better if f is the modulus of an almost linear quantity, for example a force that should vanish: its
-    step then leads to the zero at once, whereas the step with f'' does so only from nearby.
+    The second derivatives are projected onto the directions in which active constraints and pieces do not determine the step;
+    in the other directions the linear model determines it. If the objective f is positive, a second set is returned, with
+    (f^2/2)''/f in place of f''. The second set is better if f is the modulus of an almost linear quantity, for example a force
+    that should vanish: the step then leads to the zero at once, whereas the step with f'' does so only from nearby.
 
     **Arguments**: `second`: see `second_derivatives`; `weights` (s, me + mi): multipliers, in units of the objective's `size`
     (s,); `shares` (s, parts) of the pieces of the objective.

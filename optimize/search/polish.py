@@ -341,7 +341,7 @@ def _is_better(
 
 
 def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, penalty: np.ndarray) -> Point:
-    """Return the point after a step, or, if it is better, the nearest point that meets the active constraints and kinks."""
+    """Return the better of two points: that after a step, and the nearest one to it on the active constraints and kinks."""
     z = np.clip(point.z + model.p, 0.0, 1.0)
     new = evaluate(problem, z, point.extrapolate_speeds(z))
     active = model.demands > 1e-6

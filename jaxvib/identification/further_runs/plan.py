@@ -31,7 +31,8 @@ class RunPlan(Result):
     - `minutes` (c,): durations
     - `benefit` (c,): sum over the numbers of the logarithm of the ratio of errors before and after, per minute of test. An
       undetermined number counts as an error of 1
-    - `profile`: the `SpeedProfile` of the run with the optimized speed; None without limits, and if none is better
+    - `profile`: the `SpeedProfile` of the run with the optimized speed; None without limits, and if no such run is better than
+      the candidates
     """
 
     status = Computed.done
@@ -83,6 +84,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
       are `change` and `channels` of a candidate
     - With `limits`, the speeds of the best candidate at 9 evenly spaced times are optimized for the smallest errors, by
       gradients and sequential quadratic programming. The result is one more candidate, of the same duration, if it is better
+      than all others
 
     **Arguments**
 

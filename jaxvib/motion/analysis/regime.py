@@ -247,7 +247,8 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 def _is_rotor_stuck(scene: Scene, natural: Array, rotor: Array) -> Array:
     """Return True if the rotor of a motor is caught at a resonance.
 
-    Its speed is then at most 15 % below or 2 % above the resonance, and more than 5 % below the no-load speed of the motor.
+    The speed of the rotor is then at most 15 % below or 2 % above the resonance, and more than 5 % below the no-load speed of
+    the motor.
     """
     if scene.drive.ideal:
         return jnp.zeros((), bool)

@@ -230,7 +230,8 @@ def envelope(
 def _with_separation_status(run: Envelope) -> Envelope:
     """Return the run with another status if it has settled in a motion that is unstable.
 
-    It is `would_separate` for loads of one exciter at nearly one angle, and `unstable` for exciters that turn at one speed.
+    The status is `would_separate` for loads of one exciter at nearly one angle, and `unstable` for exciters that turn at one
+    speed.
     """
     if not (float(run.drift) < SETTLED_DRIFT and status_name(run.status) == "done"):
         return run

@@ -80,7 +80,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
 
     - `status`: an `EnvelopeStatus`
     - `ripple` (count,), rad: amplitude of the oscillation of each load's angle that averaging omits, the largest in the window.
-      It estimates the relative error of amplitudes and speeds; typical: 1e-3 to 0.1
+      The ripple estimates the relative error of amplitudes and speeds; typical: 1e-3 to 0.1
     - `trajectory` and `window`: `Envelopes`; `trajectory` is None if only the window was requested
     - `steps`: number of accepted and rejected steps; `rejected`: number of rejected steps
     - `scene`

@@ -118,8 +118,8 @@ class _Scaled(MotorWrapper):
 def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     """Run the motors of a scene up from rest by the averaged equations, and name the resonances that catch exciters.
 
-    An exciter has passed a natural frequency if its speed at the end is at least 5 % higher. It is caught by the lowest natural
-    frequency that it has not passed, if this frequency is below 0.95 of its working speed.
+    An exciter has passed a natural frequency if its speed at the end is at least 5 % higher. An exciter is caught by the lowest
+    natural frequency that it has not passed, if this frequency is below 0.95 of its working speed.
 
     **Arguments**
 

@@ -60,8 +60,8 @@ def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
         x'' = P(n t) x + R(n t) x',  x = (q / R, dphi),     (x, x' / n)(turn) = monodromy (x, x' / n)(0)
 
     **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of `radau.transition`, a Python number (then
-    reverse derivatives exist) or a scalar array. It works under `jit`, `vmap` and `grad`. The caller ensures that the loads
-    cancel each other and the imbalance of the rotor.
+    reverse derivatives exist) or a scalar array. The function works under `jit`, `vmap` and `grad`. The caller ensures that
+    the loads cancel each other and the imbalance of the rotor.
     """
     scene = at_constant_speed(scene)
     field = vector_field(scene)

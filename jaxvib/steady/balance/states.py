@@ -422,9 +422,9 @@ def balanced_intervals(
     """Return the intervals [from, to] of rotor speed between `low` and `high` (rad/s) in which the balanced motion is exactly
     stable.
 
-    They are searched for on `points` speeds (typical: 200, the default), and their ends are refined by bisection to 1e-7 of
-    the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for the same
-    range are `criterion(scene).balancing`. `angles` and `steps` as `balanced_stability`.
+    The intervals are searched for on `points` speeds (typical: 200, the default), and their ends are refined by bisection to
+    1e-7 of the speed. An interval narrower than the spacing of the points can be missed. The intervals of the criterion for
+    the same range are `criterion(scene).balancing`. `angles` and `steps` as `balanced_stability`.
 
     **Returns** a list of pairs, rad/s. **Raises** as `balanced_stability`, and `InputError` for an empty range.
 

@@ -176,7 +176,8 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return indices of the first occurrence of each distinct row of integers (n, m), ascending, and for each row the number
     of its distinct row, (n,).
 
-    Rows are compared by one hash each, which is much faster; the probability that two of 1e5 rows share a hash is 3e-10.
+    Rows are compared by one hash each, which is much faster than a comparison of all entries; the probability that two of 1e5
+    rows share a hash is 3e-10.
     """
     mixed = rows.astype(int) @ np.random.default_rng(0).integers(2**63, size=rows.shape[1])
     order = np.argsort(mixed)

@@ -325,8 +325,8 @@ def _status(met: Array, separates: Array, flat: Array, resolved: Array, accurate
 def differentiable_fields(
     model: CoincidentModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
-    """Return fields of one orbit from its known motion, with derivatives. They are equal to those of `orbits` for the same
-    arguments, or 0 if these are NaN."""
+    """Return fields of one orbit from its known motion, with derivatives. The fields are equal to those of `orbits` for the
+    same arguments, or 0 if these are NaN."""
     grid, there = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
     x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
     deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))

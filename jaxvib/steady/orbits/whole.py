@@ -280,8 +280,8 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
     """Return the residual of the equations at the points, relative to their terms, and the estimated error of the motion.
 
     The error is the largest of the relative error of the speed, the error of angles, rad, and the error of displacements
-    relative to the largest displacement. It is estimated from the change in one Newton step with the residuals at twice as
-    many points, and from the highest harmonic.
+    relative to the largest displacement. The error is estimated from the change in one Newton step with the residuals at twice
+    as many points, and from the highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
     found, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates

@@ -69,7 +69,7 @@ def slow_period(scene: Scene) -> float:
     return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
 
 
-def unstable(tiers: str, jam: ExactJam) -> str:
+def unstable_reason(tiers: str, jam: ExactJam) -> str:
     """Return a sentence with the reason why time integration cannot compute an unstable jam."""
     largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
     return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), and a run leaves it"

@@ -21,7 +21,7 @@ from jaxvib.motion.steps import Tolerance
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import Cost, relative, row_of
-from jaxvib.study.accuracy.exact_reference import ExactJam, collocation_points, unstable
+from jaxvib.study.accuracy.exact_reference import ExactJam, collocation_points, unstable_reason
 
 _GRADIENT_TOLERANCE = 1e-8
 
@@ -65,7 +65,7 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
     else:
         ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
         if not bool(jam.fine.stable):
-            left_out = [unstable("full", jam)]
+            left_out = [unstable_reason("full", jam)]
         else:
             ways += _by_runs(scene, at, jam, end)
     rows = [

@@ -30,7 +30,14 @@ from jaxvib.results.result import Result
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import Cost, CostRow, relative, row_of
-from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, ExactJam, collocation_points, exact_jam, slow_period, unstable
+from jaxvib.study.accuracy.exact_reference import (
+    SLOW_PERIODS,
+    ExactJam,
+    collocation_points,
+    exact_jam,
+    slow_period,
+    unstable_reason,
+)
 from jaxvib.study.accuracy.gradient_precision import gradient_precision
 from jaxvib.units import Number, count, number
 
@@ -191,7 +198,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points)), scene)
         rows.append(request.row("exact orbit", "", f"{points} points", call, error))
     if not bool(jam.fine.stable):
-        left_out.append(unstable("envelope, full", jam))
+        left_out.append(unstable_reason("envelope, full", jam))
     else:
 
         def length(tolerance: float) -> float:

@@ -246,7 +246,7 @@ def ten_periods(
         raise InputError(record.name, f"{there}; {periods + 0.5:g} are needed; record longer or give fewer periods")
     span = when[n : n + pairs] - when[:pairs]
     factor = 2.0 * float(pendulum.total_inertia) / span
-    estimates = factor * _shrinkage(a[:pairs], a[n:])
+    estimates = factor * _log_decrement(a[:pairs], a[n:])
 
     # The error of an angle enters every pair that contains it; the derivative of G(a)/2 by the two angles is +-G'(a)/4.
     slopes = np.zeros((pairs, turns.angle.size))
@@ -273,7 +273,7 @@ def ten_periods(
     )
 
 
-def _shrinkage(large: np.ndarray, small: np.ndarray) -> np.ndarray:
+def _log_decrement(large: np.ndarray, small: np.ndarray) -> np.ndarray:
     """Return [G(large) - G(small)]/2 of two amplitudes, rad: ln(large/small) of small swings."""
     nodes, weights = np.polynomial.legendre.leggauss(8)
     at = 0.5 * (large + small)[:, None] + 0.5 * (large - small)[:, None] * nodes

@@ -172,7 +172,7 @@ def identify_bearing(
     steps, swinging = steps_for(start, time), np.where(swing.time <= until, 1.0, 0.0)
     if np.sum(swinging) < len(jax.tree.leaves(start)) + 2:
         raise InputError(record.name, f"swings for {until - swing.time[0]:.3g} s before it rests; record more of the swing")
-    large = np.where(swing.time <= min(_still_large(turns), until), 1.0, 0.0)
+    large = np.where(swing.time <= min(_decay_time(turns), until), 1.0, 0.0)
     if dry and np.sum(large) < np.sum(swinging):
         # The position at which the pendulum comes to rest depends on the last digits of the friction. From distant initial
         # values, a fit that includes the samples at rest converges to the wrong half swing.
@@ -187,7 +187,7 @@ def identify_bearing(
     return found
 
 
-def _still_large(turns: TurningPoints) -> float:
+def _decay_time(turns: TurningPoints) -> float:
     """Return the time at which the swing has decayed to a tenth, at least that of the fifth turning point; infinite if
     never."""
     small = np.flatnonzero(turns.amplitude < 0.1 * turns.amplitude[0])

@@ -322,9 +322,9 @@ def capture_time(run: Run, within: float = 0.05) -> Array:
     """Return the time, s, from which on all load speeds stay within a band around the rotor speed.
 
     It is the last time in the trajectory of the run at which the speed of a load differs from the rotor speed by more than
-    `within` times the rotor speed, interpolated linearly between the stored states. Forward and reverse derivatives exist. They
-    are valid as long as the same entry of the same load into the band is the last one. If another entry becomes the last one,
-    the time jumps, and the derivatives do not show this jump.
+    `within` times the rotor speed, interpolated linearly between the stored states. Forward and reverse derivatives exist. The
+    derivatives are valid as long as the same entry of the same load into the band is the last one. If another entry becomes
+    the last one, the time jumps, and the derivatives do not show this jump.
 
     **Returns** a scalar: 0 if all loads are within the band from the beginning, infinite if one of them is outside at the end.
     **Raises** `InputError` for a run without a trajectory.

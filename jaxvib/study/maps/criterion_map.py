@@ -32,9 +32,9 @@ class CriterionMap(Result):
     - `growth` (D, M, S), 1/s: exact growth rate, stable if negative
     - `agreement` (D, M): share of the rotor speeds at which both agree
     - `boundary` (M, B), rad/s: the criterion's boundaries, ascending, NaN for an absent one
-    - `shift` (D, M, B): (exact - predicted)/predicted for each lower or upper end of an interval of the criterion. It is
-      compared with the same end of the exact interval of stability that overlaps most with this interval; NaN if no exact end
-      is in the range of speeds
+    - `shift` (D, M, B): (exact - predicted)/predicted for each lower or upper end of an interval of the criterion. Each end
+      is compared with the same end of the exact interval of stability that overlaps most with this interval; NaN if no exact
+      end is in the range of speeds
     """
 
     status = Computed.done
