@@ -96,7 +96,7 @@ def student_quantile(freedom: int) -> float:
 def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
     """Return Wilson's confidence interval (default: 95 %) of the share `hits` / `cases`; 0 to 1 if there are no cases.
 
-    It contains all shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
+    The interval contains all shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
 
     >>> [round(float(end), 4) for end in wilson(np.asarray(0), np.asarray(10))]
     [0.0, 0.2775]
