@@ -36,6 +36,14 @@ from optimize.quantities.jams import (
 from optimize.quantities.machine import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
 from optimize.quantities.motion import peak_force, settling_time
 from optimize.quantities.quantity import Demand, Quantity, largest, least
+from optimize.quantities.response import (
+    fold_distance,
+    response_amplitude,
+    response_force,
+    response_stroke,
+    response_torque,
+    response_transmissibility,
+)
 from optimize.quantities.severity import acceleration, shaft_torque, stroke, support_load, transmissibility, velocity
 from optimize.space import DesignSpace, HeldQuantity, hold
 from optimize.synthesize import Outcome, Synthesis, synthesize
@@ -55,6 +63,7 @@ __all__ = [
     "amplitude",
     "amplitude_spread",
     "expected",
+    "fold_distance",
     "fold_margin",
     "force_per_amplitude",
     "force_per_throw",
@@ -74,6 +83,11 @@ __all__ = [
     "product",
     "quantile",
     "resonance_distance",
+    "response_amplitude",
+    "response_force",
+    "response_stroke",
+    "response_torque",
+    "response_transmissibility",
     "roundness",
     "settling_time",
     "shaft_torque",

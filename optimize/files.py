@@ -17,7 +17,7 @@ from jaxvib.units import count, number
 from jaxvib.units.tables import csv_column
 from optimize import recipes
 from optimize.design import Design
-from optimize.quantities import exciters, jams, machine, motion, severity
+from optimize.quantities import exciters, jams, machine, motion, response, severity
 from optimize.quantities.cases import expected, worst
 from optimize.quantities.quantity import Demand, Quantity
 from optimize.search.find import require_searcher
@@ -25,7 +25,7 @@ from optimize.space import DesignSpace, hold
 
 _QUANTITIES = {
     name: getattr(module, name)
-    for module in (exciters, jams, machine, motion, severity)
+    for module in (exciters, jams, machine, motion, response, severity)
     for name in module.__all__
     if name != "between"
 }

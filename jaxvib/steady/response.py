@@ -255,11 +255,7 @@ def response(
     Source: Sommerfeld 1902; I. I. Blekhman, Vibrational Mechanics, 2000, for the torque; the folds are those of `branches`.
     """
     scene = validate_scene(scene)
-    for k, exciter in enumerate(scene.exciters):
-        if exciter.loads is not None:
-            problem = "turn at a speed of their own; this function needs exciters with an unbalance and no loads, use branches"
-            raise InputError(f"{scene.prefix_of(k)}loads", problem)
-    require_rotating_masses(scene)
+    require_unbalances(scene)
     n = len(scene.exciters)
     angles = jnp.zeros(n, scene.top_speed.dtype) if phases is None else numbers(phases, "rad", "phases", n)
     if speeds is None:
@@ -268,6 +264,15 @@ def response(
     else:
         w = jnp.atleast_1d(numbers(speeds, "rad/s", "speeds", None, low=0.0))
     return outcome(_response(scene, w, angles), scene)
+
+
+def require_unbalances(scene: Scene) -> None:
+    """**Raises** `InputError` for exciters with loads, and for effects that the response does not include."""
+    for k, exciter in enumerate(scene.exciters):
+        if exciter.loads is not None:
+            problem = "turn at a speed of their own; this function needs exciters with an unbalance and no loads, use branches"
+            raise InputError(f"{scene.prefix_of(k)}loads", problem)
+    require_rotating_masses(scene)
 
 
 @cached
@@ -280,13 +285,13 @@ def _default_speeds(scene: Scene, top: Array, points: int) -> Array:
 @cached
 def _response(scene: Scene, speeds: Array, phases: Array) -> Response:
     model = unbalanced_model(scene, phases).decomposed()
-    status, curve = jax.vmap(partial(_motion_at, model))(speeds)
-    operating, folds = _operation(model)
+    status, curve = jax.vmap(partial(motion_at, model))(speeds)
+    operating, folds = operation_of(model)
     resonances = jax.lax.stop_gradient(model).modes()[0]
     return Response(**curve, status=status, operating=operating, folds=folds, resonances=resonances, scene=scene)
 
 
-def _motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dict[str, Any]]:
+def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dict[str, Any]]:
     """Return the status and the fields of `AbstractResponse` at one speed, rad/s."""
     # Within a few units in the last place of an undamped resonance the amplitude consists of rounding errors.
     size = jnp.max(magnitude(model.force_direction)) / jnp.min(jnp.diagonal(model.mass))
@@ -318,7 +323,7 @@ def _motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, di
     return status, {**finite, "speed": omega, "exciter_force": exciter, "motor_torque": motor}
 
 
-def _operation(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
+def operation_of(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
     """Return the operating points and the folds of a machine with one exciter."""
     none = jnp.zeros(0, model.mass.dtype)
     no_folds = TorqueFolds(none, none, none, none, none.astype(bool))
@@ -388,7 +393,7 @@ def _operating_points(model: UnbalancedModel, speed: Array, exists: Array) -> Op
     order = jnp.argsort(jnp.where(exists, speed, jnp.inf))
     speed, exists = speed[order], exists[order]
     safe = jnp.where(exists, speed, model.balance.speed)
-    fields = jax.vmap(partial(_motion_at, model))(safe)[1]
+    fields = jax.vmap(partial(motion_at, model))(safe)[1]
     frozen, at = jax.lax.stop_gradient((model.balance, safe))
     growth = jax.vmap(lambda w: regime_growth(frozen, w, jnp.zeros(1, w.dtype), 0))(at) if at.size else at
 

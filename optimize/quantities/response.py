@@ -1,0 +1,287 @@
+"""Quantities of the response to unbalances: at the working point, at a speed, or the largest over a range of speeds.
+
+The exciters have unbalances and no loads, see `jaxvib.response`. At the working point several exciters have the phases of the
+working regime, at given speeds equal phases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.display import speed_text
+from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.mount import Place, on_body
+from jaxvib.steady.points import ellipse_at, rows_in_plane
+from jaxvib.steady.response import motion_at, operation_of, require_unbalances
+from jaxvib.units import Number, count
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
+from optimize.quantities.user_inputs import number_in
+
+__all__ = [
+    "fold_distance",
+    "response_amplitude",
+    "response_force",
+    "response_stroke",
+    "response_torque",
+    "response_transmissibility",
+]
+
+_POINTS_PER_SIDE = 24
+"""Number of speeds on each side of a resonance at which the largest value is searched for."""
+
+_REFINEMENTS = 40
+"""Number of golden-section steps; the speed then has a relative error of 1e-8."""
+
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+Speeds = tuple[float, float] | None
+"""Lowest and highest speed, rad/s; equal for a single speed; None for the working regime."""
+
+Read = Callable[..., Array]
+"""Function of an `UnbalancedModel` and a speed, rad/s, that returns a scalar."""
+
+
+def _of_response(
+    name: str, unit: str, read: Read, text: str, speed: Number | None, between: Sequence[Number] | None, *settings: object
+) -> Quantity:
+    if speed is not None and between is not None:
+        raise InputError("between", "is given together with speed; give one of them")
+    speeds: Speeds = None
+    if speed is not None:
+        at = number_in(speed, "rad/s", "speed")
+        speeds, text = (at, at), f"{text} at {speed_text(at)}"
+    elif between is not None:
+        if not isinstance(between, (list, tuple)) or len(between) != 2:
+            raise InputError("between", f"is {quoted(between)}; give the lowest and the highest speed, ['200 rpm', '900 rpm']")
+        speeds = number_in(between[0], "rad/s", "between[0]"), number_in(between[1], "rad/s", "between[1]")
+        text = f"largest {text} from {speed_text(list(speeds), between=' to ')}"
+    if speeds is not None and not 0.0 < speeds[0] <= speeds[1]:
+        raise InputError("between", f"is {quoted(between or speed)}; speeds must be positive and ascend")
+    return BuiltinQuantity(
+        name, unit, _largest, tiers=("leading",), text=text, settings=(read, speeds, *settings), pieces_function=_pieces
+    )
+
+
+def _largest(evaluation: Evaluation, tier: Tier, read: Read, speeds: Speeds, *settings: object) -> Array:
+    return jnp.max(_values(evaluation, read, speeds, settings))
+
+
+def _pieces(evaluation: Evaluation, sign: float, tier: Tier, read: Read, speeds: Speeds, *settings: object) -> Array:
+    """Return the largest value near each resonance."""
+    each = _values(evaluation, read, speeds, settings)
+    return each if sign > 0.0 else -jnp.max(each)[None]
+
+
+def _values(evaluation: Evaluation, read: Read, speeds: Speeds, settings: tuple[object, ...]) -> Array:
+    """Return the value at the working point or at one speed, (1,), or the largest values near each resonance, (nd,)."""
+    scene = evaluation.scene
+    require_unbalances(scene)
+    if speeds is None:
+        regime = evaluation.regime
+        return read(unbalanced_model(scene, regime.phases), regime.speed, *settings)[None]
+    model = unbalanced_model(scene, jnp.zeros(len(scene.exciters), scene.top_speed.dtype))
+    low, high = (jnp.asarray(end, model.mass.dtype) for end in speeds)
+    if speeds[0] == speeds[1]:
+        return read(model, low, *settings)[None]
+    frozen = jax.lax.stop_gradient(model)
+    resonances = jnp.clip(frozen.modes()[0], low, high)
+    middle = 0.5 * (resonances[1:] + resonances[:-1])
+    begins, ends = jnp.concatenate([low[None], middle]), jnp.concatenate([middle, high[None]])
+    # The value is stationary at the largest value inside the range, so that the derivative of the speed is not needed.
+    found = jax.vmap(partial(_speed_of_largest, lambda w: read(frozen, w, *settings)))(begins, resonances, ends)
+    return jax.vmap(lambda w: read(model, w, *settings))(jax.lax.stop_gradient(found))
+
+
+def _speed_of_largest(value: Callable[[Array], Array], begin: Array, resonance: Array, end: Array) -> Array:
+    """Return the speed between `begin` and `end`, which enclose a `resonance`, at which a value is largest."""
+    share = np.linspace(0.0, 1.0, _POINTS_PER_SIDE + 1) ** 3
+    grid = jnp.concatenate([resonance + (begin - resonance) * share[:0:-1], resonance + (end - resonance) * share])
+    best = jnp.argmax(jax.vmap(value)(grid))
+    left, right = grid[jnp.maximum(best - 1, 0)], grid[jnp.minimum(best + 1, grid.size - 1)]
+
+    def narrowed(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        is_left = value(one) > value(two)
+        return jnp.where(is_left, low, one), jnp.where(is_left, two, high)
+
+    low, high = jax.lax.fori_loop(0, _REFINEMENTS, narrowed, (left, right))
+    inside = 0.5 * (low + high)
+    return jnp.where(value(inside) > value(grid[best]), inside, grid[best])
+
+
+def _point_settings(at: Any, body: int) -> tuple[object, int]:
+    """Return a place and the number of a body as hashable values."""
+    place: object = at
+    if isinstance(at, (list, tuple)):
+        if len(at) != 2:
+            raise InputError("at", f"is {quoted(at)}; give a point (x, y) of a body, the number of a platform, or a distance")
+        place = tuple(number_in(each, "m", f"at[{k}]") for k, each in enumerate(at))
+    elif at is not None and not isinstance(at, int):
+        place = number_in(at, "m", "at")
+    return place, count(body, "body", low=0)
+
+
+@validated
+def response_amplitude(
+    *,
+    at: int | Number | Sequence[Number] | None = None,
+    body: int = 0,
+    speed: Number | None = None,
+    between: Sequence[Number] | None = None,
+) -> Quantity:
+    """Return the amplitude of a point under the unbalances of the exciters, m zero to peak: the long semi-axis of its path.
+
+    **Arguments**
+
+    - `at`: the number of a platform, a distance along a rotor's axis, m, or the point (x, y) of a body, m; default: platform 1,
+      the station of the exciter, or the centre of mass
+    - `body`: number of the body from 0; typical: 0 (the default)
+    - `speed`, rad/s or text, of all exciters; typical: 50 to 160; default: that of the working regime, see `throw_stroke`
+    - `between`: the lowest and the highest speed in place of `speed`, for the largest value in this range; typical:
+      ["100 rpm", "900 rpm"], the resonances that a run-up passes slowly
+
+    **Returns** `Quantity`; typical: 0.5 to 10 mm, 5 to 50 mm at a resonance. A scene whose exciters have loads raises
+    `InputError` when the quantity is computed. **Raises** `InputError` for `speed` together with `between`.
+
+    >>> from optimize import response_amplitude
+    >>> (response_amplitude(between=("100 rpm", "900 rpm")) < "20 mm").words
+    'largest amplitude under unbalances from 100 to 900 rpm at most 20 mm'
+    """
+    place = _point_settings(at, body)
+    return _of_response("response_amplitude", "m", _amplitude, "amplitude under unbalances", speed, between, *place)
+
+
+def _amplitude(model: UnbalancedModel, w: Array, at: int | Array | None, body: int) -> Array:
+    machine = model.scene.machine
+    place: Place = on_body(at, machine.require_body(body))
+    moved = rows_in_plane(machine, place) @ motion_at(model, w)[1]["displacement"]
+    return ellipse_at(moved, w, jnp.zeros_like(w), jnp.zeros_like(w)).semi_major
+
+
+@validated
+def response_stroke(
+    *,
+    at: int | Number | Sequence[Number] | None = None,
+    body: int = 0,
+    speed: Number | None = None,
+    between: Sequence[Number] | None = None,
+) -> Quantity:
+    """Return the stroke of a point under the unbalances of the exciters, m peak to peak: twice `response_amplitude`.
+
+    **Arguments**: `at`, `body`, `speed`, `between` as in `response_amplitude`; typical: at=2 for platform 2.
+
+    **Returns** `Quantity`; typical: 2 to 20 mm. **Raises** `InputError` for `speed` together with `between`.
+
+    >>> from optimize import response_stroke
+    >>> response_stroke(at=1, speed="950 rpm").words
+    'stroke under unbalances at 950 rpm'
+    """
+    place = _point_settings(at, body)
+    return _of_response("response_stroke", "m", _stroke, "stroke under unbalances", speed, between, *place)
+
+
+def _stroke(model: UnbalancedModel, w: Array, at: int | Array | None, body: int) -> Array:
+    return 2.0 * _amplitude(model, w, at, body)
+
+
+@validated
+def response_force(*, speed: Number | None = None, between: Sequence[Number] | None = None) -> Quantity:
+    """Return the force on the foundation under the unbalances of the exciters, N zero to peak, see `jaxvib.response`.
+
+    **Arguments**: `speed` and `between` as in `response_amplitude`; typical: between=("100 rpm", "900 rpm").
+
+    **Returns** `Quantity`; typical: 0.1 to 20 kN. **Raises** `InputError` for `speed` together with `between`.
+
+    >>> from optimize import response_force
+    >>> response_force(between=("100 rpm", "900 rpm")).unit
+    'N'
+    """
+    return _of_response("response_force", "N", _field("foundation_force"), "force under unbalances", speed, between)
+
+
+@validated
+def response_transmissibility(*, speed: Number | None = None, between: Sequence[Number] | None = None) -> Quantity:
+    """Return the force on the foundation divided by the resultant of the centrifugal forces of the unbalances.
+
+    **Arguments**: `speed` and `between` as in `response_amplitude`; typical: speed="950 rpm".
+
+    **Returns** `Quantity`; typical: 0.02 to 0.2 above the resonances. **Raises** `InputError` for `speed` together with
+    `between`.
+
+    >>> from optimize import response_transmissibility
+    >>> (response_transmissibility() < 0.1).words
+    'transmissibility under unbalances at most 0.1'
+    """
+    text = "transmissibility under unbalances"
+    return _of_response("response_transmissibility", "", _field("transmissibility"), text, speed, between)
+
+
+@validated
+def response_torque(*, speed: Number | None = None, between: Sequence[Number] | None = None) -> Quantity:
+    """Return the sum of the mean torques that the rotors need to sustain the vibration, N m, see `jaxvib.response`.
+
+    **Arguments**: `speed` and `between` as in `response_amplitude`; typical: between=("100 rpm", "900 rpm").
+
+    **Returns** `Quantity`; typical: 0.5 to 50 N m. **Raises** `InputError` for `speed` together with `between`.
+
+    >>> from optimize import response_torque
+    >>> (response_torque(between=("100 rpm", "900 rpm")) < "12 N m").words
+    'largest shaft torque under unbalances from 100 to 900 rpm at most 12 N m'
+    """
+    return _of_response("response_torque", "N m", _field("torque"), "shaft torque under unbalances", speed, between)
+
+
+def _field(name: str) -> Read:
+    """Return the function that reads a field of a response; the torques of several exciters are added."""
+    return partial(_read_field, name)
+
+
+def _read_field(name: str, model: UnbalancedModel, w: Array) -> Array:
+    return jnp.sum(motion_at(model, w)[1][name])
+
+
+def fold_distance() -> Quantity:
+    """Return the distance of the working speed of a motor from the nearest fold of the response, relative to this speed.
+
+        min_f |w_f / w - 1|
+
+    w is the highest speed at which the motor can run, w_f the speed of a fold, see `TorqueFolds`. A motor that is weaker, or a
+    machine with more damping, loses the working speed at a fold.
+
+    **Returns** `Quantity`; typical: 0.2 to 0.9; 1 without a fold. A scene with several exciters or with an ideal drive raises
+    `InputError` when the quantity is computed.
+
+    >>> from optimize import fold_distance
+    >>> (fold_distance() > 0.2).words
+    'distance from the nearest fold of the response at least 0.2'
+    """
+    text = "distance from the nearest fold of the response"
+    return BuiltinQuantity("fold_distance", "", _fold_distance, tiers=("leading",), text=text, pieces_function=_fold_distances)
+
+
+def _fold_distance(evaluation: Evaluation, tier: Tier) -> Array:
+    return -jnp.max(_fold_distances(evaluation, -1.0, tier))
+
+
+def _fold_distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
+    scene = evaluation.scene
+    require_unbalances(scene)
+    if len(scene.exciters) > 1 or scene.exciter.drive.ideal:
+        has = f"{len(scene.exciters)} exciters" if len(scene.exciters) > 1 else "an ideal drive"
+        raise InputError("scene", f"has {has}; folds of the response exist for one exciter with a motor")
+    operating, folds = operation_of(unbalanced_model(scene, jnp.zeros(1, scene.top_speed.dtype)))
+    working = jnp.max(jnp.where(operating.exists, operating.speed, -jnp.inf))
+    speeds = jnp.where(folds.exists, folds.speed, 0.0)
+    each = jnp.where(jnp.isfinite(working), -jnp.abs(speeds / working - 1.0), jnp.nan)
+    return each if sign < 0.0 else -jnp.max(each)[None]
