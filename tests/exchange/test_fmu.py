@@ -328,6 +328,12 @@ def test_events_are_comparisons_of_changing_real_numbers():
     written = write_program(program, ["p", "x"], 1, ["y[0]", "y[1]", "y[2]"], has_events=True)
     assert written.branches == 1 and [line for line in written.body if "indicators" in line] == ["indicators[0] = x - 0.4;"]
 
+    def pivot(x, y):
+        return jnp.where(jnp.abs(x) > jnp.abs(y), x + y, x - y), jnp.where(jnp.abs(x) > y, x, y)
+
+    written = write_program(scalar_program(pivot, jnp.asarray(0.5), jnp.asarray(0.25)), ["x", "y"], 0, ["a", "b"], has_events=True)
+    assert written.branches == 1  # two magnitudes select a pivot
+
 
 @needs_compiler
 def test_force_on_a_platform_enters_its_equation(opened):

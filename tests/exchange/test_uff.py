@@ -118,6 +118,7 @@ def test_spectra_of_a_run_are_written(run, histories):
     np.testing.assert_allclose(spectra[0].values, spectrum.force[0, :, 0], rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(spectra[2].values, spectrum.amplitude[0, :, 1], rtol=1e-10, atol=1e-15)
     assert spectra[2].about == "amplitude spectrum of the coordinate y2"
+    assert (spectra[0].quantity, spectra[0].response, spectra[0].reference) == ("force", (0, 3), (0, 0))
 
 
 def test_files_begin_with_header_units_and_geometry(responses, histories):

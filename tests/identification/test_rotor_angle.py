@@ -1,0 +1,79 @@
+"""Angle of a rotor from its channel, against ramps in closed form."""
+
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.identification.angle import _measured
+
+RATE = 4.0
+"""Acceleration of the ramps, rad/s^2; they begin at 10 rad/s."""
+
+
+def angle_at(t):
+    return 10.0 * t + 0.5 * RATE * t**2
+
+
+def measured(kind, times, values, **options):
+    channel = jv.Channel("rotor", kind, **options)
+    none = np.zeros(times.size, bool)
+    return _measured(jv.MeasuredRun((channel,), {"rotor": times}, {"rotor": values}, {"rotor": none}, {}, (), "run"), channel)
+
+
+def pulses(per_turn, until=20.0):
+    numbers = np.arange(int(per_turn * angle_at(until) / (2.0 * np.pi)))
+    return numbers.astype(float), (-10.0 + np.sqrt(100.0 + 2.0 * RATE * 2.0 * np.pi * numbers / per_turn)) / RATE
+
+
+def test_pulses_give_the_angle_and_the_speed():
+    numbers, edges = pulses(6)
+    found = measured("pulses", edges, numbers, per_turn=6)
+    t = np.linspace(2.0, 18.0, 9)
+    np.testing.assert_allclose(found.at(t), angle_at(t), rtol=1e-9)
+    for each in t:
+        assert float(found.drive.speed_at(each)) == pytest.approx(10.0 + RATE * each, rel=1e-7)
+    assert found.marked and found.span == (0.0, edges[-1]) and found.notes == ()
+
+
+def test_uneven_marks_are_estimated():
+    numbers, edges = pulses(3)
+    shift = np.array([0.0, 0.02, -0.01])[numbers.astype(int) % 3]  # rad
+    late = edges + shift / (10.0 + RATE * edges)
+    t = np.linspace(2.0, 18.0, 9)
+    found = measured("pulses", late, numbers, per_turn=3).at(t)
+    np.testing.assert_allclose(found - found[0], angle_at(t) - angle_at(t[0]), atol=2e-3)
+
+
+def test_large_changes_of_speed_between_pulses_are_noted():
+    """Speeds in the middle of two intervals of pulses differ by up to 27.5 % where the ramp begins."""
+    numbers, edges = pulses(1, 6.0)
+    middle = 10.0 + RATE * 0.5 * (edges[1:] + edges[:-1])
+    largest = np.max(np.diff(middle) / middle[1:])
+    (note,) = measured("pulses", edges, numbers).notes
+    assert f"the speed changes by up to {largest:.0%} from one pulse to the next" in note
+
+
+def test_a_speed_gives_the_angle_without_its_zero():
+    t = np.linspace(0.0, 5.0, 500)
+    found = measured("speed", t, -(10.0 + RATE * t))
+    np.testing.assert_allclose(found.at(t[1:]) - found.at(t[:1]), angle_at(t[1:]), rtol=1e-8)
+    assert not found.marked
+
+
+def test_a_falling_angle_is_read_as_a_rising_one_and_delayed():
+    t = np.linspace(0.0, 5.0, 500)
+    found = measured("angle", t, -angle_at(t), delay=0.1)
+    np.testing.assert_allclose(found.at(t - 0.1), angle_at(t), rtol=1e-8, atol=1e-8)
+
+
+def test_noise_of_an_angle_becomes_its_error():
+    t, noise = np.linspace(0.0, 5.0, 500), 1e-3
+    angles = [angle_at(t) + noise * np.random.default_rng(k).normal(size=t.size) for k in range(30)]
+    found = [measured("angle", t, each) for each in angles]
+    real = np.sqrt(np.mean([np.mean((each.at(t) - angle_at(t)) ** 2) for each in found]))
+    assert np.mean([each.error for each in found]) == pytest.approx(real, rel=0.25)
+
+
+def test_too_few_pulses_are_refused():
+    with pytest.raises(jv.InputError, match="has 3 pulses; at least .* are needed, record more turns"):
+        measured("pulses", np.array([0.0, 1.0, 2.0]), np.arange(3.0))
