@@ -331,7 +331,8 @@ def test_events_are_comparisons_of_changing_real_numbers():
     def pivot(x, y):
         return jnp.where(jnp.abs(x) > jnp.abs(y), x + y, x - y), jnp.where(jnp.abs(x) > y, x, y)
 
-    written = write_program(scalar_program(pivot, jnp.asarray(0.5), jnp.asarray(0.25)), ["x", "y"], 0, ["a", "b"], has_events=True)
+    program = scalar_program(pivot, jnp.asarray(0.5), jnp.asarray(0.25))
+    written = write_program(program, ["x", "y"], 0, ["a", "b"], has_events=True)
     assert written.branches == 1  # two magnitudes select a pivot
 
 

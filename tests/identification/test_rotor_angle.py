@@ -75,5 +75,5 @@ def test_noise_of_an_angle_becomes_its_error():
 
 
 def test_too_few_pulses_are_refused():
-    with pytest.raises(jv.InputError, match="has 3 pulses; at least .* are needed, record more turns"):
+    with pytest.raises(jv.InputError, match=r"has 3 pulses; at least .* are needed, record more turns"):
         measured("pulses", np.array([0.0, 1.0, 2.0]), np.arange(3.0))
