@@ -80,6 +80,7 @@ def measure(path: str) -> None:
     for _ in range(2):
         run = jv.read_run(path, channels)
         fit = jv.identify(scene, run, unknown=names)
+        del run
         used = resource.getrusage(resource.RUSAGE_SELF)
         spent.append(used.ru_utime + used.ru_stime)
     assert isinstance(fit, jv.MachineFit)

@@ -104,6 +104,11 @@ class MeasuredRun(eqx.Module):
         found = {channel.name: _read_channel(channel, times, values, source) for channel in channels}
         parsed = {name: parse_change(value, f"change[{quoted(name)}]") for name, value in (change or {}).items()}
         its_times, its_values = {k: each.time for k, each in found.items()}, {k: each.value for k, each in found.items()}
+        grids: dict[tuple[int, float, float], np.ndarray] = {}  # channels with the same times share one array
+        for channel in channels:
+            time = its_times[channel.name]
+            if channel.kind != "pulses":
+                its_times[channel.name] = grids.setdefault((time.size, time[0], time[-1]), time)
         notes = [note for each in found.values() for note in each.notes]
         notes += check_agreement(channels, its_times, its_values, source)
         clipped = {name: each.clipped for name, each in found.items()}
@@ -223,7 +228,9 @@ def _read_channel(
             raise InputError("values", f"has no entry {quoted(name)}; it has: {', '.join(values) or 'none'}")
         time, number, notes = numbered_pulses(time, where)
         return _Samples(time, number, np.zeros(time.size, bool), notes)
-    value = _as_samples(values[name], where) * channel.factor
+    value = _as_samples(values[name], where)
+    if channel.factor != 1.0 or value is values[name]:  # a copy, but no second one of a long recording
+        value = value * channel.factor
     if time.shape != value.shape:
         raise InputError(where, f"has {time.size} times but {value.size} values; each value needs its time")
     if channel.kind == "pulses":

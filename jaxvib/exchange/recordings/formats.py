@@ -61,10 +61,17 @@ def read_channels(path: Path, rate: float | None) -> list[Recorded]:
         raise InputError(str(path), f"cannot be read as a {kind} file ({why}); export it again") from error
     if not channels:
         raise InputError(str(path), "contains no channel of numbers; export the channels that were recorded")
-    channels = [each._replace(values=np.asarray(each.values, float)) for each in _with_own_names(channels)]
+    channels = [each._replace(values=_floating(each.values)) for each in _with_own_names(channels)]
     if rate is None:
         return channels
-    return [each._replace(time=np.arange(each.values.size) / rate) for each in channels]
+    times = {size: np.arange(size) / rate for size in {each.values.size for each in channels}}
+    return [each._replace(time=times[each.values.size]) for each in channels]
+
+
+def _floating(values: np.ndarray) -> np.ndarray:
+    """Return readings as floating-point numbers; those in single precision remain so, for the memory of long recordings."""
+    values = np.asarray(values)
+    return values if values.dtype in (np.float32, np.float64) else values.astype(float)
 
 
 def _with_own_names(channels: list[Recorded]) -> list[Recorded]:
@@ -165,10 +172,11 @@ def _read_wav(path: Path, rate: float | None) -> Iterator[Recorded]:
         own, data = wavfile.read(path)
     if np.issubdtype(data.dtype, np.integer):
         half = 2.0 ** (8 * data.dtype.itemsize - 1)
-        data = (data.astype(float) - (half if data.dtype == np.uint8 else 0.0)) / half
-    columns = data.reshape(len(data), -1).T
-    for k, values in enumerate(columns, 1):
-        yield Recorded(f"channel {k}", "", np.arange(values.size) / own, values)
+        precise = np.float32 if data.dtype.itemsize < 3 else np.float64
+        data = (data.astype(precise) - (half if data.dtype == np.uint8 else 0.0)) / precise(half)
+    time = np.arange(len(data)) / own
+    for k, values in enumerate(data.reshape(len(data), -1).T, 1):
+        yield Recorded(f"channel {k}", "", time, values)
 
 
 def _read_mf4(path: Path, rate: float | None) -> Iterator[Recorded]:

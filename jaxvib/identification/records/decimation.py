@@ -100,6 +100,7 @@ def filtered(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
     bad, inside = missing.copy(), slice(half, value.size - half)
     if np.any(bad):
         value = np.interp(np.arange(value.size), np.flatnonzero(~bad), value[~bad])
+    low = value
     for _ in range(_PASSES):
         low = _smoothed(value, taps)
         rest = value - low

@@ -67,7 +67,8 @@ def described_channels(
             sizes = f"has {found.time.size} times but {found.values.size} values"
             raise InputError(where, f"{sizes}; save both with the same length")
         times[channel.name] = _between(found.time, low, high, found.time)
-        values[channel.name] = _between(found.time, low, high, found.values) * factor
+        own = _between(found.time, low, high, found.values)
+        values[channel.name] = own if factor == 1.0 else own * factor
     return times, values
 
 

@@ -106,7 +106,8 @@ def _own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarr
 
 def _on_grid(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
     even = np.linspace(time[0], time[-1], time.size)
-    if np.max(np.abs(time - even)) <= _JITTER * (even[1] - even[0]):
+    away = time - even
+    if max(np.max(away), -np.min(away)) <= _JITTER * (even[1] - even[0]):
         return even, value, []
     steps = np.diff(time)
     step = float(np.median(steps))
@@ -161,7 +162,10 @@ def dropouts(value: np.ndarray) -> np.ndarray:
     >>> int(np.count_nonzero(dropouts(x)))
     40
     """
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(value) != 0.0) + 1])
+    equal = value[1:] == value[:-1]
+    if np.count_nonzero(equal) < _MIN_DROPOUT - 1:
+        return np.zeros(value.size, bool)
+    starts = np.concatenate([[0], np.flatnonzero(~equal) + 1])
     lengths = np.diff(np.concatenate([starts, [value.size]]))
     usual = max(float(np.quantile(lengths, 0.99)), 1.0)
     with np.errstate(invalid="ignore"):
@@ -177,7 +181,8 @@ def clipped_at(value: np.ndarray) -> tuple[float, float]:
     >>> bool(np.isinf(low)), bool(0.85 < high <= 0.9)
     (True, True)
     """
-    known = value[~np.isnan(value)]
+    missing = np.isnan(value)
+    known = value[~missing] if np.any(missing) else value
     return -_clipped_above(-known), _clipped_above(known)
 
 
