@@ -1,5 +1,6 @@
 """Run-up of motors: exciters that resonances catch, the weakest motors that pass, bad input."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -61,6 +62,51 @@ def test_motor_too_weak_for_gravity_has_a_status():
     scene = jv.Scene(body(), exciters=[jv.Exciter(drive=motor(3.0), unbalance=S)], effects=jv.Gravity())
     found = jv.run_up(scene, 5.0)  # S g = 3.9 N m
     assert found.status_name == "not_turning" and "cannot lift" in found.summary()
+
+
+def induction_motor(voltage):
+    circuit = {"stator_resistance": 2.0, "rotor_resistance": 2.0, "stator_leakage": 0.01, "rotor_leakage": 0.01}
+    return jv.InductionMotorElectrical(voltage, "50 Hz", 3, **circuit, magnetizing_inductance=0.2, inertia=0.5)
+
+
+def direct_current_motor(voltage):
+    return jv.DCMotorElectrical(voltage, 2.0, torque_constant=0.5, inertia=0.5, inductance=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [induction_motor, direct_current_motor])
+def test_currents_keep_the_fold_of_the_steady_torque(make):
+    """The fold over the voltage, where the largest braking torque below the resonance equals T(w)."""
+    speeds = np.linspace(13.0, 15.5, 2001)
+    braking = 600.0 * S**2 * speeds**5 / ((6e4 - MASS * speeds**2) ** 2 + (600.0 * speeds) ** 2)
+
+    def excess(voltage):
+        return float(np.min(np.asarray(make(voltage).torque(jnp.asarray(speeds))) - braking))
+
+    fold = brentq(excess, 5.0, 100.0)
+    for share, status in ((0.97, "caught"), (1.03, "passed")):
+        scene = jv.Scene(body(), exciters=[jv.Exciter(drive=make(share * fold), unbalance=S)])
+        found, full = jv.run_up(scene, 200.0), jv.simulate(scene, 200.0, save="window", estimate=False)
+        assert found.status_name == status
+        np.testing.assert_allclose(found.speed, full.omega, rtol=1e-4)
+    at_fold = speeds[np.argmin(np.asarray(make(fold).torque(jnp.asarray(speeds))) - braking)]
+    least = float(make(fold).torque(at_fold) / make(1.03 * fold).torque(at_fold))
+    np.testing.assert_allclose(jv.run_up(scene, 200.0, least=True).least_torque, least, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_slow_currents_carry_a_motor_over_the_resonance():
+    """Inductance over resistance against the time 2 M/c = 1 s in which the vibration of the body decays."""
+    steady = direct_current_motor(0.97 * 10.1985)  # caught by its steady torque, see the fold above
+
+    def scene(lag):
+        drive = eqx.tree_at(lambda m: m.inductance, steady, 2.0 * lag)
+        return jv.Scene(body(), exciters=[jv.Exciter(drive=drive, unbalance=S)])
+
+    found = jv.ensemble(scene, jnp.asarray([0.01, 0.1, 3.0]), 200.0, estimate=False)
+    resonance = np.sqrt(6e4 / MASS)
+    assert (found.load_speed[:, 0] > 1.05 * resonance).tolist() == [False, False, True]
+    assert jv.run_up(scene(3.0), 200.0).status_name == "caught"
 
 
 def test_run_up_without_a_motor_is_refused():
