@@ -62,7 +62,7 @@ from jaxvib.equations.linear import LinearModel, linear_model, require_circular,
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, within
 from jaxvib.machine.drives.drive import Drive
-from jaxvib.machine.effects.terms import GravityField, LoadPotential
+from jaxvib.machine.effects.terms import GravityField, LoadPotential, Term
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
@@ -238,10 +238,10 @@ def averaged_loads(scene: Scene) -> CircularLoads:
     return turning_loads(scene, AVERAGED_TERMS)
 
 
-def require_rotating_masses(scene: Scene) -> None:
+def require_rotating_masses(scene: Scene, included: tuple[type[Term], ...] = AVERAGED_TERMS) -> None:
     """Require that each exciter of a scene has an unbalance, or loads on circles with an ideal drive, and allowed effects.
 
-    **Raises** `InputError` for other exciters and for effects with terms other than `AVERAGED_TERMS`.
+    **Raises** `InputError` for other exciters and for effects with terms that are not `included`.
     """
     for k, exciter in enumerate(scene.exciters):
         with within(scene.prefix_of(k)):
@@ -253,7 +253,7 @@ def require_rotating_masses(scene: Scene) -> None:
                 )
                 raise InputError("unbalance", problem)
             require_circular(exciter.loads, exciter.drive)
-    require_terms(scene.all_effects, AVERAGED_TERMS)
+    require_terms(scene.all_effects, included)
 
 
 def averaged_field(scene: Scene) -> Averaged:

@@ -26,9 +26,11 @@ from jax import Array
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
 from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive
-from jaxvib.machine.effects.base import total_gravity
+from jaxvib.machine.effects.base import has_term, terms_of, total_gravity
+from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.mount import Mount
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.linalg import small_solve, times
 from jaxvib.runtime.programs import cached
 
@@ -114,10 +116,14 @@ class TorqueBalance(eqx.Module):
 
 def assemble_torque_balance(scene: Scene) -> TorqueBalance:
     """Assemble the torque balance of a validated scene."""
-    model = linear_model(scene)
+    return balance_of(linear_model(scene))
+
+
+def balance_of(model: LinearModel) -> TorqueBalance:
+    """Return the torque balance of a model."""
     averaged = averaged_model(model)
     directions = []
-    for exciter, mount, count in zip(scene.exciters, model.mounts, averaged.counts, strict=True):
+    for exciter, mount, count in zip(model.scene.exciters, model.mounts, averaged.counts, strict=True):
         rows = mount.load_rows(count) if count else mount.rows[0][None]
         directions.append(jnp.einsum("jka,k->ja", rows, rotating_direction(mount, exciter.direction)))
     drives = tuple(ConstantSpeed(drive.speed) if drive.ideal else drive for drive in averaged.drives)
@@ -178,8 +184,10 @@ class UnbalancedModel(ExcitedModel):
 
 def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
     """Assemble the model of a scene whose exciters have unbalances with `phases` (count,), rad."""
-    balance = assemble_torque_balance(scene)
-    model, turn = balance.model, jnp.exp(1j * phases)
+    model, turn = linear_model(scene), jnp.exp(1j * phases)
+    resultant = resultant_of(model, turn)
+    balance = balance_of(with_imbalances(model))
+    model = balance.model
     return UnbalancedModel(
         scene=model.scene,
         carrier=model.carrier,
@@ -188,23 +196,53 @@ def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
         mass=model.mass,
         balance=balance,
         turn=turn,
-        resultant=resultant_of(model, turn),
+        resultant=resultant,
         unbalance=jnp.ones((), model.mass.dtype),
         force_direction=(balance.unbalance * turn) @ balance.direction,
     )
 
 
+def _imbalances(exciter: Exciter, *, about_tilts: bool) -> list[Array]:
+    """Return the imbalances of a rotor, complex: amount times exp(i phase) with the phase in the direction of rotation."""
+    terms = terms_of(exciter.effects, RotorImbalance)
+    return [term.amount * jnp.exp(1j * exciter.direction * term.phase) for term in terms if term.about_tilts == about_tilts]
+
+
+def with_imbalances(model: LinearModel) -> LinearModel:
+    """Return the model with one equivalent unbalance in place of the unbalance and the imbalances of each rotor.
+
+    The force per w^2 on the coordinates, D = S B^T e + those of the imbalances, is that of an unbalance of 1 kg m whose point
+    moves by P q, with P^T e = D: P = (Re D, -Im D) for the direction e = (1, -i).
+    """
+    if not has_term(model.scene.all_effects, RotorImbalance):
+        return model
+    exciters, mounts = [], []
+    for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
+        turning = rotating_direction(mount, exciter.direction)
+        assert exciter.unbalance is not None  # the response has no loads
+        force = exciter.unbalance * turning @ mount.rows[0]
+        force = force + sum(_imbalances(exciter, about_tilts=False)) * turning @ mount.rotor_rows()
+        if mount.tilt is not None:
+            force = force + sum(_imbalances(exciter, about_tilts=True)) * turning @ mount.tilt
+        rows = jnp.stack([force.real, -exciter.direction * force.imag])
+        mounts.append(Mount(rows=(rows,), axes=(0, 1), gyroscopic=mount.gyroscopic, turn=mount.turn))
+        exciters.append(eqx.tree_at(lambda each: each.unbalance, exciter, jnp.ones_like(model.mass[0, 0])))
+    scene = eqx.tree_at(lambda each: each.exciters, model.scene, tuple(exciters))
+    return dataclasses.replace(model, scene=scene, mounts=tuple(mounts))
+
+
 def resultant_of(model: LinearModel, turn: Array) -> Array:
     """Return the resultant of the centrifugal forces per w^2, (np,) kg m complex: sum_j S_j exp(i alpha_j) e_j.
 
-    `turn` (mass,): exp(i alpha) of the unbalance or of the loads of each exciter. The result is NaN for loads that do not move
-    on a circle.
+    `turn` (mass,): exp(i alpha) of the unbalance, with the static imbalance of the rotor, or of the loads of each exciter. The
+    result is NaN for loads that do not move on a circle.
     """
     found, first = jnp.zeros((), turn.dtype), 0
     for exciter, mount in zip(model.scene.exciters, model.mounts, strict=True):
         loads = exciter.loads
         if loads is None:
-            each = turn[first] * (0.0 if exciter.unbalance is None else exciter.unbalance)
+            own = 0.0 if exciter.unbalance is None else exciter.unbalance
+            each = turn[first] * sum((amount for amount in _imbalances(exciter, about_tilts=False)), own)
         else:
             size = loads.mass * loads.radius if isinstance(loads, CircularLoads) else jnp.nan
             each = jnp.sum(size * turn[first : first + loads.count])

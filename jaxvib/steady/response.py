@@ -14,10 +14,11 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
-from jaxvib.equations.averaged import require_rotating_masses
+from jaxvib.equations.averaged import AVERAGED_TERMS, require_rotating_masses
 from jaxvib.equations.linear import peak_force
 from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene
@@ -230,7 +231,8 @@ def response(
 
     **Arguments**
 
-    - `scene`, whose exciters have an unbalance and no loads, and whose only effect may be gravity
+    - `scene`, whose exciters have an unbalance and no loads; its effects may be gravity, and static and moment imbalances of
+      the rotors, which excite the machine as well
     - `speeds`, rad/s, one or a list; typical: 100 to 1000 values; default: `points` from 0 to `most`, denser near resonances
     - `phases` (exciter,), rad or text, of the unbalances in their directions of rotation, which gears or an ideal
       synchronisation keep; default: 0
@@ -272,7 +274,7 @@ def require_unbalances(scene: Scene) -> None:
         if exciter.loads is not None:
             problem = "turn at a speed of their own; this function needs exciters with an unbalance and no loads, use branches"
             raise InputError(f"{scene.prefix_of(k)}loads", problem)
-    require_rotating_masses(scene)
+    require_rotating_masses(scene, (*AVERAGED_TERMS, RotorImbalance))
 
 
 @cached

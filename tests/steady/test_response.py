@@ -106,6 +106,42 @@ def test_a_gyroscopic_rotor_is_a_dense_solution():
     np.testing.assert_allclose(found.displacement, exact, rtol=1e-11)
 
 
+def imbalanced(way, drive):
+    machine = jv.rotor(
+        mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(6e5, 5e5), damping=(840.0, 800.0),
+        position=(0.165, -0.155),
+    )  # fmt: skip
+    effects = (jv.StaticImbalance(0.03, angle=0.7), jv.MomentImbalance(1e-3, angle=-0.4))
+    return jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.02, at=0.1, direction=way, effects=effects)])
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_imbalances_of_a_rotor_excite_the_machine(way):
+    scene, w = imbalanced(way, jv.ConstantSpeed(120.0)), 120.0
+    found = jv.response(scene, [w])
+    carrier, skew = scene.machine.carrier(), np.zeros((4, 4))
+    skew[2, 3], skew[3, 2] = 0.093, -0.093
+    m, c, k = (np.asarray(each) for each in (carrier.mass, carrier.damping, carrier.stiffness))
+    # A vector at the angle way (w t) + a is Re(e exp(i w t)) with e = exp(i way a) (1, -i way).
+    heavy, inclined, turn = 0.03 * np.exp(0.7j * way), 1e-3 * np.exp(-0.4j * way), np.array([1.0, -1j * way])
+    force = np.concatenate([(0.02 + heavy) * turn, (0.1 * 0.02 + inclined) * turn])
+    exact = np.linalg.solve(k - w**2 * m + 1j * w * (c + way * w * skew), w**2 * force)
+    np.testing.assert_allclose(found.displacement[0], exact, rtol=1e-10)
+    np.testing.assert_allclose(found.torque[0, 0], w * np.real(exact.conj() @ c @ exact) / 2.0, rtol=1e-9)
+    np.testing.assert_allclose(found.exciter_force, np.sqrt(2.0) * abs(0.02 + heavy) * w**2, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_motor_with_an_imbalance_runs_at_the_operating_point():
+    scene = imbalanced(1, jv.DCMotor("1400 rpm", stall_torque=40.0, inertia=0.5))
+    found = jv.response(scene).operating
+    run = jv.simulate(scene, "30 s", save="window")
+    there = np.flatnonzero(np.asarray(found.stable))
+    nearest = there[np.argmin(np.abs(np.asarray(found.speed)[there] - run.omega))]
+    np.testing.assert_allclose(run.omega, found.speed[nearest], rtol=2e-3)
+    np.testing.assert_allclose(run.amplitude, found.amplitude[nearest], rtol=2e-2)
+
+
 def test_operating_points_and_folds_are_scipys():
     scene = one_mass(drive=motor())
     found = jv.response(scene)

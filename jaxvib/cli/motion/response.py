@@ -31,7 +31,7 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
 
     loaded = loaded_scene(scene, without)
     phases = np.zeros(len(loaded.exciters))
-    if len(loaded.exciters) > 1 and all(exciter.loads is None for exciter in loaded.exciters):
+    if len(loaded.exciters) > 1 and not any(exciter.loads or exciter.effects for exciter in loaded.exciters):
         regimes = jv.synchronous_regimes(loaded)
         phases = np.asarray(regimes.phases[0]) if np.any(regimes.stable) else phases
     found = jax.device_get(jv.response(loaded, phases=phases, points=points, most=most))
