@@ -166,6 +166,8 @@ def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
 
 
 def _demands(table: object, section: str) -> list[Demand]:
+    if isinstance(table, Mapping) and "equal_to" in table:
+        raise InputError(f"{section}.equal_to", "is not a demand; a quantity keeps a value by [[hold]] with value = ...")
     quantity, more = quantity_from_table(table, section, ("at_most", "at_least"))
     if not more:
         raise InputError(section, "has no limit; give at_most, at_least or both")
