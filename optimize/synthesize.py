@@ -216,7 +216,9 @@ def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Deman
     demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
     for demand in demands:
         if not isinstance(demand, Demand):
-            held = "; == is no demand, hold(quantity, value) in the DesignSpace keeps a value" if isinstance(demand, bool) else ""
+            held = (
+                "; == is no demand, hold(quantity, value) in the DesignSpace keeps a value" if isinstance(demand, bool) else ""
+            )
             raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'{held}")
     validate_scene(space.scene)
     between(space.scene, objective.of)

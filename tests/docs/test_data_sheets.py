@@ -45,3 +45,12 @@ def test_the_table_has_its_amplitude(scenes):
     assert bool(jam.stable)
     assert 1e3 * float(jam.amplitude[0]) == pytest.approx(8.0, rel=0.05)
     assert float(jam.omega) * 30.0 / np.pi == pytest.approx(780.0, rel=0.02)
+
+
+@pytest.mark.slow
+def test_the_rotor_is_balanced_by_its_balls(scenes):
+    run = jv.simulate(scenes["my_rotor"], "40 s", save="window")
+    k, m, w = 5e5, 25.0 + 3 * 0.04, 100.0 * np.pi
+    alone = 6e-3 * w**2 / abs(k - m * w**2 + 2j * 0.03 * np.sqrt(k * 25.0) * w)
+    assert run.regime.label == "balanced" and alone == pytest.approx(3e-4, rel=0.01)
+    assert float(np.max(run.amplitude)) < 1e-3 * alone
