@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from jaxvib.draw.charts import branch_diagram
 from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.criterion import agreement_maps, criterion_chart
-from jaxvib.draw.motion.histories import time_histories
+from jaxvib.draw.motion.histories import amplitude_histories, time_histories
 from jaxvib.draw.motion.spectra import path_chart
 from jaxvib.draw.regimes import regime_chart
 from jaxvib.draw.results import growth_chart, phase_circles, shapes_chart
@@ -169,3 +169,13 @@ def test_a_line_of_folds_reaches_the_edges_of_its_map():
     axis = label_map(x, y, np.zeros((3, 5), int), ["a"], x_label="x", y_label="y", lines=lines).axes[0]
     np.testing.assert_allclose(axis.lines[0].get_xydata()[[0, -1]], [[0.5, -0.5], [3.5, 2.5]])
     assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "fold bifurcations of exact jams"]
+
+
+def test_run_up_shows_the_resonances_that_it_passes():
+    time = np.linspace(0.0, 1.0, 50)
+    speeds = 100.0 * np.stack([time, -time], 1)
+    one, no_loads = np.ones((50, 1)), np.zeros((50, 0))
+    about = {"names": ["x"], "units": ["m"], "unit": "rad/s"}
+    figure = amplitude_histories(time, one, no_loads, one, speeds, resonances=[20.0, 30.0, 500.0], **about)
+    dotted = [line for line in figure.axes[1].lines if line.get_linestyle() == ":"]
+    assert sorted(float(line.get_ydata()[0]) for line in dotted) == [-30.0, -20.0, 20.0, 30.0]

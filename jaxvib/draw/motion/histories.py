@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_unit
-from jaxvib.draw.style import COLORS, STROKES, legend_above, length_unit, load_names, panels
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, length_unit, load_names, panels
 
 _BINS = 300
 """Maximum number of intervals of a run. The run is drawn as a band between the minimum and the maximum of each interval."""
@@ -224,6 +224,7 @@ def amplitude_histories(
     names: Sequence[str],
     units: Sequence[str],
     directions: Sequence[str] = ("force",),
+    resonances: Sequence[float] = (),
     unit: SpeedUnit | None = None,
     ax: Onto = None,
 ) -> Drawn:
@@ -231,7 +232,7 @@ def amplitude_histories(
 
     `time` (nt,) is in s, `amplitude` (nt, nd) in m, drawn in mm or µm, or rad, drawn in mrad, by `units` (nd,), `load_speed`
     (nt, count) and `rotor_speed` (nt, exciters) are in rad/s, drawn in `unit`, and the foundation force `force` (nt,
-    directions) is in N.
+    directions) is in N. Natural frequencies `resonances`, rad/s, up to the largest speed are dotted lines beside the speeds.
     """
     unit, scale = speed_unit(unit)
     kinds = _kinds(amplitude, units, "amplitude", "amplitude")
@@ -249,6 +250,10 @@ def amplitude_histories(
     if load_speed.shape[1]:
         lines(axes[-2], scale * load_speed, range(load_speed.shape[1]), load_names(load_speed.shape[1]))
     _draw_rotor_speeds(axes[-2], time, scale * rotor_speed)
+    ways = [way for way in (1.0, -1.0) if np.any(way * rotor_speed > 0.0)]
+    passed = [w for w in resonances if w < np.max(np.abs(rotor_speed), initial=0.0)]
+    for k, w in enumerate(np.outer(ways, passed).ravel().tolist()):
+        axes[-2].axhline(scale * w, color=GUIDE, ls=":", lw=0.9, label=None if k else "natural frequencies")
     axes[-2].set_ylabel(f"speed, {unit}")
     legend_above(axes[-2], 6)
     lines(axes[-1], force, range(len(directions)), directions)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -133,20 +135,26 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
 
         **Arguments**: `unit` and `ax` as `Run.plot`.
         """
-        from jaxvib.draw.motion.histories import amplitude_histories  # slow import
+        return plot_histories(self, unit=unit, ax=ax)
 
-        kept, structure = self.window if self.trajectory is None else self.trajectory, self.scene.machine.structure()
-        exciters = self.scene.exciters
-        own = np.repeat([e.loads is not None for e in exciters], [1 if e.loads is None else e.loads.count for e in exciters])
-        return amplitude_histories(
-            np.asarray(kept.time),
-            np.asarray(kept.amplitude),
-            np.asarray(kept.load_speed)[:, own],
-            np.asarray(kept.foundation_force),
-            np.stack([np.asarray(speed) for speed in kept.rotor_speeds], axis=1),
-            names=structure.coordinates,
-            units=structure.units,
-            directions=structure.foundation_directions,
-            unit=unit,
-            ax=ax,
-        )
+
+def plot_histories(run: Envelope, *, resonances: Sequence[float] = (), unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
+    """Plot an averaged run, with natural frequencies `resonances`, rad/s, in the diagram of the speeds."""
+    from jaxvib.draw.motion.histories import amplitude_histories  # slow import
+
+    kept, structure = run.window if run.trajectory is None else run.trajectory, run.scene.machine.structure()
+    exciters = run.scene.exciters
+    own = np.repeat([e.loads is not None for e in exciters], [1 if e.loads is None else e.loads.count for e in exciters])
+    return amplitude_histories(
+        np.asarray(kept.time),
+        np.asarray(kept.amplitude),
+        np.asarray(kept.load_speed)[:, own],
+        np.asarray(kept.foundation_force),
+        np.stack([np.asarray(speed) for speed in kept.rotor_speeds], axis=1),
+        names=structure.coordinates,
+        units=structure.units,
+        directions=structure.foundation_directions,
+        resonances=resonances,
+        unit=unit,
+        ax=ax,
+    )

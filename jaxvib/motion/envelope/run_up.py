@@ -18,7 +18,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.envelope.envelope import envelope
-from jaxvib.motion.envelope.result import Envelope
+from jaxvib.motion.envelope.result import Envelope, plot_histories
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, status_name
@@ -93,8 +93,8 @@ class MotorRunUp(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
-        """Plot the histories of the run-up. **Arguments**: `unit` and `ax` as `Run.plot`."""
-        return self.run.plot(unit=unit, ax=ax)
+        """Plot the histories of the run-up with the natural frequencies. **Arguments**: `unit` and `ax` as `Run.plot`."""
+        return plot_histories(self.run, resonances=self.resonances.tolist(), unit=unit, ax=ax)
 
 
 class _Scaled(MotorWrapper):
