@@ -11,6 +11,7 @@ from optimize import (
     DesignSpace,
     foundation_force,
     motion_spread,
+    pareto,
     recipes,
     roundness,
     synchronization_margin,
@@ -204,6 +205,18 @@ def test_margin_and_force_constrain_designs_as_in_a_scan():
     assert 0.99 * least < best.values.min() <= least
     found = *best.scene.exciters[1].position, best.scene.machine.supports[0].stiffness[1]
     np.testing.assert_allclose(found, z, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_front_of_straightness_and_force_is_that_of_scans():
+    front = pareto(place_and_springs(), straight_at_45(), foundation_force(), points=4, starts=8)
+    assert len(front.values) >= 4
+    assert np.all(np.diff(front.values[:, 0]) > 0.0) and np.all(np.diff(front.values[:, 1]) < 0.0)
+    for straightness, force in front.values[:-1]:
+        _, least = scan_of_place_and_springs(force * (1.0 + 1e-7), points=25, rounds=6)
+        assert least * 0.99 - 1e-7 < straightness < least + 1e-9
+    _, least_force = scan(LOW, HIGH, lambda z: TwoMotors(*z.T).force(), points=25)
+    assert least_force * (1.0 - 1e-4) < front.values[-1, 1] < least_force * (1.0 + 1e-7)
 
 
 @pytest.mark.slow
