@@ -49,8 +49,8 @@ def load_design(path: str | Path) -> Design:
     - `[free]`: bounds for each parameter that may change
     - `[ties]`: parameters that follow others
     - `[choices]`: parameters whose values are chosen from a list, or from a catalogue: `file`, a CSV file relative to the
-      design file, and the name of its `column`. Rows of a catalogue, such as motors, are a word with `file` and `columns`, a
-      table from parameters to names of columns
+      design file, and the name of its `column`. For rows of a catalogue, such as motors, the key is any word, and its value is
+      a table of `file` and `columns`, which maps parameters to names of columns
     - every `[[hold]]`: a quantity and the value that it keeps; default: its value in the scene
     - every `[[demand]]`: a quantity that is `at_most` or `at_least` a value
     - `[objective]`: the quantity to minimize, or to maximize with `maximize = true`
@@ -144,7 +144,7 @@ def _search_options(table: Tables) -> Tables:
 def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
     """Return the values of a choice.
 
-    A table with `file`, and `column` if necessary, is a column of a CSV file, one with `file` and `columns` its rows.
+    A table with `file`, and `column` if necessary, is a column of a CSV file. A table with `file` and `columns` is its rows.
     """
     if not isinstance(values, Mapping) or any("." in each for each in values):
         return values

@@ -18,11 +18,11 @@ SEPARATION = click.option(
 
 
 _POINT = "jaxvib.deck_point"
-"""Name of the options in the context of click."""
+"""Key of the values of --deck and --slope in the context of click."""
 
 
 def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options --deck and --slope of commands that show the measures of a vibration, for `measures_of`."""
+    """Add the options --deck and --slope, which `measures_of` reads, to a command."""
 
     def keep(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
         if value is not None:

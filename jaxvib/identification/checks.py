@@ -36,10 +36,11 @@ _UNEXPLAINED = 0.5
 """Share of a channel's standard deviation in the residuals above which a fit counts as none."""
 
 _MOSTLY = 0.5
-"""Share of the power of a signal in one vibration above which the signal is said to be this vibration."""
+"""Smallest share of the power of a signal in one vibration for which a note names this vibration."""
 
 _NOISE_LIKE = 0.01
-"""Power of residuals relative to the readings below which a vibration of constant frequency counts as noise."""
+"""Smallest variance of residuals, relative to that of the readings, for which a note names a vibration of constant
+frequency."""
 
 
 class FitStatus(eqx.Enumeration):

@@ -191,7 +191,7 @@ def identify(
     - `throw`: raise if no fit is found
 
     **Returns** `MachineFit`, or `Identified` for a pendulum. **Raises** `InputError` for records that cannot be fitted,
-    `ComputationError` "not_converged", or "contradicted" if the records vibrate at another frequency than the rotor's.
+    `ComputationError` "not_converged", or "contradicted" if the records contain a vibration that is not at the rotor's speed.
 
     >>> import numpy as np, jaxvib as jv
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)

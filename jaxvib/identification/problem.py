@@ -196,7 +196,10 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
 
 
 def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
-    """Return a run with a sampling rate for the highest frequency of the motion, rad/s, with a margin for the first values."""
+    """Return the run, reduced to a sampling rate for the highest frequency of the motion if it is long.
+
+    The natural frequencies have a margin, because they are those of the first values.
+    """
     if max(time.size for time in run.times.values()) < MIN_LONG:
         return run
     measured = run.rotor_speed()

@@ -438,7 +438,7 @@ def _plain(value: np.ndarray | float, *, unwrap: bool) -> float | list:
 
 
 def _template(kind: str, ending: str = "", speed: str = "") -> str:
-    """Return the text of a template; `ending` names the loads, the drive and the effects that machines of one sort share."""
+    """Return the text of a template; `ending`: file with the loads, the drive and the effects of all machines of one sort."""
     folder = Path(__file__).with_name("templates")
     parts = [(folder / f"{name}.toml").read_text(encoding="utf-8") for name in (kind, ending) if name]
     return "\n".join(parts).replace("{speed}", speed)

@@ -50,11 +50,11 @@ def estimate_share(flags: Any) -> Share:
     """Return the share of True among Boolean `flags` of independent cases, with Wilson's confidence interval of 95 %.
 
     The share of an `Ensemble` estimates a probability if the values of its runs are random samples of their distribution. The
-    width of the interval falls with the root of the number of cases.
+    width of the interval is proportional to 1/sqrt(number of cases).
 
     **Arguments**: `flags`, Boolean array; typical: 100 to 10,000 runs.
 
-    **Returns** `Share`. **Raises** `InputError` for anything else than a Boolean array with at least one value.
+    **Returns** `Share`. **Raises** `InputError` for anything other than a Boolean array with at least one value.
 
     >>> import numpy as np, jaxvib as jv
     >>> share = jv.estimate_share(np.arange(50) < 40)

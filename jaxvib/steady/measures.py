@@ -47,7 +47,7 @@ ways to compute the torque have a relative rounding error of 1e-12."""
 
 
 _NEGLIGIBLE = 1e-9
-"""Strokes and loads below this fraction of the largest are not shown: they are rounding errors."""
+"""Strokes and forces below this fraction of the largest are not shown: they are rounding errors."""
 
 
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
@@ -136,7 +136,7 @@ class VibrationMeasures(eqx.Module):
     - `exciter_force`, N zero to peak: resultant of the centrifugal forces
     - `transmissibility`: foundation force divided by `exciter_force`
     - `static_load` (ns,), N: weight that each support carries; NaN if the directions of the coordinates are unknown
-    - `dynamic_load` (ns,), N zero to peak, vertical, and `side_load` (ns,), horizontal, of each support
+    - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on each support
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
     - `point` (2,) of a body in a plane, its `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s,
       the estimate of `jaxvib.conveying_speed`; None for other machines
@@ -197,7 +197,7 @@ class VibrationMeasures(eqx.Module):
         if self.point is None or self.throw_angle is None or self.throw_number is None or self.conveying_speed is None:
             return []
         place, speed = ", ".join(f"{float(x):.4g}" for x in self.point), float(self.conveying_speed)
-        conveys = "flights over a turn" if np.isnan(speed) else f"conveys {speed:.3f} m/s"
+        conveys = "flights longer than a turn" if np.isnan(speed) else f"conveys {speed:.3f} m/s"
         angle = f"thrown at {quantity_text(self.throw_angle, 'rad', 4)}"
         return [f"point ({place}) m: {angle}, throw number {float(self.throw_number):.3g}, {conveys}"]
 
@@ -218,7 +218,7 @@ def vibration_measures(
     body: int = 0,
     slope: Number = 0.0,
 ) -> VibrationMeasures:
-    """Return stroke, acceleration, velocity, isolation, loads on supports, torque, power and throw of a vibration.
+    """Return stroke, acceleration, velocity, isolation, forces on supports, torque, power and throw of a vibration.
 
         stroke = 2 |Y|,    acceleration = Omega^2 |Y| / g,    velocity = Omega |Y| / sqrt 2,
         dynamic load of a support = |k u + i Omega c u|,    static load = k s with K s = M g
@@ -228,8 +228,8 @@ def vibration_measures(
     **Arguments**
 
     - `scene`
-    - `motion` of it: a jam of light loads such as `jam_modes(scene).select(3)`, or the `vibration()` of a run, of a synchronous
-      regime or of a response
+    - `motion` of the scene: a jam of light loads such as `jam_modes(scene).select(3)`, or the `vibration()` of a run, of a
+      synchronous regime or of a response
     - `at`: point of a deck, (x, y) of the body number `body`, m; default: its centre of mass; typical: the middle of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
 
@@ -261,7 +261,7 @@ def _vibration_of(scene: Scene, omega: Array, displacement: Array, force: Array)
 
 
 def exciter_force(model: JammedModel, omega: Array) -> Array:
-    """Return the centrifugal force of coincident loads, N zero to peak, as `peak_force`."""
+    """Return the centrifugal force of coincident loads, N zero to peak, see `peak_force`."""
     return peak_force(model.unbalance * omega**2 * rotating_direction(model.mount))
 
 
@@ -324,9 +324,10 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
 
 
 def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tuple[Array, Array, Array]:
-    """Return the static load, and the vertical and the horizontal dynamic load, zero to peak, of each support, (ns,) N each.
+    """Return the static, the vertical dynamic and the horizontal dynamic force on each support, (ns,) N each.
 
-    The static load is NaN if the directions of the coordinates are unknown. Supports that are effects are not included.
+    Dynamic forces are zero to peak. The static force is NaN if the directions of the coordinates are unknown. Supports that are
+    effects are not included.
     """
     machine = model.scene.machine
     stiffness, damping = machine.support_rows()

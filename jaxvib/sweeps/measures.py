@@ -112,8 +112,8 @@ RUN_MEASURES = {
 """Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
 foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time, with
 a resolution of 1/64 of the run, after which each load speed differs from its final value by less than 1 % of the rotor
-speed. Stroke to conveying speed: see `VibrationMeasures`, at the centre of mass; the support load is the sum of the static and
-the vertical dynamic load."""
+speed. The measures from stroke to conveying speed are those of `VibrationMeasures`, for the centre of mass as the point. The
+support load is the sum of the static and the vertical dynamic load."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

@@ -34,7 +34,7 @@ class PlannedRun(eqx.Module):
       its name, and thereby its gain, at another place
     - `rate`, Hz, of the samples; typical: 200 to 2000
     - `noise`: standard deviation of the readings by the name of the channel, for channels that no run so far has, in SI units
-      or as strings; typical: "0.05 m/s^2". Other channels have the noise of the fit, with the same power in each frequency
+      or as strings; typical: "0.05 m/s^2". Other channels have the noise of the fit, with the same spectral density
     - `change`: numbers of the scene that differ in this run, as in `MeasuredRun.from_arrays`
 
     **Raises** `InputError` for a drive whose speed depends on the machine, and for values that are not positive.
@@ -102,7 +102,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
 
     **Raises** `InputError` for a channel whose noise is unknown, and for a scene with several exciters.
     """
-    # Noise has the same power in each frequency at all sampling rates: deviations per square root of the rate.
+    # The spectral density of the noise is the same at all sampling rates. Deviations are stored per square root of the rate.
     deviations: dict[str, float] = {}
     for names, noise, time in reversed(list(zip(fit.channels, fit.noise, fit.time, strict=True))):
         deviations |= dict(zip(names, noise * math.sqrt(time[1] - time[0]), strict=True))

@@ -1,11 +1,11 @@
 """Lower sampling rate of long records: a low-pass filter, of which every n-th reading is kept.
 
 Readings that are recorded much faster than the machine moves contain nothing but noise and other vibrations above its band. The
-filter is symmetric in time. Its gain is 1 up to 0.3 times the new rate and 0 from 0.7 times the new rate, both to 1e-5. What is
-folded back lies above 0.3 times the new rate, and white noise remains nearly white.
+filter is symmetric in time. Its gain is 1 up to 0.3 times the new rate and 0 from 0.7 times the new rate, both to 1e-5. Aliases
+lie above 0.3 times the new rate, and white noise remains nearly white.
 
-Outliers and missing readings are replaced by the filtered signal before it is filtered again, which is exact enough because
-they are much shorter than the response of the filter.
+Outliers and missing readings are replaced by values of the filtered signal, and the readings are filtered again. This is exact
+enough, because outliers and gaps are much shorter than the response of the filter.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ _HALF_LENGTH, _KAISER = 8, 10.06
 """Half of the length of the filter, in new steps, and the parameter of its Kaiser window: 100 dB."""
 
 _PASSES, _OUTLIER_DISTANCE, _RIPPLE = 4, 6.0, 1e-3
-"""Largest number of filter passes for a record with outliers or missing readings; distance of an outlier from the filtered
-signal in standard deviations of this difference, and relative to the size of the signal, above the error of the filter."""
+"""Largest number of filter passes for a record with outliers or missing readings. Smallest distance of an outlier from the
+filtered signal, in standard deviations of this distance and relative to the standard deviation of the signal. The second one is
+above the error of the filter."""
 
 _NEIGHBORS = 2
 """Number of readings on each side of an outlier with which it is compared."""
@@ -45,8 +46,8 @@ _KINDS = ("acceleration", "velocity", "displacement", "force", "angle", "speed")
 
 
 def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
-    """Return a run with a lower sampling rate, and a note about it, if it is long and much faster than the `highest` frequency
-    (rad/s) of the machine and its rotors; otherwise the same run.
+    """Return a run with a lower sampling rate, and a note about both rates, if the run is long and its rate is much higher than
+    the `highest` frequency (rad/s) of the machine and its rotors; otherwise return the same run.
 
     Runs with clipped readings, which are bounds, and with channels at different times are not changed.
     """
@@ -83,7 +84,7 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
 
 
 def filtered(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
-    """Return every `factor`-th reading after the filter, without the ends and NaN near longer gaps, and the number of outliers.
+    """Return every `factor`-th filtered reading without the ends, and the number of outliers; NaN near longer gaps.
 
     >>> t = 1e-3 * np.arange(40000)
     >>> value = np.sin(20.0 * t) + 0.1 * np.sin(3000.0 * t)

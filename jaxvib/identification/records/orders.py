@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 _SEGMENTS = 4
-"""Number of segments of a record whose spectra, with those of the segments between them, are averaged."""
+"""Number of segments of a record. Their spectra are averaged together with those of segments that begin at their middles."""
 
 _LINE, _AROUND = 2, 8
-"""Number of bins of a spectrum on each side of a line that belong to it, and of those that are compared with it."""
+"""Number of bins of a spectrum on each side of a peak that belong to its line, and number of the next bins on each side, with
+which the line is compared."""
 
 _STEEP = 10.0
-"""Power of a bin of a line relative to that of the bins around it, below which the spectrum has no line there."""
+"""Smallest mean power of the bins of a line, relative to that of the bins around the line."""
 
 _MIN_TURNS, _MIN_SAMPLES = 16, 512
 """Smallest number of turns and of samples whose spectra are examined."""
@@ -22,8 +23,8 @@ _MIN_TURNS, _MIN_SAMPLES = 16, 512
 class ForeignVibration(NamedTuple):
     """Vibration that is not at the speed of the rotor.
 
-    **Attributes**: its `order`, the frequency relative to the rotor's speed, or its constant `frequency` in Hz, of which the
-    other one is None; `share` of the power of the signal.
+    **Attributes**: `order`: frequency relative to the rotor's speed, None for a vibration of constant frequency; `frequency`,
+    Hz, None for a vibration whose frequency follows the rotor; `share` of the power of the signal.
     """
 
     order: float | None

@@ -229,7 +229,7 @@ def _why_unnamed(scene: Scene, name: str) -> str:
 
 
 def _row_by_row(leaf: Array) -> Array:
-    """Return the entries of an array as their numbers count them."""
+    """Return the entries of a matrix row by row, as they are numbered, and other arrays unchanged."""
     return leaf if leaf.ndim < 2 else jnp.ravel(leaf)
 
 

@@ -134,7 +134,8 @@ class Rotor(Machine):
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
     def support_rows(self) -> tuple[Array, Array]:
-        """Return the rows of both supports; those of the foundation if the terms are not those of the supports."""
+        """Return the rows of both supports; those of the foundation if `stiffness_terms` or `damping_terms` replace
+        supports."""
         if self.stiffness_terms is not None or self.damping_terms is not None:
             return super().support_rows()
         translation, tilt = self._directions()

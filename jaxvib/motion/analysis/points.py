@@ -74,8 +74,8 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
 
 @cached
 def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -> Vibration:
-    """Return the harmonic with the mean speed of the loads that is fitted to a window, the measured amplitudes and the mean
-    torques of the drives.
+    """Return the harmonic at the mean speed of the loads, fitted to the displacements of a window, with the measured amplitudes
+    and the mean torques and powers of the drives.
 
     The exciter's force is NaN for a rotor with an imbalance, which can turn faster than the loads, and the torque is NaN for
     loads that spin or slide.
