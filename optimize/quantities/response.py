@@ -1,4 +1,4 @@
-"""Quantities of the response to unbalances: at the working point, at a speed, or the largest over a range of speeds.
+"""Quantities of the response to unbalances: at the working point, at a speed, or the largest value over a range of speeds.
 
 The exciters have unbalances and no loads, see `jaxvib.response`. At the working point several exciters have the phases of the
 working regime, at given speeds equal phases.
