@@ -188,13 +188,14 @@ def _film(scene: Scene, shown: SampledMotion, history: SampledMotion, fps: float
         text.set_in_layout(False)
     cursors = _plot_histories((lower, below), scene, history)
     directions = scene.machine.structure().foundation_directions
-    directions = directions if len(directions) > 1 else ("",)
+    directions = directions if len(directions) > 1 else ("foundation force",)
+    heading = "    " if len(directions) == 1 else "  force "  # both components fit above the picture
 
     def update(k: int) -> None:
         for artist, part in zip(artists, parts(k), strict=True):
             _move(artist, part.points)
-        total = ", ".join(f"{name}{force:8.0f} N" for name, force in zip(directions, shown.force[k], strict=True))
-        clock.set_text(f"t = {shown.time[k]:8.3f} s    foundation force {total}")
+        total = ", ".join(f"{name}{force:7.0f} N" for name, force in zip(directions, shown.force[k], strict=True))
+        clock.set_text(f"t = {shown.time[k]:7.3f} s{heading}{total}")
         for cursor in cursors:
             cursor.set_xdata([shown.time[k]] * 2)
 

@@ -114,6 +114,9 @@ def time_histories(
     # The ripple of loads that are much slower than the rotor would be invisible on an axis that includes the rotor.
     if whole[2].shape[1] == 0 or np.all(np.abs(part[3] - np.mean(ends)) < ends[1] - ends[0]):
         _draw_rotor_speeds(right, part[0], scale * part[3])
+    low, high = right.get_ylim()
+    if high - low < (room := _LEAST_RANGE * max(abs(low), abs(high))):  # rounding errors of a constant speed
+        right.set_ylim(0.5 * (low + high - room), 0.5 * (low + high + room))
     left.set_ylabel(f"speed, {unit}")
     legend_above(left, 6)
     left, right = axes[-2:]
@@ -139,6 +142,9 @@ def _kinds(values: np.ndarray, units: Sequence[str], length: str, tilt: str) -> 
     kinds = (("m", f"{length}, {unit}", factor), ("rad", f"{tilt}, mrad", 1e3))
     return [kind for kind in kinds if kind[0] in units]
 
+
+_LEAST_RANGE = 1e-4
+"""Smallest range of the axis of the last periods' speeds, relative to the speeds."""
 
 _EQUAL = 0.01
 """Difference of the speeds of two loads, relative to the range of an axis, below which they are drawn as one line."""
