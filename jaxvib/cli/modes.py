@@ -91,6 +91,7 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
             }
             for jam in jams
         ],
+        "unresolved": found.unresolved,
         "measures": [{"mode": mode, **each.document()} for mode, each in measures.items()],
         "folds": [{"omega": found.folds.omega[k], "rotor_speed": found.folds.rotor_speed[k]} for k in folds],
         **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {}),
@@ -110,6 +111,7 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
         ]
         if rows:
             lines.append("stays, no: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
+        lines += [text] if (text := found.unresolved_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
         for mode, each in measures.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from typing import Any, NamedTuple
@@ -177,7 +178,9 @@ def integrate(
         progress=plan.progress_meter,
     )
     assert solution.ts is not None and solution.ys is not None
-    times, states = solution.ts[0], motion.unpack(solution.ys[0])
+    times, states = jax.tree.map(
+        lambda value: jnp.where(exists, value, jnp.nan), (solution.ts[0], motion.unpack(solution.ys[0]))
+    )
     window = trajectory(model, times, states)
     whole = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
     if is_measured is None:
@@ -186,7 +189,9 @@ def integrate(
         numbers = jax.lax.cond(
             is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(model, states)
         )
-    numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
+    parts = numbers, whole, window.rotor_speeds
+    numbers, whole, speeds = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), parts)
+    window = dataclasses.replace(window, rotor_speeds=speeds)
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not reach its end has no window; its last state shows if it diverged.
     ended = solution.result == diffrax.RESULTS.successful

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.numerics.fence import fence, hidden_one
+
 NODES = 4
 """Number of neighbouring samples whose values and slopes a polynomial interpolates."""
 
@@ -138,17 +140,19 @@ def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
     slope = _derivative(polynomial)
     curvature = _derivative(slope)
     turns = begin * end < 0.0
-    # Two Newton steps, from the extremum of the cubic between the two samples, leave only rounding errors.
     bend = 3.0 * rise - 2.0 * begin - end
     root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))
     divisor = bend + jnp.where(begin > 0.0, -root, root)
-    share = jnp.clip(-begin / jnp.where(turns & (divisor != 0.0), divisor, 1.0), 0.0, 1.0)
-    for _ in range(2):
+
+    def improved(share: Array) -> Array:
         curved = _at(curvature, origin + share)
         change = _at(slope, origin + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
-        share = jnp.clip(share - change, 0.0, 1.0)
-    # Without a barrier the compiler recomputes the polynomials for each use of their values.
-    return jax.lax.optimization_barrier((share, jnp.where(turns, _at(polynomial, origin + share), x[:-1])))
+        return jnp.clip(share - change, 0.0, 1.0)
+
+    share = improved(jnp.clip(-begin / jnp.where(turns & (divisor != 0.0), divisor, 1.0), 0.0, 1.0))
+    value = jnp.where(turns, _at(polynomial, origin + share), x[:-1])
+    # Without the barrier and the fence the compiler recomputes the polynomials for each use of their values.
+    return jax.lax.optimization_barrier((improved(share), fence(value, hidden_one(x[0]))))
 
 
 def _polynomial(x: Sequence[Array] | Array, v: Sequence[Array] | Array) -> list[Array]:

@@ -27,7 +27,7 @@ _Entry: TypeAlias = Array | float
 
 def times(matrix: Array, vector: Array) -> Array:
     """Return a matrix times a vector: for small matrices as a sum, because a product in a time loop prevents fusion."""
-    if min(matrix.shape) <= _MAX_UNROLLED_EQUATIONS:
+    if max(matrix.shape) <= _MAX_UNROLLED_EQUATIONS:
         return jnp.sum(matrix * vector[None, :], axis=-1)
     return jnp.matmul(matrix, vector, precision="highest")
 

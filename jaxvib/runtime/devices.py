@@ -64,7 +64,9 @@ def on_device(tree: PyTree) -> PyTree:
 
 def arrays_on_device(leaves: Sequence[Any]) -> list[Any]:
     """Copy NumPy's arrays among the leaves of a tree to JAX's device; leave Python's numbers, which are part of programs."""
-    return [on_device(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
+    arrays = [leaf for leaf in leaves if isinstance(leaf, np.ndarray)]
+    moved = iter(jax.device_put(arrays) if arrays else ())
+    return [next(moved) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
 
 
 def take_a_device() -> None:

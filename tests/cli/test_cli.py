@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import equinox as eqx
 import numpy as np
 import pytest
 from scenes import scene
@@ -28,7 +29,7 @@ def test_modes_json_has_the_promised_keys(typed):
     code, out, err = typed("modes", "machine.toml", "--json")
     document = json.loads(out)
     assert code == 0 and err == ""
-    assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "measures", "folds"}
+    assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "unresolved", "measures", "folds"}
     keys = {"mode", "omega", "stable", "growth_of_free_loads", "status", "amplitude", "foundation_force"}
     assert set(document["modes"][0]) == keys and document["judged"] == "by slope, for light loads that stay together"
     assert set(document["folds"][0]) == {"omega", "rotor_speed"}
@@ -44,6 +45,16 @@ def test_modes_writes_table_and_picture(typed, tmp_path):
     assert " yes " in out and " no " in out and "no: the loads spread" in out and max(map(len, out.splitlines())) <= 110
     assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
+
+
+def test_modes_name_a_resonance_without_a_peak(typed, tmp_path):
+    plain = scene("two_mass", speed=150.0)
+    damped = eqx.tree_at(lambda s: s.machine.damping, plain, 30.0 * plain.machine.damping)
+    jv.save_scene(damped, tmp_path / "damped.toml")
+    said = "modes 1, 2 exist at no rotor speed: the branch has no peak of its own"
+    assert said in typed("modes", "damped.toml")[1] and said in jv.jam_modes(damped).summary()
+    assert json.loads(typed("modes", "damped.toml", "--json")[1])["unresolved"] == [1, 2]
+    assert "at no rotor speed" not in typed("modes", "machine.toml")[1] + jv.jam_modes(plain).summary()
 
 
 def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):

