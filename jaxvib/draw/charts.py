@@ -270,7 +270,9 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
         axis.set_title(title, loc="left", pad=24.0, fontsize="medium")
     axis.grid(False, axis="y")
     less, more = Patch(color=COLORS[0]), Patch(facecolor=COLORS[3], hatch="///", edgecolor="white", lw=0.0)
-    legend_above(axis, handles=[less, more], labels=["less than before", "more than before"])
+    # The legend ends at the axis, whose width depends on the names: the header of the values stands to the right of it.
+    names = ["less than before", "more than before"]
+    legend_above(axis, handles=[less, more], labels=names, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     return figure if ax is None else ax
 
 

@@ -5,9 +5,10 @@ import itertools
 import matplotlib.colors
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxvib.draw.charts import branch_diagram
+from jaxvib.draw.charts import before_after, branch_diagram
 from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.criterion import agreement_maps, criterion_chart
 from jaxvib.draw.motion.histories import amplitude_histories, time_histories
@@ -179,3 +180,17 @@ def test_run_up_shows_the_resonances_that_it_passes():
     figure = amplitude_histories(time, one, no_loads, one, speeds, resonances=[20.0, 30.0, 500.0], **about)
     dotted = [line for line in figure.axes[1].lines if line.get_linestyle() == ":"]
     assert sorted(float(line.get_ydata()[0]) for line in dotted) == [-30.0, -20.0, 20.0, 30.0]
+
+
+def test_a_legend_ends_before_the_header_of_the_values():
+    figure = before_after([("foundation force divided by the amplitude of a point at (0, 0.1) m, N/mm", 2.0, 1.0)])
+    FigureCanvasAgg(figure).draw()
+    axis = figure.axes[0]
+    header = next(text for text in axis.texts if text.get_text() == "before → after")
+    assert axis.get_legend().get_window_extent().x1 <= header.get_window_extent().x0
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_points_on_a_circle_begin_with_the_first_number(first):
+    texts = [text.get_text() for text in phase_circles([("", np.array([0.5, 2.0]))], first=first).axes[0].texts]
+    assert {f"{first}", f"{first + 1}"} <= set(texts)

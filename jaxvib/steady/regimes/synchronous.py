@@ -166,7 +166,7 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
-        return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], ax=ax)
+        return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], first=_first_number(self.scene), ax=ax)
 
 
 @cached
@@ -218,7 +218,12 @@ class SynchronousRegimes(AbstractSynchronousRegime):
             (f"{speed_text(w, 6)}\n{'stable' if s else 'unstable'}", np.asarray(a))
             for w, s, a in zip(self.speed, self.stable, self.phases, strict=True)
         ]
-        return phase_circles(sets, ax=ax)
+        return phase_circles(sets, first=_first_number(self.scene), ax=ax)
+
+
+def _first_number(scene: Scene) -> int:
+    """Return the number of the first rotating mass in figures: unbalances have the numbers of their exciters, from 0."""
+    return int(any(exciter.loads is not None for exciter in scene.exciters))
 
 
 @validated
