@@ -53,6 +53,7 @@ def test_fit_finds_the_numbers_from_wrong_first_values():
     assert np.max(np.abs(distances(fit))) < 4.0
     assert abs(fit.phase[0] - 0.4) < 1e-3
     np.testing.assert_allclose(fit.noise[0], NOISE, rtol=0.03)
+    np.testing.assert_allclose(np.nanstd(fit.readings[0] - fit.fitted[0], axis=0), NOISE, rtol=0.03)
     assert fit.estimate("machine.link_stiffness[0]").error < 40.0
     np.testing.assert_allclose(fit.scene.machine.stiffness, [5e4, 6e4], rtol=3e-3)
     assert float(fit.scene.exciters[0].unbalance) == pytest.approx(fit.estimate("exciters[0].unbalance").value, rel=1e-12)

@@ -162,6 +162,13 @@ def test_converter_follows_its_ramp():
     assert rotor[1][-1] == pytest.approx(50.0, abs=1e-3)
 
 
+def test_converter_shifts_the_curve_of_its_motor():
+    motor = jv.DCMotor(150.0, stall_torque=30.0, inertia=0.02)
+    drive = jv.Converter(motor, jv.SpeedProfile([0.0, 1.0], [0.0, 100.0]))
+    for speed in (80.0, 100.0, 110.0):
+        assert float(drive.torque(speed)) == pytest.approx(30.0 * (100.0 - speed) / 150.0, abs=1e-12)
+
+
 def test_speed_control_equals_scipy():
     drive = jv.SpeedControl(jv.ConstantSpeed(100.0), gain=0.5, integral_gain=2.0, torque_limit=8.0, inertia=0.2)
     time, rotor = _rotor(_run(drive, 10.0))

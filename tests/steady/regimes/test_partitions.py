@@ -1,10 +1,13 @@
 """Motions of exciters in groups of different speeds: closed forms, run-ups, simulation, exchanges, bad input."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
 import jaxvib as jv
+from jaxvib.steady.regimes.partitions import _motion
 
 MASS, INERTIA = 300.0, 75.0
 
@@ -108,3 +111,15 @@ def test_group_of_one_mass_is_a_scene_of_its_own():
     np.testing.assert_allclose(alone.speed, single.speed, rtol=1e-12)
     np.testing.assert_allclose(alone.growth, single.growth, rtol=1e-6)
     np.testing.assert_allclose(alone.power, single.power, rtol=1e-9)
+
+
+def test_a_motion_is_stable_if_all_its_groups_are():
+    """Groups (0, 2) and (1,) with the growth rates -2 and 3 1/s."""
+
+    def regime(masses, growth, stable):
+        numbers = np.arange(1.0, masses + 1.0)
+        return SimpleNamespace(speed=10.0 * masses, phases=numbers, torque=-numbers, growth=growth, stable=stable)
+
+    group, speed, phases, torque, growth, stable = _motion([((0, 2), regime(2, -2.0, True)), ((1,), regime(1, 3.0, False))], 3)
+    assert list(group) == [0, 1, 0] and list(speed) == [20.0, 10.0, 20.0] and (growth, stable) == (3.0, False)
+    assert list(phases) == [1.0, 1.0, 2.0] and list(torque) == [-1.0, -1.0, -2.0]
