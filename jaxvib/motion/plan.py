@@ -104,11 +104,10 @@ def plan_run(
     end = known_number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
-    samples = (
-        _enough_samples(given_scene, end)
-        if samples is None
-        else count(samples, "samples", low=2, each=_sample_size(given_scene))
-    )
+    if samples is None:
+        samples = _enough_samples(given_scene, end)
+    else:
+        samples = count(samples, "samples", low=2, each=_sample_size(given_scene))
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _step_control(end, steps, estimate)
     scene = with_spin_up_drive(given_scene, end, start, spin_up)
@@ -123,30 +122,34 @@ def plan_run(
     if max_steps is None:
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
-        # The caller may differentiate the run, and derivatives of the unrolled step take several times as long to compile.
-        forward = isinstance(adjoint, diffrax.ForwardMode)
-        solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
+        solver = _solver_for_derivatives(adjoint)
     kept, most = samples if save == "all" else 0, min(count(max_steps, "max_steps"), MAX_STEPS)
-    # Time loses its digits in single precision.
-    is_cut = (
-        known
-        and state.displacement.dtype.itemsize < 8
-        and save == "window"
-        and len(scene.exciters) == 1
-        and scene.drive.constant
-    )
     return RunPlan(
         given_scene=given_scene,
         scene=scene,
         end=end,
         state=state,
         integration=IntegrationPlan(solver, control, adjoint, kept, periods, (fastest, slowest), most, progress_meter),
-        stretches=max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _STRETCH_TURNS))) if is_cut else 1,
+        stretches=_stretches(scene, end, state, fastest) if known and save == "window" else 1,
         is_known=known,
         is_estimated=is_estimated,
         accuracy=steps.error if isinstance(steps, Accuracy) else None,
         fastest=fastest,
     )
+
+
+def _solver_for_derivatives(adjoint: diffrax.AbstractAdjoint | None) -> LoopDopri8:
+    """Return the method of a run that the caller may differentiate; derivatives of the unrolled step take several times as long
+    to compile."""
+    forward = isinstance(adjoint, diffrax.ForwardMode)
+    return LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
+
+
+def _stretches(scene: Scene, end: Array, state: State, fastest: Array | np.ndarray) -> int:
+    """Return the number of consecutive integrations; time loses its digits in single precision."""
+    if state.displacement.dtype.itemsize >= 8 or len(scene.exciters) != 1 or not scene.drive.constant:
+        return 1
+    return max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _STRETCH_TURNS)))
 
 
 def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *, throw: bool) -> RunPlan:

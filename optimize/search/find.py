@@ -172,26 +172,25 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
         interrupted = True
         polished = polish(problem, last, 0, lambda *_: None)
     history.append(polished.history)
-    # The jam that was followed may have another mode number now, which can be determined only from the whole branch.
-    point, violations, remaining_decrease, optimal = (
-        _with_requested_modes(problem, polished.point),
-        polished.violation,
-        polished.remaining_decrease,
-        polished.optimality,
-    )
-    lost = ~point.exists()
-    if np.any(lost):  # a machine with the requested mode is preferred to a better one without it
-        point = _with_requested_modes(problem, initial).where(lost, point)
-        violations, remaining_decrease, optimal = (
-            violation(problem, point),
-            np.where(lost, np.inf, remaining_decrease),
-            optimality(problem, point),
-        )
+    polished = _restore_modes(problem, polished, initial)
     bounds = np.asarray(problem.space.low), np.asarray(problem.space.high)
     # The history of an evolution has one column; that of the polishing has one column for each start.
     width = max(part.shape[1] for part in history)
     joined = np.concatenate([np.broadcast_to(part, (len(part), width)) for part in history])
-    return SearchResult(point, joined, remaining_decrease, violations, optimal, drawn, existing, interrupted, bounds)
+    return SearchResult(*polished._replace(history=joined), drawn, existing, interrupted, bounds)
+
+
+def _restore_modes(problem: Problem, polished: Polished, initial: Point) -> Polished:
+    """Return the results with the requested jams; a design that lost its jam is replaced by the initial one."""
+    # The jam that was followed may have another mode number now, which can be determined only from the whole branch.
+    point = _with_requested_modes(problem, polished.point)
+    lost = ~point.exists()
+    if not np.any(lost):
+        return polished._replace(point=point)
+    # A machine with the requested mode is preferred to a better one without it.
+    point = _with_requested_modes(problem, initial).where(lost, point)
+    remaining_decrease = np.where(lost, np.inf, polished.remaining_decrease)
+    return Polished(point, polished.history, remaining_decrease, violation(problem, point), optimality(problem, point))
 
 
 def _with_requested_modes(problem: Problem, point: Point) -> Point:

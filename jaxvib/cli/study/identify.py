@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -38,6 +38,17 @@ def _with_number_options(command: Command) -> Command:
     return command
 
 
+def _with_options(tables: Tables, given: Mapping[str, str | bool | None]) -> Tables:
+    """Return the tables of a measurement file with the given options in place of their values."""
+    result = dict(tables)
+    for name, value in given.items():
+        section, _, field = name.partition("__")
+        old = result.get(section, {})
+        if value is not None and isinstance(old, dict):
+            result[section] = {**old, field: value.split(",") if field == "columns" and isinstance(value, str) else value}
+    return result
+
+
 @app.command("identify")
 @click.argument("record", type=click.Path(path_type=Path))
 @_with_number_options
@@ -66,13 +77,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     if not {"machine", "run", "channel"}.isdisjoint(tables):
         _identify_machine(tables, record.parent, output, [name for name, value in given.items() if value is not None])
         return
-    for name, value in given.items():
-        section, _, field = name.partition("__")
-        if value is not None:
-            value = value.split(",") if field == "columns" and isinstance(value, str) else value
-            old = tables.get(section, {})
-            tables[section] = {**old, field: value} if isinstance(old, dict) else old
-    pendulum, swing, options = measurement_from_tables(tables, record.parent)
+    pendulum, swing, options = measurement_from_tables(_with_options(tables, given), record.parent)
     found = identify_bearing(pendulum, swing, **options)
     output.picture("record.png", found.plot)
     data = output.file("fit.csv")

@@ -252,16 +252,7 @@ def orbits(
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`.
     """
     grid = grid_of(points, model.half_turn)
-
-    def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
-        motion = periodic_motion(model, grid, given, v, s, deviation)
-        return motion, *_all_quantities(model, grid, motion)
-
-    if value.shape[0] == 1:  # a program without an axis of length one is smaller
-        alone = one(*jax.tree.map(lambda x: x[0], (value, start, deviation)))
-        motion, harmonics, measured = jax.tree.map(lambda x: x[..., None], alone)
-    else:
-        motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
+    motion, harmonics, measured = _solve_each(model, grid, given, (value, start, deviation))
     resolved = jnp.asarray(steps) <= _MAX_INTEGRATION_STEPS
     limited = min(steps, _MAX_INTEGRATION_STEPS) if isinstance(steps, int) else jnp.where(resolved, steps, 1)
     growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit)
@@ -302,6 +293,20 @@ def orbits(
         offsets=jnp.broadcast_to(model.offsets, (value.shape[0], model.loads.count)),
     )
     return orbit, growth
+
+
+def _solve_each(
+    model: CoincidentModel, grid: Grid, given: Parameter, starts: tuple[Array, Array, Array | None]
+) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
+    """Return the periodic motions from the `starts` of `orbits`, their harmonics and quantities; the last axis is P."""
+
+    def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
+        motion = periodic_motion(model, grid, given, v, s, deviation)
+        return motion, *_all_quantities(model, grid, motion)
+
+    if starts[0].shape[0] == 1:  # a program without an axis of length one is smaller
+        return jax.tree.map(lambda x: x[..., None], one(*jax.tree.map(lambda x: x[0], starts)))
+    return jax.vmap(one, out_axes=-1)(*starts)
 
 
 def _multipliers_of(growth: Floquet, grid: Grid) -> tuple[Array, Array, Array]:

@@ -109,20 +109,8 @@ def fit_swing(
     **Arguments**: `time` (n,) s from 0; `angle` (n,) rad; `weight` (n,), 1 for samples that count and 0 for the others.
     """
     size = jnp.std(angle) * jnp.sqrt(2.0)
-    duration = time[-1] - time[0]
-    inertia, length, law = pendulum.total_inertia, pendulum.length, start.friction
-    scale = Unknowns(
-        angle=size,
-        rate=size * start.frequency,
-        offset=size,
-        frequency=1.0 / duration,
-        friction=Friction(
-            viscous=inertia / duration,
-            dry=None if law.dry is None else 2.0 * length * size / (pendulum.diameter * start.frequency * duration),
-            air=None if law.air is None else inertia / (size * start.frequency * duration),
-            torque=None if law.torque is None else inertia * start.frequency**2 * size,
-        ),
-    )
+    inertia, length = pendulum.total_inertia, pendulum.length
+    scale = _scale(pendulum, start, size, time[-1] - time[0])
 
     def states(at: Unknowns) -> tuple[Array, Array]:
         # Give the pendulum the gravity with which its small swings about the rest position have the trial frequency.
@@ -167,6 +155,23 @@ def fit_swing(
         noise=jnp.sqrt(variance),
         stopped_at=stopped_at,
         converged=converged & jnp.all(jnp.isfinite(covariance)),
+    )
+
+
+def _scale(pendulum: BearingPendulum, start: Unknowns, size: Array, duration: Array) -> Unknowns:
+    """Return the size of each unknown, from the amplitude and the duration of the record."""
+    inertia, law, rate = pendulum.total_inertia, start.friction, size * start.frequency
+    return Unknowns(
+        angle=size,
+        rate=rate,
+        offset=size,
+        frequency=1.0 / duration,
+        friction=Friction(
+            viscous=inertia / duration,
+            dry=None if law.dry is None else 2.0 * pendulum.length * size / (pendulum.diameter * start.frequency * duration),
+            air=None if law.air is None else inertia / (rate * duration),
+            torque=None if law.torque is None else inertia * start.frequency**2 * size,
+        ),
     )
 
 

@@ -309,11 +309,9 @@ def swing_states(
         after = stopped & ~jnp.isfinite(f)
         f, slip = (jnp.where(after, value, before) for value, before in zip(rest, (f, slip), strict=True))
     finished = stopped | (solution.result == diffrax.RESULTS.successful)
-    status = SwingStatus.where(stopped, SwingStatus.stopped, SwingStatus.swinging)
-    status = SwingStatus.where(finished, status, SwingStatus.max_steps_reached)
     good = exists & finished
     return Swing(
-        status=SwingStatus.where(exists, status, SwingStatus.no_start),
+        status=_status(exists, finished, stopped),
         time=times,
         angle=jnp.where(good, f, jnp.nan),
         rate=jnp.where(good, slip, jnp.nan),
@@ -321,6 +319,12 @@ def swing_states(
         width=jnp.full_like(frequency, jnp.nan) if width is None else width,
         steps=solution.stats["num_steps"],
     )
+
+
+def _status(exists: Array, finished: Array, stopped: Array) -> SwingStatus:
+    status = SwingStatus.where(stopped, SwingStatus.stopped, SwingStatus.swinging)
+    status = SwingStatus.where(finished, status, SwingStatus.max_steps_reached)
+    return SwingStatus.where(exists, status, SwingStatus.no_start)
 
 
 _Pair: TypeAlias = tuple[Array, Array]

@@ -208,17 +208,9 @@ def capture(
 
     Source: Strautmanis et al. 2018, section 3, with one start for each speed.
     """
-    scene = validate_scene(scene)
-    require_torus_balls(scene.loads, "capture")
-    if not scene.drive.constant:
-        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a prescribed speed, use ConstantSpeed")
+    scene = _scene_for_capture(scene, rotation)
     if resolution is not None and not 0.0 < resolution < 1.0:
         raise InputError("resolution", f"is {quoted(resolution)}; it must be between 0 and 1, such as 1e-3")
-    if rotation not in get_args(Rotation):
-        raise InputError("rotation", f"is {quoted(rotation)}; it must be 'rolling' or 'none'")
-    if rotation == "none" and not has_term(scene.all_effects, SlipRelease):
-        problem = "is 'none', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
-        raise InputError("rotation", problem)
     first_speeds = _ascending(speeds)
     end = 2.0 * np.pi * count(turns, "turns") / float(scene.drive.speed)
     width = float(number(spread, "rad", "spread", low=0.0))
@@ -261,6 +253,20 @@ def capture(
     uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
     status = CaptureStatus.not_converged if last_change > tolerance else result.status
     return dataclasses.replace(result, last_change=jnp.asarray(last_change), uncertainty=uncertainty, status=status)
+
+
+def _scene_for_capture(scene: Scene, rotation: Rotation) -> Scene:
+    """Return the valid scene. **Raises** `InputError` if its drive, loads or effects do not allow the search."""
+    scene = validate_scene(scene)
+    require_torus_balls(scene.loads, "capture")
+    if not scene.drive.constant:
+        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; capture needs a prescribed speed, use ConstantSpeed")
+    if rotation not in get_args(Rotation):
+        raise InputError("rotation", f"is {quoted(rotation)}; it must be 'rolling' or 'none'")
+    if rotation == "none" and not has_term(scene.all_effects, SlipRelease):
+        problem = "is 'none', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
+        raise InputError("rotation", problem)
+    return scene
 
 
 def _ascending(speeds: Sequence[float] | np.ndarray | None) -> np.ndarray:
