@@ -305,6 +305,10 @@ def test_design_files_mean_what_they_say(tmp_path, monkeypatch):
         (("# rate = 0.05", 'rate = "fast"'), "search.rate is 'fast'"),
         (("[free]", "[free"), "is not a TOML file"),
         (("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\n[objective]'), "demand[0] has no limit"),
+        (
+            ("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\nequal_to = "3 W"\n[objective]'),
+            "demand[0].equal_to is not a demand; a quantity keeps a value by [[hold]]",
+        ),
         (("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\nat_most = "3 kg"\n[objective]'), "is not in W"),
         (("[objective]", "[ties]\nx = 3\n[objective]"), "ties.x is not a parameter of this scene"),
         (("[objective]", '[choices]\n"loads.drag" = 3\n[objective]'), "give a list of values"),
