@@ -229,15 +229,15 @@ class Synthesis(Result):
         for each in ranked[:5]:
             lines.append(f"  1 % less / more {each.what}: {changed(each.less, each.more)}")
         equal = [m for m in self.machines if abs(m.value - best) <= _EQUAL_VALUE * abs(best)]
+        unit, factor = shown_unit(self.unit, abs(best))
         if len(equal) > 1 and len(equal) == len(self.machines):
-            unit, factor = shown_unit(self.unit, abs(best))
             value = f"{best * factor:.4g} {unit}".rstrip()
             lines.append(
                 f"  {len(equal)} different machines are equally good ({value}): the objective does not decide between them"
             )
         elif len(self.machines) > 1:
-            counts = ", ".join(f"{m.starts} x {m.value:.4g}" for m in self.machines[:6])
-            lines.append(f"  {len(self.machines)} different machines: {counts} {self.unit}".rstrip())
+            counts = ", ".join(f"{m.starts} x {m.value * factor:.4g}" for m in self.machines[:6])
+            lines.append(f"  {len(self.machines)} different machines: {counts} {unit}".rstrip())
         return lines
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:

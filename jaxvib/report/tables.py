@@ -105,7 +105,10 @@ def parameter_tables(scene: Scene) -> str:
     parts.append((f"machine: {_words(kind)}", tables["machine"], _units(type(scene.machine))))
     for which, table, exciter in owners:
         own = {name: table[name] for name in ("at", "direction", "unbalance") if name in table}
-        parts += [(which.removesuffix(", "), own, _units(Exciter))] if own else []
+        units = dict(_units(Exciter))
+        if not isinstance(own.get("at"), int):  # a point or a distance, not the number of a platform
+            units["at"] = units["position"]
+        parts += [(which.removesuffix(", "), own, units)] if own else []
         for section in [name for name in ("loads", "drive") if name in table]:
             kind = str(table[section].pop("kind"))
             parts.append((f"{which}{section}: {_words(kind)}", table[section], _units(type(getattr(exciter, section)))))

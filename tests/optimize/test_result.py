@@ -39,7 +39,7 @@ def test_results_are_given_in_the_units_of_designers(searched):
     assert said[2] == "  met: third at most 4 mm (1 mm)"
     assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
     assert [line.split(":")[0][-8:] for line in said[4:8]] == [f"number {k}" for k in (6, 5, 4, 3)]
-    assert said[8] == "  2 different machines: 3 x 2e+04, 1 x 3e+04 N"
+    assert said[8] == "  2 different machines: 3 x 20, 1 x 30 kN"
     one = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=machines[:1]).findings()
     assert one == ["  1 % less / more x: +400 kN / -0.2 kN"]  # 2000 % of 2e4 N: of almost nothing a share tells nothing
     none = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=()).findings()

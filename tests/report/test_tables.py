@@ -3,7 +3,8 @@
 import re
 
 import jaxvib as jv
-from jaxvib.report.tables import accuracy_table, result_tables
+from jaxvib.machine.files import SCREENS
+from jaxvib.report.tables import accuracy_table, parameter_tables, result_tables
 
 UNITS = {"force": "N", "rows": "m"}
 
@@ -55,3 +56,10 @@ def test_a_report_shows_what_the_terminal_would(tmp_path):
     assert cells(text, "h1") == ["Größe µ"] and 'class="command"' not in text
     shown = re.search(r"<pre>(.*?)</pre>", text, re.DOTALL)
     assert shown and shown[1].strip().splitlines()[0].split() == modes.summary().strip().splitlines()[0].split()
+
+
+def test_exciters_are_numbered_and_placed_with_a_unit():
+    text = parameter_tables(jv.scene_from_toml(SCREENS["feeder"]))
+    assert [head for head in cells(text, "h3") if head.startswith("exciter") and ":" not in head] == ["exciter 0", "exciter 1"]
+    table = text.partition("exciter 1<")[2]
+    assert cells(table)[:2] == ["-481, -390", "mm"]
