@@ -90,6 +90,7 @@ def test_intervals_hold_the_truth_in_repeated_records():
     assert 0.85 < np.std(ratios) < 1.15
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_in_six_records():
     ratios = np.array([distances(jv.identify(start(), run_of(seed), unknown=NAMES)) for seed in range(1, 7)])
     assert np.mean(np.abs(ratios) < 1.96) > 0.8
