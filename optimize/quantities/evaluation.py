@@ -189,10 +189,10 @@ class Evaluation:
 
         return self._run("working", integrate)
 
-    def _sixty_periods(self) -> float:
+    def _sixty_periods(self) -> Array:
         """Return the length of 60 periods of the lowest natural frequency, s."""
         frequencies = known(jax.lax.stop_gradient(natural_frequencies(self.scene)))
-        return 60.0 * 2.0 * np.pi / float(frequencies.min())
+        return 60.0 * 2.0 * np.pi / frequencies.min()
 
     def keep_run(self, motion: int | Literal["working"], run: Run) -> None:
         """Store a run that has settled in a jam mode or in the working regime, in place of a new one."""

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -38,6 +39,15 @@ def test_runs_from_a_jam_last_sixty_lowest_periods(monkeypatch):
     kept = Evaluation(SCENE)
     kept.keep_run(3, "the run")
     assert kept.jam_run(3) == "the run" and len(asked) == 2
+
+
+def test_runs_of_a_scene_that_is_not_known_are_traced(monkeypatch):
+    """A search asks for the shapes of all quantities before it has numbers."""
+    monkeypatch.setattr(
+        answers_module, "simulate", lambda scene, until, **_: SimpleNamespace(window=scene.machine.mass * until)
+    )
+    found = jax.eval_shape(lambda s: Evaluation(s).jam_run(3).window, SCENE)
+    assert found.shape == (2,)
 
 
 def test_guesses_are_the_jam_and_the_folds_beside_it(modes):
