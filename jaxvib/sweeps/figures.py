@@ -157,7 +157,7 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     dims = opened.dims
     grid = [d for d in dims if d != SAMPLE]
     over = over or (grid[0] if grid else None)
-    if over not in grid:
+    if over is None or over not in grid:
         raise InputError("over", f"is {quoted(over)}; {suggest_name(str(over), grid)}")
     if not _has_labels(opened):
         raise InputError(
