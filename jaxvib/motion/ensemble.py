@@ -78,7 +78,7 @@ class Ensemble(Result):
       within one turn
     - `load_speed` (B, count), rad/s: the mean speed of each load over the last quarter of the run
     - `slip` (B,), rad: largest difference between the angles through which two masses turn, each in its direction, in the last
-      quarter of the run. A mass is a load, or the rotor of an exciter without loads
+      quarter of the run. A mass is a load, or the rotor of an exciter without loads. It is 0 for a scene with one exciter
     - `error` (B,): estimated error of the final state, as for a `Run`, with displacements relative to the largest displacement
       of the same run; typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
       finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
@@ -115,7 +115,7 @@ class Ensemble(Result):
 
     @property
     def synchronous(self) -> Array:
-        """True for runs (B,) whose masses turn at one speed: the motion stayed finite and `slip` is below 0.5 rad."""
+        """True for runs (B,) whose exciters turn at one speed: the motion stayed finite and `slip` is below 0.5 rad."""
         return self.finite & (self.slip < _MAX_SLIP)
 
     @property
@@ -132,7 +132,7 @@ class Ensemble(Result):
         speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
         lines = [head, f"  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"]
-        if speeds.shape[1] > 1:
+        if np.any(np.asarray(self.slip) > 0.0):
             lines.append(f"  all masses of a run turn at one speed: {self.synchronous_share.text}")
         return "\n".join(lines)
 
@@ -215,13 +215,15 @@ def ensemble(
         # The error is the part (coarse/each)^3 of the difference, as for a method of order 3. This is conservative, because the
         # method has order 8.
         error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
-    turned = load_speed * turning_directions(plan.scenes) * (plan.end / ENSEMBLE_PARTS)
-    slip = jnp.max(turned, axis=1) - jnp.min(turned, axis=1)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
     if not plan.is_allowed:
-        numbers = last, load_speed, slip, error, finite, resolved, detached
-        last, load_speed, slip, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
+        numbers = last, load_speed, error, finite, resolved, detached
+        last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
+    slip = np.zeros(plan.allowed.shape, plan.end.dtype)
+    if len(plan.scenes.exciters) > 1:
+        turned = load_speed * turning_directions(plan.scenes) * (plan.end / ENSEMBLE_PARTS)
+        slip = jnp.max(turned, axis=1) - jnp.min(turned, axis=1)
     found = Ensemble(*on_device((last, load_speed, slip, error, plan.allowed, finite, resolved, detached, taken[0], unknown)))
     if not plan.is_known:
         return found
