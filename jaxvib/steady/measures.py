@@ -49,6 +49,9 @@ ways to compute the torque have a relative rounding error of 1e-12."""
 _NEGLIGIBLE = 1e-9
 """Strokes and forces below this fraction of the largest are not shown: they are rounding errors."""
 
+_LARGEST_TRANSMISSIBILITY = 1e4
+"""Larger ratios of forces are not shown: the loads balance one another, and only a decaying motion is left."""
+
 
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
     """Return the amplitude of the acceleration, in g, of a sine of `amplitude`, m zero to peak, and `speed`, rad/s."""
@@ -185,11 +188,11 @@ class VibrationMeasures(eqx.Module):
             parts = [f"{load:.4g} N {word}" for load, word in named if load > _NEGLIGIBLE * np.nanmax(each)]
             lines += [f"support {k + 1}: {', '.join(parts)}"] if np.nansum(each) > 0.0 else []
         ratio = float(self.transmissibility)
-        if np.isfinite(ratio):
+        if ratio < _LARGEST_TRANSMISSIBILITY:
             passed = f"of the exciter's {quantity_text(self.exciter_force, 'N', 4)}, {100.0 * ratio:.3g} % reach the foundation"
             lines.append(passed + (f" (isolation {100.0 * (1.0 - ratio):.3g} %)" if ratio < 1.0 else ""))
         shafts = [f"{float(t):.4g} N m, {float(p):.4g} W" for t, p in zip(self.torque, self.power, strict=True)]
-        number = [""] if len(shafts) == 1 else [f" {k + 1}" for k in range(len(shafts))]
+        number = [""] if len(shafts) == 1 else [f" of exciter {k}" for k in range(len(shafts))]
         lines += [f"shaft{k}: {text}" for k, text in zip(number, shafts, strict=True) if "nan" not in text]
         return "\n".join([*lines, *self._throw_text()])
 

@@ -1,5 +1,7 @@
 """Measures of a vibration against closed forms and the flight of a particle."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -218,3 +220,9 @@ def test_bearings_of_a_rotor_carry_weight_and_whirl():
     np.testing.assert_allclose(np.sum(measures.static_load), 37.0 * G, rtol=1e-9)
     np.testing.assert_allclose(measures.static_load @ np.array([0.165, -0.155]), 0.0, atol=1e-9)
     assert measures.throw_number is None and len(measures.stroke) == 2
+
+
+def test_no_transmissibility_is_shown_for_balanced_loads(jam):
+    measures = jv.vibration_measures(*jam)
+    balanced = dataclasses.replace(measures, transmissibility=jnp.asarray(3.5e5))
+    assert "reach the foundation" in measures.summary() and "reach the foundation" not in balanced.summary()
