@@ -10,7 +10,9 @@ evaluations, of a value with its gradient where gradients are used, of a value e
 
 from __future__ import annotations
 
+import contextlib
 import time
+import unittest.mock
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -32,6 +34,9 @@ SIZES = {3: 2, 10: 5, 30: 15, 100: 50}
 
 _LARGEST_POPULATION = 30
 """Free numbers up to which differential evolution takes part."""
+
+Report = Callable[[float, Point], None]
+"""Function that a search calls with the share of its steps and the present designs."""
 
 
 class Course(NamedTuple):
@@ -96,38 +101,51 @@ def gradient_cost(free: int, repeat: int = 200) -> tuple[float, float]:
 
 
 def by_gradients(problem: Problem, polishing: int, seconds: float) -> Course:
-    """The search of `synthesize`, watched: from 16 starts, and anew from four times as many while there is time."""
-    course, counted, descending = Course([], [], []), [0], [0]
-    inner = model.evaluate
+    """The search of `synthesize`: from 16 starts, and anew from four times as many while there is time.
+
+    It is repeated to count its evaluations, because programs of functions that are replaced are compiled anew.
+    """
+    course, begun, rounds = Course([], [], []), time.perf_counter(), 0
+
+    def told(_share: float, point: Point) -> None:
+        course.seconds.append(time.perf_counter() - begun)
+        course.values.append(float(np.min(point.values[np.isfinite(point.values[:, 0]), 0])))
+
+    while not rounds or course.seconds[-1] < seconds / 5.0:  # the next round takes four times as long
+        search_once(problem, 16 * 4**rounds, polishing, told, told)
+        rounds += 1
+    course.evaluations.extend(evaluations_of(problem, polishing, rounds))
+    return course
+
+
+def search_once(problem: Problem, starts: int, polishing: int, descended: Report, polished: Report) -> None:
+    """Descend from `starts` designs and polish a quarter of them."""
+    drawn = polish.draw_starts(problem, starts, starts, find_speeds)
+    assert drawn.point is not None
+    point = descent.descend(problem, drawn.point, 200, 0.05, descended).point
+    best = np.argsort(point.values[:, 0])[: starts // 4]
+    polish.polish(problem, point.take(best), polishing, polished)
+
+
+def evaluations_of(problem: Problem, polishing: int, rounds: int) -> list[int]:
+    """Number of evaluations at each report of the search."""
+    inner, counted = model.evaluate, [0]
+    reports: list[int] = []
 
     def watched(problem: Problem, z: np.ndarray, near: tuple[np.ndarray, ...]) -> Point:
         counted[0] += len(z)
         return inner(problem, z, near)
 
-    def told(_share: float, point: Point) -> None:
-        counted[0] += descending[0] * descent.STEPS_PER_CALL
-        values = point.values[np.isfinite(point.values[:, 0]), 0]
-        for row, new in zip(course, (time.perf_counter() - begun, counted[0], float(np.min(values))), strict=True):
-            row.append(new)
+    def descended(_share: float, point: Point) -> None:
+        counted[0] += len(point.z) * descent.STEPS_PER_CALL
+        reports.append(counted[0])
 
-    kept = [(module, module.evaluate) for module in (model, polish, find)]
-    for module, _ in kept:
-        module.evaluate = watched
-    starts, begun = 16, time.perf_counter()
-    try:
-        while not course.seconds or course.seconds[-1] < seconds / 5.0:  # the next round takes four times as long
-            drawn = polish.draw_starts(problem, starts, starts, find_speeds)
-            assert drawn.point is not None
-            descending[0] = len(drawn.point.z)
-            point = descent.descend(problem, drawn.point, 200, 0.05, told).point
-            descending[0] = 0
-            best = np.argsort(point.values[:, 0])[: starts // 4]
-            polish.polish(problem, point.take(best), polishing, told)
-            starts *= 4
-    finally:
-        for module, old in kept:
-            module.evaluate = old
-    return course
+    with contextlib.ExitStack() as stack:
+        for module in (model, polish, find):
+            stack.enter_context(unittest.mock.patch.object(module, "evaluate", watched))
+        for k in range(rounds):
+            search_once(problem, 16 * 4**k, polishing, descended, lambda *_: reports.append(counted[0]))
+    return reports
 
 
 def by_differential_evolution(problem: Problem, seconds: float, seed: int = 0) -> Course:

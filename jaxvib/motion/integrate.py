@@ -189,7 +189,7 @@ def integrate(
         numbers = jax.lax.cond(
             is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(model, states)
         )
-    parts = numbers, whole, window.rotor_speeds
+    parts = numbers, whole, window.rotor_speeds  # those of ideal drives do not follow from the states
     numbers, whole, speeds = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), parts)
     window = dataclasses.replace(window, rotor_speeds=speeds)
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))

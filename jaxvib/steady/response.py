@@ -84,8 +84,8 @@ class AbstractResponse(eqx.Module):
 
         **Raises** `InputError` if there are fewer speeds.
         """
-        if not 0 <= index < (number := self.speed.shape[0]):
-            raise InputError("index", f"is {index}; there are {number} speeds, counted from 0")
+        if not 0 <= index < (speeds := self.speed.shape[0]):
+            raise InputError("index", f"is {index}; there are {speeds} speeds, counted from 0")
         return Vibration(*(getattr(self, name)[index] for name in Vibration._fields))
 
 

@@ -80,10 +80,10 @@ def foreign_vibration(values: np.ndarray, angle: np.ndarray, step: float) -> For
 
 def _spectrum(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
     """Return the power in each bin of an averaged spectrum, relative to the whole power, and the width of a bin."""
-    length = 2 * (values.size // (2 * _SEGMENTS))
-    pieces = np.lib.stride_tricks.sliding_window_view(values, length)[:: length // 2]
-    power = np.sum(np.abs(np.fft.rfft(pieces * np.hanning(length), axis=1)) ** 2, axis=0)
-    return power / max(float(np.sum(power)), 1e-300), 1.0 / (length * step)
+    from scipy.signal import welch  # slow to import
+
+    frequency, power = welch(values, 1.0 / step, nperseg=2 * (values.size // (2 * _SEGMENTS)), detrend=False)
+    return power / max(float(np.sum(power)), 1e-300), float(frequency[1])
 
 
 def _line(power: np.ndarray) -> tuple[float, float]:
