@@ -82,7 +82,7 @@ def _spectrum(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
     """Return the power in each bin of an averaged spectrum, relative to the whole power, and the width of a bin."""
     from scipy.signal import welch  # slow to import
 
-    frequency, power = welch(values, 1.0 / step, nperseg=2 * (values.size // (2 * _SEGMENTS)), detrend=False)
+    frequency, power = welch(values, 1.0 / step, nperseg=2 * (values.size // (2 * _SEGMENTS)))
     return power / max(float(np.sum(power)), 1e-300), float(frequency[1])
 
 
