@@ -1,0 +1,239 @@
+"""Status of a fit, and the statistics behind it, against SciPy."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, f
+
+from jaxvib.identification import checks
+from jaxvib.identification.checks import (
+    FitStatus,
+    coverage_notes,
+    disagreement,
+    pseudoinverse,
+    resembles,
+    residual_chance,
+    status_of,
+)
+from jaxvib.identification.problem import Known
+
+
+def channel(name):
+    return SimpleNamespace(name=name)
+
+
+def test_chance_of_residuals_is_that_of_an_f_test():
+    rng, n, taps = np.random.default_rng(3), 3000, np.array([1.0, -0.4, 0.2])
+    angle = np.linspace(0.0, 200.0, n) ** 1.2
+    left = rng.normal(size=n) + 0.15 * np.cos(angle) + 0.2 * np.sin(2.0 * angle) - 0.2 * np.cos(3.0 * angle)
+    left[[0, 700, 701, 1500]] = np.nan
+    known = np.where(np.isnan(left), 0.0, left)
+    white = known.copy()
+    white[1:] += taps[1] * known[:-1]
+    white[2:] += taps[2] * known[:-2]
+    missing = np.isnan(left)
+    gone = missing.copy()
+    gone[1:] |= missing[:-1]
+    gone[2:] |= missing[:-2]
+    gone[:2] = True
+    explained, place = 0.0, np.flatnonzero(~gone)
+    for part in np.array_split(place, 16):
+        waves = [np.ones(part.size)] + [wave(k * angle[part]) for k in (1, 2, 3) for wave in (np.cos, np.sin)]
+        basis = np.stack(waves, axis=1)
+        explained += np.sum((basis @ np.linalg.lstsq(basis, white[part], rcond=None)[0]) ** 2)
+    columns, found = 16 * 7, 5
+    rest = (np.sum(white[place] ** 2) - explained) / (place.size - columns)
+    chance = f.sf(explained / (columns - found) / rest, columns - found, place.size - columns)
+    assert residual_chance(left, taps, angle, found) == pytest.approx(chance, rel=1e-9) and 1e-9 < chance < 0.5
+    assert residual_chance(left[:890], taps, angle[:890], found) == 1.0  # too short
+    assert residual_chance(0.0 * left, taps, angle, found) == 1.0
+
+
+def test_rotor_at_rest_has_no_orders():
+    """The waves of a constant angle are one column in place of seven."""
+    rng, n = np.random.default_rng(3), 3200
+    left = rng.normal(size=n) + np.repeat(0.15 * rng.normal(size=16), 200)
+    means = np.mean(left.reshape(16, 200), axis=1)
+    explained, total = 200.0 * np.sum(means**2), np.sum(left**2)
+    chance = f.sf(explained / 12 / ((total - explained) / (n - 16)), 12, n - 16)
+    assert residual_chance(left, np.ones(1), np.full(n, 0.3), 4) == pytest.approx(chance, rel=1e-9)
+
+
+def test_disagreement_is_a_ratio_of_likelihoods():
+    """Values of two numbers with the information A by other runs, and with B by this run."""
+    a, b = np.array([[400.0, 30.0], [30.0, 900.0]]), np.array([[100.0, -20.0], [-20.0, 50.0]])
+    away = np.array([0.3, -0.1])
+    gradient = b @ np.linalg.inv(a + b) @ a @ away
+    found = disagreement(a, b, gradient, ["mass", "stiffness"])
+    statistic = away @ np.linalg.inv(np.linalg.inv(a) + np.linalg.inv(b)) @ away
+    assert found.chance == pytest.approx(chi2.sf(statistic, 2), rel=1e-9)
+    # A change of one number alone: weighted mean of the differences, with the information A (A + B)^-1 B about them.
+    shared = np.diagonal(a @ np.linalg.inv(a + b) @ b)
+    assert found.name == "mass"
+    assert found.change == pytest.approx(gradient[0] / shared[0]) and found.error == pytest.approx(shared[0] ** -0.5)
+    text = f"run 2 deviates from the others by more than their errors (chance {found.chance:.1g}); a change of mass by "
+    assert found.sentence("run 2") == text + f"{found.change:+.3g} +- {1.96 * found.error:.1g} explains most of it"
+
+
+@pytest.mark.parametrize(("others", "run"), [(0.0, 100.0), (400.0, 0.0)])
+def test_numbers_of_one_side_alone_cannot_disagree(others, run):
+    nothing = disagreement(np.array([[others]]), np.array([[run]]), np.array([5.0]), ["mass"])
+    assert nothing == (1.0, "mass", 0.0, np.inf)
+    both = disagreement(np.diag([others, 4.0]), np.diag([run, 9.0]), np.array([0.0, 6.0]), ["mass", "stiffness"])
+    assert both.name == "stiffness" and both.chance == pytest.approx(chi2.sf(36.0 * (1.0 / 4.0 + 1.0 / 9.0), 1))
+
+
+def test_pseudoinverse_is_on_the_scale_of_the_diagonal():
+    slopes = np.random.default_rng(0).normal(size=(9, 3)) * np.array([1e-6, 1.0, 1e6])
+    inverse, rank = pseudoinverse(slopes.T @ slopes)
+    np.testing.assert_allclose(inverse, np.linalg.inv(slopes.T @ slopes), rtol=1e-8)
+    assert rank == 3
+    slopes[:, 2] = 1e6 * slopes[:, 1]
+    inverse, rank = pseudoinverse(slopes.T @ slopes)
+    assert rank == 2
+    np.testing.assert_allclose(slopes.T @ slopes @ inverse @ slopes.T @ slopes, slopes.T @ slopes, rtol=1e-8)
+    assert pseudoinverse(np.zeros((2, 2)))[1] == 0
+
+
+def test_contradicted_values_are_named():
+    unknowns = SimpleNamespace(numbers=(channel("machine.mass"), channel("machine.damping")), gains=("frame",))
+    problem = SimpleNamespace(
+        unknowns=unknowns, means=np.array([0.1, 0.0, 0.0, 0.0]), precisions=np.array([1e4, 0.0, 1e4, 0.0]),
+        unbalances=(None, Known(5.0, 0.1), Known(13.0, 0.1)),
+    )  # fmt: skip
+    fitted = SimpleNamespace(
+        problem=problem, x=np.array([0.2, 9.0, -0.05, 9.0]), linear=np.array([9, 9, 3, 4.0, 12.39, 5, 1.0])
+    )
+    found = list(checks._contradictions(fitted))
+    assert found == [
+        "machine.mass is 10.0 standard errors away from its known value",
+        "the gain of channel 'frame' is 5.0 standard errors away from its known value",
+    ]
+    fitted.linear[2:4] *= 1.1
+    assert list(checks._contradictions(fitted))[2:] == [
+        "exciters[1].unbalance is 5.0 standard errors away from its known value"
+    ]
+
+
+def test_resemblance_is_the_share_of_the_best_channel():
+    raw = np.array([[2.0, 10.0], [-2.0, -10.0], [2.0, 10.0], [500.0, -10.0]])
+    mask = np.array([[True, True], [True, True], [True, True], [False, True]])
+    problem = SimpleNamespace(raw=(raw,), masks=(mask,))
+    for share, converged, expected in ((0.49, True, True), (0.51, True, False), (0.49, False, False)):
+        differences = (raw * np.array([share, 0.9]),)
+        assert resembles(SimpleNamespace(problem=problem, differences=differences, converged=converged)) is expected
+
+
+def runs_of(time, speeds):
+    angle = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(time))])
+    return SimpleNamespace(problem=SimpleNamespace(times=(time,), angles=(angle[:, None],)))
+
+
+@pytest.mark.parametrize(
+    ("frequency", "until", "words"),
+    [
+        ([30.0, 60.0], 10.0, []),
+        ([60.0, 80.0], 10.0, ["no run passes a resonance: the rotors turn at 10 to 50 rad/s", "frequencies are 60, 80 rad/s;"]),
+        ([9.0], 40.0, ["no run passes a resonance"]),
+        ([30.0], 6.5, ["run 1 lasts 6.5 s, less than two decay times of the slowest mode (3.33 s each)"]),
+        ([], 10.0, []),
+    ],
+)
+def test_coverage_of_runs_in_words(frequency, until, words):
+    time = np.linspace(1.0, 1.0 + until, 2001)
+    run = runs_of(time, np.linspace(10.0, 50.0, 2001))
+    found = list(coverage_notes(run, np.array(frequency), np.full(len(frequency), 0.01)))
+    assert (len(found) > 0) == (len(words) > 0) and all(word in found[0] for word in words)
+
+
+def outcome(monkeypatch, **changes):
+    """Return the status of a fit of one run with two channels, from the results of its checks."""
+    given = {
+        "contradictions": [],
+        "disagreements": [],
+        "foreign": [],
+        "fits": True,
+        "chances": (0.5, 0.3),
+        "shares": (0.0, 0.0),
+    }
+    given |= {"errors": (0.01, 0.02), "outliers": (0.0, 0.0), "undetermined": 0} | changes
+    chances = iter(given["chances"])
+    monkeypatch.setattr(checks, "_contradictions", lambda fitted: given["contradictions"])
+    monkeypatch.setattr(checks, "_disagreements", lambda fitted: given["disagreements"])
+    monkeypatch.setattr(checks, "_foreign_vibrations", lambda fitted, fits: given["foreign"] if fits == given["fits"] else None)
+    monkeypatch.setattr(checks, "resembles", lambda fitted: given["fits"])
+    monkeypatch.setattr(checks, "angle_shares", lambda fitted: [np.array(given["shares"])])
+
+    def chance(left, taps, angle, found):
+        assert left.tolist() == taps.tolist() and angle.tolist() == [7.0] and found == 3
+        return next(chances)
+
+    monkeypatch.setattr(checks, "residual_chance", chance)
+    rotors = [tuple(SimpleNamespace(error=each) for each in given["errors"])]
+    two = np.array([[1.0, 2.0]])
+    runs = [SimpleNamespace(channels=(channel("a"), channel("b")), taps=two)]
+    problem = SimpleNamespace(rotors=rotors, runs=runs, angles=[np.array([[7.0, 8.0]])], angle_errors=[0.05])
+    fitted = SimpleNamespace(problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(3))
+    status, least, notes = status_of(fitted, SimpleNamespace(undetermined=np.zeros((2, given["undetermined"]))))
+    return status, least, notes
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "least", "words"),
+    [
+        ({}, "found", 0.3, []),
+        ({"undetermined": 1}, "undetermined", 0.3, []),
+        ({"contradictions": ["no"]}, "contradicted", 0.3, ["no"]),
+        ({"disagreements": ["never"]}, "contradicted", 0.3, ["never"]),
+        ({"fits": False}, "not_converged", 0.3, []),
+        ({"fits": False, "foreign": ["another"]}, "contradicted", 0.3, ["another"]),
+        ({"foreign": ["another"]}, "patterned", 0.3, ["another"]),
+        ({"chances": (1e-6, 0.3)}, "patterned", 1e-6, ["the residuals of channel 'a' in run 1 repeat with the rotor's angle"]),
+        ({"chances": (2e-5, 2e-6)}, "patterned", 2e-6, ["the residuals of channel 'b' in run 1 repeat with the rotor's angle"]),
+        ({"errors": (0.31, 0.02)}, "patterned", 0.3, ["the rotor's angle in run 1 has the standard error 0.31 rad between"]),
+        ({"errors": (0.29, 0.02)}, "found", 0.3, []),
+        (
+            {"shares": (0.0, 0.12)},
+            "patterned",
+            0.3,
+            ["angle in run 1, 0.05 rad, is not in the intervals, and it is 12% of the"],
+        ),
+        ({"shares": (0.0, 0.09)}, "found", 0.3, []),
+        ({"outliers": (0.02, 0.0)}, "found", 0.3, ["2.0% of the readings of channel 'a' in run 1 are outliers"]),
+    ],
+)
+def test_status_follows_from_the_checks(monkeypatch, changes, status, least, words):
+    found = outcome(monkeypatch, **changes)
+    assert bool(found[0] == getattr(FitStatus, status)) and found[1] == least and len(found[2]) == len(words)
+    assert all(word in note for word, note in zip(words, found[2], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("fits", "share", "order", "size", "words"),
+    [
+        (True, 0.6, None, 1.0, "60% of the power of the residuals of channel 'a' in run 1 is at 9 Hz, but an unbalance turns"),
+        (True, 0.4, None, 1.0, ""),
+        (True, 0.6, None, 0.09, ""),  # residuals like noise
+        (True, 0.6, 2.0, 0.09, "60% of the power of the residuals"),
+        (False, 0.6, None, 0.09, "60% of the power of the readings"),
+    ],
+)
+def test_foreign_vibration_in_words(monkeypatch, fits, share, order, size, words):
+    raw = np.array([[1.0], [-1.0], [90.0]])
+    mask, left = np.array([[True], [True], [False]]), np.array([[size], [-size], [np.nan]])
+
+    def foreign(values, angle, step):
+        np.testing.assert_array_equal(values, [size, -size, np.nan] if fits else [1.0, -1.0, np.nan])
+        assert angle.tolist() == [1.0, 2.0, 3.0] and step == 0.5
+        return SimpleNamespace(share=share, order=order, place="at 9 Hz")
+
+    monkeypatch.setattr(checks, "foreign_vibration", foreign)
+    samples = SimpleNamespace(channels=(channel("a"),), step=0.5)
+    angles = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
+    problem = SimpleNamespace(unbalances=(None,), runs=[samples], raw=[raw], masks=[mask], angles=[angles])
+    fitted = SimpleNamespace(problem=problem, residuals=[left])
+    found = list(checks._foreign_vibrations(fitted, fits))
+    assert (found == []) == (words == "") and all(words in each for each in found)
+    problem.unbalances = (None, None)
+    assert list(checks._foreign_vibrations(fitted, fits)) == []
