@@ -88,7 +88,7 @@ def information_of(fitted: Fitted) -> Information:
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
     # Directions that nothing determines are left out of those that the gains determine.
     by_gain = by_gain - undetermined @ (undetermined.T @ by_gain)
-    basis, sizes_of, _ = np.linalg.svd(by_gain, full_matrices=False) if by_gain.size else (by_gain, np.zeros(0), None)
+    basis, sizes_of, _ = np.linalg.svd(by_gain, full_matrices=False)
     by_gain = basis[:, : int(np.sum(sizes_of > 0.5))]
     by_gain_errors = np.sqrt(np.einsum("ku,kl,lu->u", by_gain, covariance, by_gain))
     return Information(names, values, scale, logarithmic, *found, by_gain, by_gain_errors)
@@ -161,7 +161,7 @@ def elimination(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
     `eliminate` is L^T matrix L, and for a change of the matrix L^T change L.
     """
     free, size, vectors, values = _free(matrix, own)
-    found = np.zeros((matrix.shape[0], own.size))
+    found = np.zeros((len(matrix), own.size))
     found[own, np.arange(own.size)] = 1.0
     found[free] = -((vectors / values) @ vectors.T @ (matrix[np.ix_(free, own)] / size[:, None])) / size[:, None]
     return found
@@ -170,7 +170,7 @@ def elimination(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
 def _free(matrix: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the unknowns other than `own` (r,), their scales (r,), and the eigenvectors (r, s) and eigenvalues (s,) > 0 of
     their scaled information."""
-    free = np.setdiff1d(np.arange(matrix.shape[0]), own)
+    free = np.setdiff1d(np.arange(len(matrix)), own)
     free = free[np.diagonal(matrix)[free] > 0.0]
     size = np.sqrt(np.diagonal(matrix)[free])
     values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / np.outer(size, size))

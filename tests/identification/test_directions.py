@@ -37,6 +37,7 @@ def test_elimination_is_the_schur_complement():
     np.testing.assert_array_equal(found[own], np.eye(2))
     np.testing.assert_allclose(found[free], -np.linalg.inv(inner) @ coupling, rtol=1e-8)
     assert not np.any(found[5])
+    np.testing.assert_array_equal(eliminate(matrix, np.arange(6)), matrix)
 
 
 def test_free_unknowns_may_be_dependent():
