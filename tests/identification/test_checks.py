@@ -237,3 +237,38 @@ def test_foreign_vibration_in_words(monkeypatch, fits, share, order, size, words
     assert (found == []) == (words == "") and all(words in each for each in found)
     problem.unbalances = (None, None)
     assert list(checks._foreign_vibrations(fitted, fits)) == []
+
+
+def test_runs_are_compared_at_their_common_minimum(monkeypatch):
+    """Two runs about three unknowns: a mass, the zero of a run's angle, and (a, b) of the unbalance; the fit is not exact."""
+    rng = np.random.default_rng(0)
+    rows = [rng.normal(size=(40, 4)) for _ in range(2)]
+    away = [np.array([0.0, 0.0, 0.0, 0.0]), np.array([0.9, 0.0, 0.0, 0.0])]
+    at = np.array([0.3, 0.1, 0.4, 0.3])  # not the minimum; a and b are the last two
+    equations = []
+    for row, true in zip(rows, away, strict=True):
+        z = np.concatenate([10.0 * row, 10.0 * (row @ (true - 0.05 * at))[:, None]], axis=1)
+        equations.append(z.T @ z)
+    known = np.diag([4.0, 0.0, 0.0, 0.0]), np.array([-4.0 * 0.05 * at[0], 0.0, 0.0, 0.0])
+    monkeypatch.setattr(checks, "run_equations", lambda *_: equations)
+    monkeypatch.setattr(checks, "prior_equations", lambda *_: known)
+    unknowns = SimpleNamespace(numbers=(channel("machine.mass"),), gains=(), turns=1, errors=0, count=2)
+    problem = SimpleNamespace(runs=[1, 2], unbalances=(None,), unknowns=unknowns)
+    fitted = SimpleNamespace(problem=problem, x=at[:2], linear=at[2:])
+    (sentence,) = (each for each in checks._disagreements(fitted) if each.startswith("run 2"))
+    # By elimination of the zero of the angle, in the size and the angle of the unbalance.
+    turn = np.eye(4)
+    turn[2:, 2:] = [[0.4, -0.3], [0.3, 0.4]]
+    own = [0, 2, 3]
+    parts = []
+    for matrix, gradient in [(each[:-1, :-1], each[:-1, -1]) for each in equations] + [known]:
+        matrix, gradient = turn.T @ matrix @ turn, turn.T @ gradient
+        rest = matrix[1, own] / matrix[1, 1] if matrix[1, 1] > 0.0 else np.zeros(3)
+        parts.append((matrix[np.ix_(own, own)] - np.outer(rest, matrix[1, own]), gradient[own] - rest * gradient[1]))
+    total = sum(part for part, _ in parts)
+    moved = np.linalg.solve(total, sum(gradient for _, gradient in parts))
+    part, gradient = parts[1]
+    names = ["machine.mass", "the size of exciters[0].unbalance", "the angle (rad) of exciters[0].unbalance"]
+    assert sentence == disagreement(total - part, part, gradient - part @ moved, names).sentence("run 2")
+    problem.runs = [1]
+    assert list(checks._disagreements(fitted)) == []
