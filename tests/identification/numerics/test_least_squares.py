@@ -193,6 +193,46 @@ def test_fit_without_resemblance_has_not_converged(monkeypatch):
     assert not found.converged
 
 
+def test_angle_is_fitted_if_it_matters_for_one_channel(monkeypatch):
+    """Errors of the angle become unknowns of the runs in which they are above 3 % of a channel's noise."""
+
+    class Asked(Exception):
+        pass
+
+    def with_angle_errors(problem, runs):
+        raise Asked(runs)
+
+    monkeypatch.setattr(fit, "with_angle_errors", with_angle_errors)
+    size = np.std(readings()[0], axis=0)
+    shares = size / NOISE / np.max(size / NOISE)
+    assert np.min(shares) < 0.9
+    error = 0.03 / np.max(size / NOISE)
+    fit.fit_from(problem_with()._replace(angle_errors=(0.8 * error, 0.0)), [TRUTH])
+    with pytest.raises(Asked) as asked:
+        fit.fit_from(problem_with()._replace(angle_errors=(1.2 * error, 0.0)), [TRUTH])
+    assert asked.value.args == ([True, False],)
+
+
+def test_filters_are_computed_until_the_noise_is_steady(monkeypatch):
+    """The deviation changes by 5 %, 4.5 % and 0: the second filter is final."""
+    changes, passes = iter([1.05, 1.005, 1.005]), []
+
+    def noise_of(residual):
+        return Noise(np.ones(1), np.std(residual) * current[0])
+
+    def run(problem, noise, differences, starts):
+        passes.append(differences is not None)
+        if len(passes) > 1:
+            current[0] = next(changes)
+        return original(problem, noise, differences, starts)
+
+    current, original = [1.0], fit._pass
+    monkeypatch.setattr(fit, "noise_of", noise_of)
+    monkeypatch.setattr(fit, "_pass", run)
+    fit.fit_from(problem_with(), [TRUTH])
+    assert passes == [False, False, True, True]
+
+
 def test_masked_readings_are_not_numbers_in_the_residuals():
     mask = np.ones((N, CHANNELS), bool)
     mask[5, 1] = False

@@ -121,6 +121,21 @@ def test_intervals_of_numbers_with_a_cubic_cost(monkeypatch, skew, names):
     assert profile_intervals(fitted, known) == {}
 
 
+@pytest.mark.parametrize(("rises", "is_quadratic"), [((4.3, 3.7), True), ((4.5, 4.0), False), ((4.0, 3.5), False)])
+def test_one_side_that_is_not_quadratic_suffices(monkeypatch, rises, is_quadratic):
+    """A cost that rises by 10 % more or less than 4 at two standard errors."""
+    information = np.diag([0.0, 4.0])
+    monkeypatch.setattr(likelihood, "in_polar_unbalances", lambda _: (information, np.diag([4.0, 0.0]), np.zeros(0)))
+    monkeypatch.setattr(likelihood, "project", lambda *_: SimpleNamespace(cost=0.0))
+    costs = {-2.0: rises[0], 2.0: rises[1]}
+    monkeypatch.setattr(_Profile, "rise", lambda self, distance, is_exact: 9e9 if is_exact else costs[distance])
+    monkeypatch.setattr(_Profile, "end", lambda self, side: 3.0 + side)
+    problem = SimpleNamespace(unknowns=SimpleNamespace(numbers=(1, 2)), unbalances=())
+    known = SimpleNamespace(names=("mass", "damping"), determined=[False, True])
+    found = profile_intervals(SimpleNamespace(problem=problem, x=np.zeros(2)), known)
+    assert found == ({} if is_quadratic else {"damping": (-0.5 * 2.0, 0.5 * 4.0)})
+
+
 def test_known_values_count_in_the_rise():
     problem = Problem(*[None] * len(Problem._fields))._replace(
         means=np.array([0.1, 0.3]), precisions=np.array([25.0, 16.0]), unbalances=(Known(0.05, 0.01),)
