@@ -1,6 +1,7 @@
 """Rules of recorders' formats that a complete run does not show: clocks, rates, names, structures, objects."""
 
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -69,11 +70,6 @@ def test_structures_and_objects_are_flat():
     assert list(_flat(MatlabOpaque(), "", objects)) == [] and objects[-1] == "a variable without a name"
 
 
-def dataset(values, **attributes):
-    values = np.asarray(values)
-    return SimpleNamespace(attrs=attributes, dtype=values.dtype, ndim=values.ndim, __getitem__=None, values=values)
-
-
 class Dataset:
     """Array of a file of version 7.3."""
 
@@ -88,7 +84,7 @@ class Dataset:
 class Group(dict):
     """Structure of a file of version 7.3."""
 
-    attrs = {}
+    attrs: ClassVar = {}
 
 
 def test_arrays_of_version_73():
@@ -212,13 +208,9 @@ def test_signals_of_mf4(tmp_path, monkeypatch):
             pass
 
         def iter_channels(self):
-            for name, unit, values in (
-                ("a", "g", np.sin(T)),
-                ("b", None, np.cos(T)),
-                ("w", "", np.array(["x"])),
-                ("m", "", np.eye(3)),
-            ):
-                yield SimpleNamespace(name=name, unit=unit, samples=values, timestamps=T)
+            signals = {"a": np.sin(T), "b": np.cos(T), "words": np.array(["x"]), "matrix": np.eye(3)}
+            for name, values in signals.items():
+                yield SimpleNamespace(name=name, unit="g" if name == "a" else None, samples=values, timestamps=T)
 
     monkeypatch.setattr(formats, "optional_module", lambda *_: SimpleNamespace(MDF=lambda path: Mdf()))
     (tmp_path / "run.mdf").write_bytes(b"")
