@@ -19,12 +19,13 @@ from optimize.quantities.cases import Sampled
 from optimize.quantities.quantity import Demand, Quantity
 
 _SHORT_NAMES = {
-    "stiffness": ("machine.stiffness", "machine.link_stiffness"),
-    "damping": ("machine.damping", "machine.link_damping"),
-    "mass": ("machine.mass",),
-    "drag": ("loads.drag",),
+    "stiffness": re.compile(r"machine\.(link_|supports\[\d+\]\.)?stiffness(_up)?(\[\d+\])?"),
+    "damping": re.compile(r"machine\.(link_|supports\[\d+\]\.)?damping(_up)?(\[\d+\])?"),
+    "mass": re.compile(r"machine\.(bodies\[\d+\]\.)?mass"),
+    "drag": re.compile(r"(exciters\[\d+\]\.)?loads\.drag"),
+    "unbalance": re.compile(r"exciters\[\d+\]\.unbalance"),
 }
-"""Names of arrays of a scene that a short name stands for, if the scene has them."""
+"""Names of parameters of a scene that a short name stands for."""
 
 _SHARE_PATTERN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
 _RANGE = re.compile(r"(.+?)\.\.(.+)")
@@ -78,7 +79,8 @@ def tolerance_ranges(
     - `quantities`, or demands of quantities; typical: 1 to 5
     - `tolerances`: texts of the form NAME=SHARE, such as "stiffness=5%" (95 of 100 machines are within it, each number has its
       own deviation) or NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg" (any value of the range is equally likely).
-      Short names are stiffness, damping, mass and drag. "load=0..20kg" is material on platform 1, "load[2]=..." on platform 2
+      Short names are stiffness and damping (of all springs and dampers, each with its own deviation), mass, drag and unbalance.
+      "load=0..20kg" is material on platform or body 1, at its centre of mass, "load[2]=..." on platform or body 2
     - `samples`: number of machines; typical: 64 to 1000 (default 128)
     - `seed` of the random deviations
 
@@ -120,8 +122,18 @@ def _value(quantity: Quantity, scene: Scene) -> float:
         return math.nan
 
 
-def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) -> Iterator[Scene]:
-    """Yield scenes with deviations of their numbers."""
+class Tolerances(NamedTuple):
+    """Tolerances of a scene.
+
+    **Attributes**: `errors`: names of parameters and their relative errors; `ranges` of parameters.
+    """
+
+    errors: tuple[tuple[str, float], ...]
+    ranges: tuple[_NumberRange, ...]
+
+
+def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
+    """Return tolerances from texts. **Raises** `InputError` as `tolerance_ranges`."""
     errors: list[tuple[str, float]] = []
     ranges: list[_NumberRange] = []
     there = numbers_of(scene)
@@ -133,14 +145,21 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
             size = float(share[1]) / 100.0
             if not 0.0 < size < 1.0:
                 raise InputError("tolerances", f"is {quoted(text)}; the share must be greater than 0 % and less than 100 %")
-            short = [each for each in _SHORT_NAMES.get(name, ()) if each in there]
+            pattern = _SHORT_NAMES.get(name)
+            short = [each for each in there if pattern is not None and pattern.fullmatch(each)]
             errors += [(each, size) for each in short or [find_number(scene, name, "tolerances").name]]
         elif ends := _RANGE.fullmatch(value):
             ranges.append(_range(scene, name, ends[1], ends[2]))
         else:
             raise InputError("tolerances", f"is {quoted(text)}; write NAME=SHARE or NAME=LOW..HIGH, such as stiffness=5%")
+    return Tolerances(tuple(errors), tuple(ranges))
+
+
+def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) -> Iterator[Scene]:
+    """Yield scenes with deviations of their numbers."""
+    errors, ranges = read_tolerances(scene, tolerances)
     random = random_numbers(seed)
-    batch = Sampled(tuple(errors), samples, seed).scenes(scene) if errors else None
+    batch = Sampled(errors, samples, seed).scenes(scene) if errors else None
     shares = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
     for k in range(samples):
         machine = scene if batch is None else jax.tree.map(lambda leaf, k=k: leaf[k], batch)
@@ -154,10 +173,19 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
 def _range(scene: Scene, name: str, low: str, high: str) -> _NumberRange:
     """Return a range; its first end may lack the unit of the second."""
     material = _MATERIAL.fullmatch(name)
-    found = find_number(scene, f"machine.mass[{int(material[1] or 1) - 1}]" if material else name, "tolerances")
+    found = find_number(scene, _mass_name(scene, int(material[1] or 1)) if material else name, "tolerances")
     unit = "".join(re.findall(r"[^\d.eE+\-\s].*$", high.strip()))
     ends = [low if re.search(r"[^\d.eE+\-\s]", low) else f"{low.strip()} {unit}".strip(), high]
     first, last = (float(number(end.strip(), found.unit, f"tolerances.{name}")) for end in ends)
     if not first < last:
         raise InputError(f"tolerances.{name}", f"is {low}..{high}; the second must be larger than the first")
     return _NumberRange(found, first, last, material is not None)
+
+
+def _mass_name(scene: Scene, number: int) -> str:
+    """Return the name of the mass of a platform or body; the only body of a machine has no number."""
+    there = numbers_of(scene)
+    if f"machine.bodies[{number - 1}].mass" in there:
+        return f"machine.bodies[{number - 1}].mass"
+    is_single = number == 1 and "machine.mass" in there and there["machine.mass"].size == 1
+    return "machine.mass" if is_single else f"machine.mass[{number - 1}]"

@@ -19,7 +19,8 @@ from jaxvib.cli.output import Output
 from jaxvib.errors import ComputationError, InputError, legible, quoted
 
 if TYPE_CHECKING:
-    from jaxvib.machine.scene import Scene
+    from jaxvib.machine.effects.base import Effect
+    from jaxvib.machine.scene import Exciter, Scene
     from optimize import ToleranceRange
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "app",
     "loaded_scene",
     "ranges_within",
+    "require_tolerances",
     "run",
     "shared",
     "table",
@@ -41,30 +43,57 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     """Load the scene of a file, and change its effects and its drive.
 
     **Arguments**: `path` of the file; `without`: kinds of effects to leave out; `speed`: constant rotor speed that replaces the
-    drive; `constant`: True to replace a run-up by its final speed, with a message on stderr.
+    drives; `constant`: True to replace a run-up by its final speed, with a message on stderr.
 
     **Raises** `InputError` for an effect that the scene does not have, and for a string that is not a speed.
     """
-    from jaxvib.display import speed_text  # slow imports, which --help does not need
-    from jaxvib.machine.drives.drive import ConstantSpeed
+    from jaxvib.machine.drives.drive import ConstantSpeed  # slow imports, which --help does not need
     from jaxvib.machine.files import load_scene
     from jaxvib.machine.validation import implausible_numbers
 
     scene = load_scene(path)
     if speed is not None:
-        scene = scene.replace(drive=ConstantSpeed(speed))
-    elif constant and scene.drive.ideal and not scene.drive.constant:
-        end = float(scene.drive.speed)
-        click.echo(f"constant speed of {speed_text(end, 6)}: the final speed of the drive ({scene.drive.kind})", err=True)
-        scene = scene.replace(drive=ConstantSpeed(end))
+        scene = _with_exciters(scene, lambda each: each.with_parts(each.loads, ConstantSpeed(speed), each.effects))
+    elif constant:
+        scene = _with_exciters(scene, _at_final_speed)
     for note in implausible_numbers(scene):
         click.echo(f"note: {note}", err=True)
     there = [effect.kind for effect in scene.all_effects]
     for kind in without:
         if kind not in there:
             raise InputError("--without", f"is {quoted(kind)}; the scene's effects are: {', '.join(there) or 'none'}")
-    kept = tuple(effect for effect in scene.all_effects if effect.kind not in without)
-    return scene if len(kept) == len(there) else scene.replace(effects=kept)
+    return _without_effects(scene, without) if without else scene
+
+
+def _with_exciters(scene: Scene, change: Callable[[Exciter], Exciter]) -> Scene:
+    """Return a scene with changed exciters."""
+    from jaxvib.machine.scene import Scene  # slow import, which --help does not need
+
+    return Scene(scene.machine, exciters=[change(each) for each in scene.exciters], effects=scene.effects)
+
+
+def _at_final_speed(exciter: Exciter) -> Exciter:
+    """Return an exciter whose run-up, if it has one, is replaced by its final speed, with a message on stderr."""
+    from jaxvib.display import speed_text  # slow imports, which --help does not need
+    from jaxvib.machine.drives.drive import ConstantSpeed
+
+    drive = exciter.drive
+    if not drive.ideal or drive.constant:
+        return exciter
+    end = float(drive.speed)
+    click.echo(f"constant speed of {speed_text(end, 6)}: the final speed of the drive ({drive.kind})", err=True)
+    return exciter.with_parts(exciter.loads, ConstantSpeed(end), exciter.effects)
+
+
+def _without_effects(scene: Scene, kinds: Sequence[str]) -> Scene:
+    """Return a scene without some kinds of effects on the machine and on its exciters."""
+    from jaxvib.machine.scene import Scene  # slow import, which --help does not need
+
+    def kept(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+        return tuple(effect for effect in effects if effect.kind not in kinds)
+
+    exciters = [each.with_parts(each.loads, each.drive, kept(each.effects)) for each in scene.exciters]
+    return Scene(scene.machine, exciters=exciters, effects=kept(scene.effects))
 
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
@@ -100,7 +129,8 @@ TOLERANCE = click.option(
     "tolerances",
     multiple=True,
     metavar="NAME=SHARE",
-    help="Ranges over machines with deviations, repeatable: stiffness=5%, damping=30%, load=0..20kg (material on platform 1).",
+    help="Ranges over machines with deviations, repeatable: stiffness=5%, damping=30%, load=0..20kg (material on platform or "
+    "body 1).",
 )
 """Option of commands that show ranges over machines within tolerances."""
 
@@ -126,6 +156,14 @@ def ranges_within(scene: Scene, modes: Sequence[int] | None, tolerances: Sequenc
         )
     ]
     return tolerance_ranges(scene, quantities, list(tolerances))
+
+
+def require_tolerances(scene: Scene, tolerances: Sequence[str]) -> None:
+    """**Raises** `InputError` for tolerances that a scene cannot have. Commands call this before a long computation."""
+    if tolerances:
+        from optimize.tolerance import read_tolerances  # slow import, which --help does not need
+
+        read_tolerances(scene, tolerances)
 
 
 def tolerance_table(found: Sequence[ToleranceRange], tolerances: Sequence[str]) -> str:

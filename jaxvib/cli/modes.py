@@ -8,7 +8,19 @@ from pathlib import Path
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import SPEED, TOLERANCE, WITHOUT, Output, app, loaded_scene, ranges_within, shared, table, tolerance_table
+from jaxvib.cli.app import (
+    SPEED,
+    TOLERANCE,
+    WITHOUT,
+    Output,
+    app,
+    loaded_scene,
+    ranges_within,
+    require_tolerances,
+    shared,
+    table,
+    tolerance_table,
+)
 from jaxvib.cli.document import indented, measures_of
 from jaxvib.cli.output import csv_options, fields_of
 from jaxvib.errors import InputError
@@ -47,6 +59,7 @@ def modes(
         )
     if tolerances and (exact or phases or loaded.mounting.axes != (1,)):
         raise InputError("--tolerance", "is for light loads on platforms that stay together; leave it or the other option out")
+    require_tolerances(loaded, tolerances)
     if exact:
         _exact(loaded, csv, output)
         return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from jaxvib.cli.app import TOLERANCE, Output, app, shared, table, tolerance_table
+from jaxvib.cli.app import TOLERANCE, Output, app, require_tolerances, shared, table, tolerance_table
 from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def optimize(
     from optimize import Synthesis, load_design, synthesize, tolerance_ranges
 
     loaded = load_design(design)
+    require_tolerances(loaded.space.scene, tolerances)
     given = {"starts": starts, "seed": seed, "searcher": searcher}
     options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
     with output.progress() as progress:

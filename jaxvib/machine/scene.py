@@ -251,7 +251,7 @@ class Scene(Part):
         """Only exciter of the scene. **Raises** `InputError` if the scene has several."""
         if len(self.exciters) != 1:
             problem = f"has {len(self.exciters)} exciters; this function needs a scene with one"
-            instead = "for several use synchronous_regimes, envelope or simulate"
+            instead = "for several use simulate, settle, envelope, response or synchronous_regimes (command regimes)"
             raise InputError("scene", f"{problem}, {instead} (their parts are scene.exciters[0].drive and so on)")
         return self.exciters[0]
 

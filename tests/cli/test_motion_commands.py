@@ -13,7 +13,7 @@ from small_machine import small_run
 
 import jaxvib as jv
 import optimize
-from jaxvib.cli.app import _HOMES, app, run
+from jaxvib.cli.app import _HOMES, app, loaded_scene, run
 from jaxvib.machine.files import EFFECTS, SCREENS, SECTIONS, TEMPLATES
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
@@ -270,3 +270,23 @@ def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     assert typed("response", "machine.toml")[0] == 2
     code, _, err = typed("response", "table.toml", "--deck", "1,0")
     assert code == 2 and "--deck is for bodies in a plane, not for a machine of kind 'one_mass'" in err
+
+
+def test_options_change_scenes_of_several_exciters(tmp_path, capsys):
+    path = tmp_path / "screen.toml"
+    path.write_text(SCREENS["linear_screen"])
+    scene = jv.load_scene(path)
+    assert [effect.kind for effect in scene.all_effects] == ["gravity"]
+    changed = loaded_scene(path, ["gravity"])
+    assert changed.all_effects == () and [each.drive.kind for each in changed.exciters] == 2 * ["induction_motor"]
+    slower = loaded_scene(path, speed="900 rpm")
+    assert [float(each.drive.speed) for each in slower.exciters] == pytest.approx(2 * [30.0 * np.pi])
+    assert [each.direction for each in slower.exciters] == [1, -1] and len(slower.effects) == 1
+    ramps = [each.with_parts(None, jv.SpinUp(speed, "2 s")) for each, speed in zip(scene.exciters, (90.0, 95.0), strict=True)]
+    jv.save_scene(jv.Scene(scene.machine, exciters=ramps), path)
+    ends = loaded_scene(path, constant=True)
+    assert [(each.drive.kind, float(each.drive.speed)) for each in ends.exciters] == [
+        ("constant_speed", 90.0),
+        ("constant_speed", 95.0),
+    ]
+    assert capsys.readouterr().err.count("the final speed of the drive (spin_up)") == 2

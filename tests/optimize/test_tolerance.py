@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.machine.files import SCREENS, scene_from_toml
 from optimize import jam_frequency, static_deflection, tolerance_ranges
+from optimize.tolerance import read_tolerances
 
 
 @pytest.fixture
@@ -45,3 +47,27 @@ def test_modes_that_vanish_lower_the_share(scene):
 def test_wrong_tolerances_are_refused(scene, text):
     with pytest.raises(jv.InputError, match="tolerance"):
         tolerance_ranges(scene, [static_deflection()], [text], samples=4)
+
+
+def test_short_names_of_a_body_are_all_its_springs():
+    scene = scene_from_toml(SCREENS["linear_screen"])
+    each = [f"machine.supports[{k}].stiffness[{j}]" for k in (0, 1) for j in (0, 1)]
+    assert read_tolerances(scene, ["stiffness=5%"]).errors == tuple((name, 0.05) for name in each)
+    assert [name for name, _ in read_tolerances(scene, ["mass=1%", "unbalance=2%"]).errors] == [
+        "machine.mass",
+        "exciters[0].unbalance",
+        "exciters[1].unbalance",
+    ]
+    (material,) = read_tolerances(scene, ["load=0..20kg"]).ranges
+    assert (material.found.name, material.low, material.high, material.is_added) == ("machine.mass", 0.0, 20.0, True)
+    with pytest.raises(jv.InputError, match=r"machine.mass\[1\]"):
+        read_tolerances(scene, ["load[2]=0..20kg"])
+
+
+def test_short_names_of_a_network_of_bodies():
+    supports = [jv.support(at=(0.0, 0.0), stiffness=(1e5, 2e5), damping=(1e2, 2e2), body=k) for k in (0, 1)]
+    machine = jv.plane_network([jv.body(mass=100.0, inertia=10.0), jv.body(mass=50.0, inertia=5.0)], supports)
+    scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.1)])
+    errors = read_tolerances(scene, ["mass=1%", "damping=30%"]).errors
+    assert errors[:2] == (("machine.bodies[0].mass", 0.01), ("machine.bodies[1].mass", 0.01)) and len(errors) == 6
+    assert read_tolerances(scene, ["load[2]=0..20kg"]).ranges[0].found.name == "machine.bodies[1].mass"

@@ -16,6 +16,7 @@ from jaxvib.cli.app import (
     app,
     loaded_scene,
     ranges_within,
+    require_tolerances,
     shared,
     tolerance_table,
 )
@@ -55,6 +56,7 @@ def settle(
     does not suffice.
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
+    require_tolerances(loaded, tolerances)
     run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("history.png", run.plot)
     output.keep("run.npz", run)
