@@ -2,7 +2,9 @@
 
 Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots, whose number has the smallest Bayesian
 information criterion. The second derivative of the spline, which the force of an unbalance needs, is smooth. Marks of a wheel
-that are unevenly spaced have one unknown offset each. The covariance of the coefficients gives functions e_m(t), such that
+that are unevenly spaced have one unknown offset each. All pulses may be early or late by a common time, whose standard error
+is that of one pulse, because recorders round times up, down, or to the nearest sample. The covariance of the coefficients gives
+functions e_m(t), such that
 
     angle(t) = spline(t) + sum_m z_m e_m(t),      z_m independent and standard normal
 
@@ -209,7 +211,8 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
     The errors are principal components of the covariance of the coefficients, in the order of their size.
 
     **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): the number of a value's mark, each with an unknown
-    offset (0 on average); `spread` (n,): standard deviations of the values up to a common factor.
+    offset (0 on average); `spread` (n,): rates of values whose errors are those of their times. A common delay of all times is
+    then one of the errors.
 
     >>> t = np.linspace(0.0, 2.0, 200)
     >>> spline = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
@@ -229,7 +232,11 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
         tried.append(_fit_knots(time, value * weights, weights, offsets, intervals))
         intervals = max(intervals + 1, int(1.4 * intervals))
     best = min(tried, key=lambda each: each.criterion)
-    sizes, axes = np.linalg.eigh(best.covariance())
+    covariance = best.covariance()
+    if spread is not None:
+        late = _derivative(best) * math.sqrt(best.variance) / np.mean(spread)
+        covariance += np.outer(late, late)
+    sizes, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(sizes, 0.0))
     grid = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * len(best.found)), best.knots, _DEGREE)
     errors = root @ np.linalg.svd(grid @ root, full_matrices=False)[2].T
@@ -258,6 +265,16 @@ class _KnotsFit(NamedTuple):
 
         alone = solveh_banded(self.band, np.eye(len(self.found)), lower=True)
         return self.variance * (alone + self.answers @ self.schur @ self.answers.T)
+
+
+def _derivative(fit: _KnotsFit) -> np.ndarray:
+    """Return the coefficients (k,) of the spline with the same knots that interpolates the derivative."""
+    from scipy.interpolate import BSpline  # slow to import
+
+    places = np.lib.stride_tricks.sliding_window_view(fit.knots[1:-1], _DEGREE).mean(axis=1)
+    places = np.clip(places, fit.knots[0], fit.knots[-1])  # rounding errors
+    basis = BSpline.design_matrix(places, fit.knots, _DEGREE).toarray()
+    return np.linalg.solve(basis, BSpline(fit.knots, fit.found, _DEGREE)(places, 1))
 
 
 def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets: np.ndarray, intervals: int) -> _KnotsFit:

@@ -113,11 +113,11 @@ def free_motions(times, case):
     return list(np.einsum("ai,tik->kta", flow[2:], free).real)
 
 
-def bound(times, names, noise, color=0.0, gain_error=0.0, turning=ramp, phase=0.4):
+def bound(times, names, noise, color=0.0, gain_error=0.0, turning=ramp, phase=0.4, delay_error=0.0):
     """Return the Cramer-Rao bound of the relative standard errors of numbers `names`.
 
     The derivatives are differences of SciPy's run-ups. The states at the first sample, the offsets and the phase of the
-    unbalance are free. The noise is that of `record`.
+    unbalance are free. The noise is that of `record`. `delay_error`, s: standard error of a common delay of all pulses.
     """
     step = 1e-4
     cases = [TRUTH | {name: TRUTH[name] * (1.0 + s * step)} for name in names for s in (1.0, -1.0)]
@@ -129,13 +129,18 @@ def bound(times, names, noise, color=0.0, gain_error=0.0, turning=ramp, phase=0.
     columns += [np.tile([1.0, 0.0], (times.size, 1)), np.tile([0.0, 1.0], (times.size, 1))]
     readings = accelerations(times, [TRUTH], phase, turning)[0]
     columns += [readings * each for each in np.eye(2)] if gain_error else []
+    errors = [gain_error] * 2 if gain_error else []
+    if delay_error:
+        shifted = [accelerations(times, [TRUTH], phase, lambda t, s=s: turning(t + s)) for s in (step, -step)]
+        columns.append((shifted[0] - shifted[1])[0] / (2.0 * step))
+        errors.append(delay_error)
     slopes = np.stack(columns, axis=-1)
     slopes[1:] -= color * slopes[:-1]
     slopes[0] *= np.sqrt(1.0 - color**2)
     slopes = slopes.reshape(-1, slopes.shape[-1]) / (noise * np.sqrt(1.0 - color**2))
     information = slopes.T @ slopes
-    if gain_error:
-        information[-2:, -2:] += np.eye(2) / gain_error**2
+    for k, error in enumerate(reversed(errors)):
+        information[-1 - k, -1 - k] += 1.0 / error**2
     return np.sqrt(np.diagonal(np.linalg.inv(information))[: len(names)])
 
 

@@ -44,6 +44,16 @@ def test_uneven_marks_are_estimated():
     np.testing.assert_allclose(found - found[0], angle_at(t) - angle_at(t[0]), atol=2e-3)
 
 
+def test_times_rounded_down_are_within_the_error_of_the_angle():
+    """All pulses are early by half a millisecond on average, which no mean over pulses shows."""
+    numbers, edges = pulses(1)
+    t = np.linspace(2.0, 18.0, 9)
+    found = measured("pulses", 1e-3 * np.floor(edges / 1e-3), numbers)
+    away = (found.at(t) - angle_at(t)) / np.linalg.norm(found.spline(t)[:, 1:], axis=1)
+    np.testing.assert_allclose(away, np.sqrt(3.0), atol=0.7)
+    assert found.error == pytest.approx(1e-3 / np.sqrt(12.0) * 53.0, rel=0.2)
+
+
 def test_large_changes_of_speed_between_pulses_are_noted():
     """Speeds in the middle of two intervals of pulses differ by up to 27.5 % where the ramp begins."""
     numbers, edges = pulses(1, 6.0)
