@@ -78,6 +78,7 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
     foreign = list(_foreign_vibrations(fitted, has_fit))
     notes += foreign
     shares = angle_shares(fitted)
+    unknowns = fitted.problem.unknowns.count - fitted.problem.unknowns.errors  # errors of the angle have a known size
     for k, (samples, left) in enumerate(zip(fitted.problem.runs, fitted.residuals, strict=True)):
         for c, channel in enumerate(samples.channels):
             if shares[k][c] > _ANGLE_SHARE:
@@ -92,7 +93,7 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
                     f"{fitted.outliers[k][c]:.1%} of the readings of channel {channel.name!r} in run {k + 1} are outliers, "
                     "which have little influence"
                 )
-            one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], fitted.problem.angles[k][:, 0], fitted.x.size)
+            one = residual_chance(left[:, c], np.asarray(samples.taps)[:, c], fitted.problem.angles[k][:, 0], unknowns)
             if one < CHANCE:
                 notes.append(f"the residuals of channel {channel.name!r} in run {k + 1} repeat with the rotor's angle")
             chance = min(chance, one)
