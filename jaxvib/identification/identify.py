@@ -329,7 +329,7 @@ def _gains(fitted: Fitted) -> tuple[Estimate, ...]:
     moved = len(unknowns.numbers)
     own = np.arange(moved, moved + len(unknowns.gains))
     data, prior, _ = in_polar_unbalances(fitted)
-    covariance = np.linalg.inv(eliminate(data + prior, own)) if own.size else np.zeros((0, 0))
+    covariance = np.linalg.inv(eliminate(data + prior, own))
     pairs = zip(fitted.x[own], np.sqrt(np.diagonal(covariance)), strict=True)
     return tuple(_estimate(math.exp(x), math.exp(x), True, float(spread), True) for x, spread in pairs)
 

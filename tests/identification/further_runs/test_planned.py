@@ -1,0 +1,254 @@
+"""Plans of runs: what a run shares with a fit, errors, benefits, and the optimized speed."""
+
+import functools
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.identification.directions import eliminate
+from jaxvib.identification.fit import model_readings
+from jaxvib.identification.further_runs import plan, profile
+from jaxvib.identification.further_runs.plan import RunPlan, plan_runs
+from jaxvib.identification.further_runs.planned import (
+    Expected,
+    PlannedRun,
+    expected_errors,
+    expected_information,
+    expected_run,
+    own_precisions,
+    shared_places,
+)
+from jaxvib.identification.further_runs.profile import Limits, _spread, optimized_profile, require_within
+
+FRAME = jv.Channel("frame", "velocity", at=1, gain_error=0.02)
+NAMES = ("machine.stiffness[0]", "exciters[0].unbalance", "machine.damping[0]")
+
+
+@functools.cache
+def fit():
+    """What a plan needs of a fit: two runs at 100 and 400 Hz, of which the first one counts for the noise of the frame."""
+    drive = jv.RunUp(60.0, acceleration=6.0)
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    return SimpleNamespace(
+        scene=jv.Scene(machine, exciters=[jv.Exciter(drive=drive, unbalance=0.05)]),
+        names=NAMES, gain_names=("deck", "frame"), phase=np.array([0.4]),
+        channels=(("frame",), ("deck", "frame")), noise=(np.array([1e-3]), np.array([5e-3, 7e-3])),
+        time=(0.01 * np.arange(3), 0.0025 * np.arange(3)), information=np.diag([4e4, 100.0, 900.0, 1e4, 1e4, 400.0]),
+    )  # fmt: skip
+
+
+def ramp(duration=1.28, channels=(FRAME,), rate=100.0, **options):
+    return PlannedRun("ramp", jv.SpeedProfile([0.0, 1.28], [5.0, 45.0]), duration, list(channels), rate=rate, **options)
+
+
+def test_planned_run_has_the_numbers_and_the_noise_of_the_fit():
+    found = expected_run(fit(), ramp())
+    problem = found.fitted.problem
+    np.testing.assert_allclose(problem.runs[0].weights[0, :, 0], 1.0 / 1e-3)  # all 128 readings, at the rate of the fit
+    np.testing.assert_allclose(found.fitted.linear[:2], 0.05 * np.array([np.cos(0.4), np.sin(0.4)]))
+    assert not np.any(found.fitted.linear[2:]) and not np.any(found.fitted.x)
+    # Numbers, gain and unbalance; the runs have no common zero of the angle.
+    assert found.own.tolist() == [0, 1, 3, 2] and found.place.tolist() == [0, 2, 1, 4]
+    np.testing.assert_allclose(problem.precisions, 0.0)  # the gain is known by the fit
+    assert problem.unbalances == (None,)
+
+
+@pytest.mark.parametrize(("noise", "deviation"), [({}, 5e-3 * 0.5), ({"deck": "9 mm/s"}, 9e-3)])
+def test_noise_of_another_rate_and_of_new_channels(noise, deviation):
+    """The deck was recorded at 400 Hz; at 100 Hz the same spectral density has half the deviation."""
+    deck, tacho = jv.Channel("deck", "velocity", at=1), jv.Channel("tacho", "pulses")
+    found = expected_run(fit(), ramp(channels=(deck, tacho), noise=noise))
+    np.testing.assert_allclose(found.fitted.problem.runs[0].weights[0, :, 0], 1.0 / deviation)
+    assert found.own.tolist() == [0, 1, 2, 3] and found.place.tolist() == [0, 2, 1, 5]  # no gain, but the mark of the angle
+    with pytest.raises(jv.InputError, match="candidates: ramp: channel 'new' is new; give its noise, noise="):
+        expected_run(fit(), ramp(channels=(jv.Channel("new", "velocity", at=1),)))
+
+
+def test_new_gains_keep_what_is_known_about_them():
+    unknowns = SimpleNamespace(numbers=(1, 2), gains=("frame", "new"), count=4)
+    problem = SimpleNamespace(unknowns=unknowns, precisions=np.array([0.0, 3.0, 25.0, 16.0]))
+    assert own_precisions(fit(), problem).tolist() == [0.0, 3.0, 0.0, 16.0] and problem.precisions[2] == 25.0
+
+
+def test_places_of_shared_unknowns():
+    named = tuple(SimpleNamespace(name=name) for name in ("machine.damping[0]", "machine.stiffness[0]"))
+    unknowns = SimpleNamespace(numbers=named, gains=("new", "frame"), count=5)
+    problem = SimpleNamespace(unknowns=unknowns, unbalances=(None,))
+    for has_mark, pairs in ((False, [(0, 2), (1, 0), (5, 1), (3, 4)]), (True, [(0, 2), (1, 0), (5, 1), (3, 4), (6, 5)])):
+        own, place = shared_places(fit(), problem, has_mark)
+        assert list(zip(own.tolist(), place.tolist(), strict=True)) == pairs
+    shared = Expected(None, own[:2], place[:2]).shared(np.diag([3.0, 4.0, 5.0]), 4)
+    np.testing.assert_array_equal(shared, np.diag([4.0, 0.0, 3.0, 0.0]))
+
+
+def test_information_is_that_of_the_slopes_of_the_readings():
+    """Differences of the readings over stiffness, damping, gain, size and angle of the unbalance, free motion and offset."""
+    expected = expected_run(fit(), ramp())
+    fitted = expected.fitted
+    problem, samples, step = fitted.problem, fitted.problem.runs[0], 1e-4
+
+    def readings(x, size, angle, rest):
+        linear = np.concatenate([rest[:2], size * np.array([np.cos(angle), np.sin(angle)]), rest[2:]])
+        return np.asarray(model_readings(problem.unknowns, samples, problem.scene, jnp.asarray(x), jnp.asarray(linear)))[:, 0]
+
+    columns = []
+    for k in range(8):
+        high, low = (
+            readings(sign * step * np.eye(3, 8)[:, k], 0.05 * np.exp(sign * step * (k == 3)), 0.4 + sign * step * (k == 4),
+                     sign * step * np.eye(3, 8, -5 + 10)[:, k] if k > 4 else np.zeros(3))
+            for sign in (1.0, -1.0)
+        )  # fmt: skip
+        columns.append((high - low) / (2.0 * step * 1e-3))
+    slopes = np.stack(columns, axis=1)
+    matrix, own, others = slopes.T @ slopes, [0, 3, 1, 2], [4, 5, 6, 7]
+    coupling = matrix[np.ix_(others, own)]
+    inner = matrix[np.ix_(own, own)] - coupling.T @ np.linalg.inv(matrix[np.ix_(others, others)]) @ coupling
+    found = expected_information(fit(), expected)
+    # In the order of the fit: stiffness, unbalance, damping, the gain of the frame.
+    places = [0, 1, 2, 4]
+    np.testing.assert_allclose(found[np.ix_([0, 1, 2, 4], places)], inner[np.ix_([0, 1, 2, 3], [0, 1, 2, 3])], rtol=1e-4)
+    assert not np.any(found[[3, 5]]) and not np.any(found[:, [3, 5]])
+
+
+def test_expected_errors_are_those_without_the_other_unknowns():
+    slopes = np.random.default_rng(0).normal(size=(30, 4))
+    matrix = 400.0 * slopes.T @ slopes
+    np.testing.assert_allclose(expected_errors(matrix, 2), np.sqrt(np.diagonal(np.linalg.inv(matrix))[:2]), rtol=1e-9)
+    assert expected_errors(np.diag([0.0, 100.0]), 2).tolist() == [np.inf, 0.1]
+
+
+def test_gradient_of_short_runs_by_the_speed_is_the_difference():
+    expected = expected_run(fit(), ramp())
+    times, speeds = np.linspace(0.0, 1.28, 9), np.linspace(5.0, 45.0, 9) + np.array([0, 3, -2, 0, 4, -5, 0, 2, 0.0])
+    value, gradient = _spread(fit(), expected, times, speeds)
+    run = expected_run(fit(), eqx.tree_at(lambda each: each.drive, ramp(), jv.SpeedProfile(times, speeds)))
+    information = fit().information + expected_information(fit(), run)
+    variances = np.diagonal(np.linalg.inv(eliminate(information, np.arange(3)) + np.eye(3)))
+    assert value == pytest.approx(0.5 * np.sum(np.log(variances)), rel=1e-6)
+    step = 1e-3
+    for k in (0, 3, 6):
+        high, low = (_spread(fit(), expected, times, speeds + s * step * np.eye(9)[k])[0] for s in (1.0, -1.0))
+        np.testing.assert_allclose(gradient[k], (high - low) / (2.0 * step), rtol=1e-4, atol=1e-7)
+
+
+def test_optimized_speed_stays_within_its_limits(monkeypatch):
+    """An objective with its minimum at speeds that are too high, and that change too fast."""
+    wanted, limits = np.array([0.0, 20.0, 30.0, 70.0, 50.0, 45.0, 40.0, 20.0, -9.0]), Limits(60.0, 15.0)
+    monkeypatch.setattr(profile, "_spread", lambda *args: (np.sum((args[3] - wanted) ** 2) / 50.0, (args[3] - wanted) / 25.0))
+    found = optimized_profile(None, ramp(16.0), None, limits)
+    times, speeds = np.asarray(found.times), np.asarray(found.speeds)
+    np.testing.assert_allclose(times, np.linspace(0.0, 16.0, 9))
+    assert np.all(speeds >= 0.0) and np.all(speeds <= 60.0) and np.max(np.abs(np.diff(speeds))) <= 30.0 * (1.0 + 1e-6)
+    # 70 rad/s is 40 above its neighbour: both move by the same amount until the limit of the speed.
+    np.testing.assert_allclose(speeds, [0.0, 20.0, 30.0, 60.0, 50.0, 45.0, 40.0, 20.0, 0.0], atol=0.5)
+
+
+def test_limits_hold_to_rounding():
+    planned = ramp(1.28)
+    require_within(planned, Limits(45.0 * (1.0 - 5e-7), 31.25 * (1.0 - 5e-7)))
+    for limits, says in (
+        (Limits(44.99, 40.0), "candidates: ramp: drive reaches"),
+        (Limits(50.0, 31.2), r"has an acceleration of 31.25 rad/s\^2; limits.acceleration is 31.2 rad/s\^2"),
+    ):
+        with pytest.raises(jv.InputError, match=says):
+            require_within(planned, limits)
+    falling = PlannedRun("fall", jv.SpeedProfile([0.0, 1.0], [50.0, 0.0]), 1.0, [FRAME], rate=100.0)
+    with pytest.raises(jv.InputError, match="has an acceleration of 50 rad/s"):
+        require_within(falling, Limits(60.0, 40.0))
+
+
+def planned_as(monkeypatch, errors, better=None, limits=None):
+    """Return the plan of three candidates of 1, 2 and 3 minutes with given expected errors; now they are 0.2, inf, 0.1."""
+    table = {name: np.diag(1.0 / np.asarray(each) ** 2) for name, each in errors.items()}
+    if better is not None:
+        table["optimized"] = np.diag(1.0 / np.asarray(better) ** 2)
+    fit = SimpleNamespace(names=("mass", "stiffness", "damping"), information=np.diag([25.0, 0.0, 100.0]))
+    speed = jv.SpeedProfile([0.0, 1.0], [7.0, 8.0])
+    monkeypatch.setattr(
+        plan, "expected_run", lambda fit, each: "optimized" if isinstance(each.drive, jv.SpeedProfile) else each.name
+    )
+    monkeypatch.setattr(plan, "expected_information", lambda fit, name: table[name] - fit.information)
+    asked = []
+    monkeypatch.setattr(plan, "optimized_profile", lambda *args: asked.append(args) or speed)
+    candidates = [
+        PlannedRun(name, jv.RunUp(30.0, acceleration=2.0), 60.0 * (k + 1), [FRAME], rate=100.0) for k, name in enumerate(errors)
+    ]
+    return plan.plan_runs.__wrapped__(fit, candidates, limits), asked, candidates, speed
+
+
+ERRORS = {"a": (0.1, 0.5, 0.1), "b": (0.02, 0.1, 0.01), "c": (0.2, np.inf, 0.1)}
+BENEFITS = {"a": np.log(2.0 * 2.0), "b": np.log(10.0 * 10.0 * 10.0) / 2.0, "c": 0.0}
+
+
+def test_candidates_are_ordered_by_benefit_per_minute(monkeypatch):
+    errors = {name: tuple(min(x, 1e9) for x in each) for name, each in ERRORS.items()}
+    found, asked, _, _ = planned_as(monkeypatch, errors)
+    assert found.candidates == ("b", "a", "c") and found.numbers == ("mass", "stiffness", "damping") and asked == []
+    np.testing.assert_allclose(found.benefit, [BENEFITS[name] for name in "bac"], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.errors, [ERRORS[name] for name in "bac"])
+    np.testing.assert_allclose(found.now, [0.2, np.inf, 0.1])
+    assert found.minutes.tolist() == [2.0, 1.0, 3.0] and found.profile is None
+    assert found.summary().splitlines() == [
+        "errors now: mass 0.2, stiffness not determined, damping 0.1",
+        "b (2 min, benefit 3.45 per minute): mass 0.02, stiffness 0.1, damping 0.01",
+        "a (1 min, benefit 1.39 per minute): mass 0.1, stiffness 0.5, damping 0.1",
+        "c (3 min, benefit 0 per minute): mass 0.2, stiffness not determined, damping 0.1",
+    ]
+
+
+@pytest.mark.parametrize(("better", "first"), [((0.01, 0.1, 0.01), "b, optimized speed"), ((0.03, 0.1, 0.01), "b")])
+def test_optimized_speed_is_a_candidate_if_it_is_better(monkeypatch, better, first):
+    errors = {name: tuple(min(x, 1e9) for x in each) for name, each in ERRORS.items()}
+    limits = {"speed": 40.0, "acceleration": 3.0}
+    found, asked, candidates, speed = planned_as(monkeypatch, errors, better, limits)
+    assert found.candidates[0] == first and asked[0][1:] == (candidates[1], "b", Limits(40.0, 3.0))
+    is_better = first != "b"
+    assert (found.profile is speed) == is_better and len(found.candidates) == 3 + is_better
+    assert ("optimized speed: 66.85 rpm at 0 s, 76.39 rpm at 1 s" in found.summary()) == is_better
+    if is_better:
+        assert found.minutes[0] == 2.0
+        np.testing.assert_allclose(found.errors[0], better)
+        np.testing.assert_allclose(found.benefit[0], np.log(20.0 * 10.0 * 10.0) / 2.0)
+    with pytest.raises(jv.InputError, match=r"limits\.speed is 95\.49 rpm"):
+        planned_as(monkeypatch, errors, better, {"speed": 10.0, "acceleration": 3.0})
+
+
+def test_empty_plan_and_chart():
+    with pytest.raises(jv.InputError, match="candidates is empty; give at least one PlannedRun"):
+        plan_runs.__wrapped__(None, [])
+    errors = np.array([[0.1, np.inf], [0.3, 0.2]])
+    shown = RunPlan(("a", "b"), ("m", "k"), errors, errors[0], np.ones(2), np.ones(2), None).plot()
+    (line,) = [each for each in shown.axes[0].lines if len(each.get_ydata()) == 2] or [None]
+    if line is not None:
+        np.testing.assert_allclose(line.get_ydata(), [1.0, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            dict(drive=jv.DCMotor(120.0, stall_torque=8.0, inertia=0.2)),
+            "drive is 'dc_motor', whose speed depends",
+        ),
+        (dict(duration=0.0), "duration"),
+        (dict(rate=-1.0), "rate"),
+        (dict(noise={"deck": 1.0}), r"noise\['deck'\] is not of a channel of the run; its channels are: frame"),
+        (dict(noise={"frame": "1 kg"}), r"noise\['frame'\]"),
+        (dict(noise={"frame": 0.0}), r"noise\['frame'\]"),
+    ],
+)
+def test_wrong_planned_runs_end_in_one_sentence(change, says):
+    values = dict(name="x", drive=jv.ConstantSpeed(30.0), duration=10.0, channels=[FRAME], rate=100.0) | change
+    with pytest.raises(jv.InputError, match=f"^{says}"):
+        PlannedRun(**values)
+
+
+def test_planned_run_reads_units():
+    found = PlannedRun(
+        "x", jv.ConstantSpeed(30.0), "1 min", [FRAME], rate="1 kHz", noise={"frame": "2 mm/s"}, change={"a": "+1 kg"}
+    )
+    assert (found.duration, found.rate, found.noise, found.change) == (60.0, 1000.0, {"frame": 2e-3}, {"a": "+1 kg"})
