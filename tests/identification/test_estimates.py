@@ -36,7 +36,7 @@ def scene_of(exciters=1):
 
 
 def test_errors_of_a_function_of_the_numbers():
-    """Of log k + 2 log m, whose slopes by relative changes are 1 and 2, and of -m k."""
+    """Functions log k + 2 log m, whose slopes by relative changes are 1 and 2, and -m k."""
     names = ("machine.stiffness[0]", "machine.mass[1]")
 
     def function(scene):
