@@ -30,7 +30,7 @@ NAMES = ("machine.stiffness[0]", "exciters[0].unbalance", "machine.damping[0]")
 
 @functools.cache
 def fit():
-    """Parts of a fit that a plan needs: two runs at 100 and 400 Hz, of which the first one counts for the noise of the frame."""
+    """Parts of a fit that a plan needs: two runs at 100 and 400 Hz; the first one has the noise of the frame."""
     drive = jv.RunUp(60.0, acceleration=6.0)
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
     return SimpleNamespace(
