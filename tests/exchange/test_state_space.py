@@ -167,3 +167,17 @@ def test_hostile_frequencies_of_responses_are_refused():
     for omega in ("a", {}, [1.0 + 1j], [float("nan")], object()):
         with pytest.raises(jv.InputError, match=r"^omega"):
             jv.state_space(scene()).frequency_response(omega)
+
+
+def test_residual_of_a_jam_is_relative_to_its_drag():
+    """A displacement that is 0.1 % too large moves the loads; the largest of their accelerations is stated."""
+    jam = jv.jam_modes(scene()).select(3)
+    moved = eqx.tree_at(lambda j: j.displacement, jam, 1.001 * jam.displacement)
+    field, zero = averaged_field(scene()), np.zeros(3)
+    at = Amplitudes(moved.displacement, 1j * jam.omega * moved.displacement, zero + jam.omega, zero)
+    drag = np.max(np.asarray(field.drag) * abs(120.0 - float(jam.omega)) / np.asarray(field.inertia))
+    residual = float(np.max(np.abs(field(0.0, at).rate))) / drag
+    with pytest.raises(jv.InputError, match=rf"is not an equilibrium .* \(relative residual {residual:.1e}\); use a"):
+        jv.state_space(scene(), moved)
+    small = eqx.tree_at(lambda j: j.displacement, jam, (1.0 + 0.5e-6 * 1e-3 / residual) * jam.displacement)
+    assert jv.state_space(scene(), small).A.shape == (13, 13)
