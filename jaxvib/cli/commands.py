@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, loaded_scene, shared
-from jaxvib.cli.document import SEPARATION, chosen_steps, deck_options, run_document, run_measures
+from jaxvib.cli.document import SEPARATION, chosen_steps, deck_options, require_deck_options, run_document, run_measures
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
@@ -76,6 +76,7 @@ def simulate(
     if csv is not None and window:
         raise InputError("--csv", "needs a trajectory, which --window does not save; leave one of them out")
     loaded = loaded_scene(scene)
+    require_deck_options(loaded)
     meter = ProgressBar() if sys.stderr.isatty() and _long(loaded, options["until"]) else None
     if meter is not None:
         output.end_waiting()

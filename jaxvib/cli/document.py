@@ -24,8 +24,12 @@ _POINT = "jaxvib.deck_point"
 def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options --deck and --slope, which `measures_of` reads, to a command."""
 
-    def keep(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
-        if value is not None:
+    def keep(context: click.Context, parameter: click.Parameter, value: Any) -> None:
+        if isinstance(value, tuple):
+            from jaxvib.units import numbers  # slow import, which --help does not need
+
+            value = [numbers([part.strip() for part in point.split(",")], "m", "--deck", 2).tolist() for point in value]
+        if value:
             context.meta.setdefault(_POINT, {})[parameter.name] = value
 
     slope = click.option(
@@ -35,26 +39,35 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
         "--deck",
         "at",
         metavar="X,Y",
+        multiple=True,
         expose_value=False,
         callback=keep,
-        help="Point of the deck of a body in a plane for throw and conveying speed, m, such as 1.5,0.1 [centre of mass].",
+        help="Point of the deck of a body in a plane for stroke, throw and conveying speed, m, such as 1.5,0.1, repeatable "
+        "[centre of mass].",
     )
     return deck(slope(command))
 
 
 def measures_of(scene: jv.Scene, motion: jv.Jam | jv.Vibration) -> jv.VibrationMeasures:
-    """Return the measures of a vibration, at the point of the option --deck.
+    """Return the measures of a vibration, at the points of the option --deck.
 
-    **Raises** `InputError` for a point that is not two numbers, and for a machine that is not a body in a plane.
+    **Raises** `InputError` for a machine that is not a body in a plane.
     """
     import jax  # slow import, which --help does not need
 
+    require_deck_options(scene)
     given = dict(click.get_current_context().meta.get(_POINT, {}))
-    if given and scene.machine.places != "plane":
-        raise InputError("--deck", f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
     if "at" in given:
-        given["at"] = [part.strip() for part in given["at"].split(",")]
+        given["at"] = given["at"][0] if len(given["at"]) == 1 else given["at"]
     return jax.device_get(jv.vibration_measures(scene, motion, **given))
+
+
+def require_deck_options(scene: jv.Scene) -> None:
+    """**Raises** `InputError` for the options --deck and --slope with a machine that is not a body in a plane."""
+    given = click.get_current_context().meta.get(_POINT, {})
+    if given and scene.machine.places != "plane":
+        option = "--deck" if "at" in given else "--slope"
+        raise InputError(option, f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
 
 
 def run_measures(run: jv.Run) -> jv.VibrationMeasures | None:

@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from collections.abc import Sequence
 from typing import Any
 
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 
-_TABLE = re.compile(r"\s*\[([\w.]+)\]")
+_TABLE = re.compile(r"\s*\[(\[?)([\w.]+)\]")
 _ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)((?:[^\"'#]|\"[^\"]*\"|'[^']*')*?)(\s*)(#\s*(.*))?")
 _NUMBER_AND_UNIT = re.compile(r"\s*((?:\d{1,4}\s*[x×]\s*)?)([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)")
 
 _RELATIVE = re.compile(r"%|\bloss\b")
 """Pattern of a damping that is given as a ratio or a loss factor."""
+
+_Path = tuple[str | int, ...]
+"""Names of tables and indices of arrays of tables."""
 
 _DIGITS = 8
 """Digits of changed numbers. More would hide the size of a number from a reader."""
@@ -24,8 +28,9 @@ _DIGITS = 8
 def rewrite_scene(text: str, scene: Scene) -> str:
     """Return the text of a scene file with the numbers of another scene of the same kind.
 
-    Comments, order and units stay. A changed number has 8 digits, and a comment with its old value. If the text cannot be
-    changed in this way, for example because the scene has other effects, the result is `scene_to_toml(scene)`.
+    Comments, order and units stay. A changed number has 8 digits, and a comment with its old value; a changed default is a new
+    line. If the text cannot be changed in this way, for example because the scene has other effects, the result is
+    `scene_to_toml(scene)`.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
@@ -38,22 +43,37 @@ def rewrite_scene(text: str, scene: Scene) -> str:
         old = tomllib.loads(scene_to_toml(scene_from_toml(text)))
     except ValueError:  # a text that refers to another file, which would not be found from another folder
         return scene_to_toml(scene)
-    section, lines = "", []
+    section: _Path = ()
+    counts: dict[_Path, int] = {}
+    lines = []
     for line in _whole_entries(text):
         table, entry = _TABLE.match(line), _ENTRY.fullmatch(" ".join(line.split("\n")))
-        section = table[1] if table else section
+        section = _section_of(table[2].split("."), bool(table[1]), counts) if table else section
         if entry:
-            path = (*section.split("."), entry[2])
+            path = (*section, entry[2])
             present, former, value = (_value_at(tables, path) for tables in (read, old, new))
-            is_other = section == "machine" and not _is_close(old[section], new[section])
+            is_other = path[0] == "machine" and not _is_close(old["machine"], new["machine"])
             line = _rewritten_line(line, entry, present, former, value, is_other)
         lines.append(line)
+        if table:
+            lines += _added_lines(*(_value_at(tables, section) for tables in (read, old, new)))
     result = "\n".join(lines) + "\n"
     try:
         is_same = _is_close(tomllib.loads(scene_to_toml(scene_from_toml(result))), new)
     except ValueError:  # the changed text is no scene file
         is_same = False
     return result if is_same else scene_to_toml(scene)
+
+
+def _added_lines(read: Any, old: Any, new: Any) -> list[str]:
+    """Return lines for the numbers of a table that differ from a default, which the file does not state."""
+    if not all(isinstance(each, dict) for each in (read, old, new)):
+        return []
+    return [
+        f"{name} = {_with_unit(None, old[name], value)}  # was {_with_unit(None, None, old[name])}, the default"
+        for name, value in new.items()
+        if name in old and name not in read and isinstance(value, (float, list)) and not _is_close(old[name], value)
+    ]
 
 
 def _whole_entries(text: str) -> list[str]:
@@ -65,9 +85,28 @@ def _whole_entries(text: str) -> list[str]:
     return found
 
 
-def _value_at(tables: Any, path: tuple[str, ...]) -> Any:
-    for name in path:
-        tables = tables.get(name) if isinstance(tables, dict) else None
+def _section_of(names: Sequence[str], is_array: bool, counts: dict[_Path, int]) -> _Path:
+    """Return the path of the table in a header; `counts` of the arrays of tables are updated.
+
+    >>> counts = {}
+    >>> [_section_of(["a"], True, counts), _section_of(["a"], True, counts), _section_of(["a", "b"], False, counts)]
+    [('a', 0), ('a', 1), ('a', 1, 'b')]
+    """
+    path: _Path = ()
+    for k, name in enumerate(names):
+        path = (*path, name)
+        if is_array and k == len(names) - 1:
+            counts[path] = counts.get(path, -1) + 1
+        path = (*path, counts[path]) if path in counts else path
+    return path
+
+
+def _value_at(tables: Any, path: _Path) -> Any:
+    for step in path:
+        if isinstance(tables, list):
+            tables = tables[step] if isinstance(step, int) and step < len(tables) else None
+        else:
+            tables = tables.get(step) if isinstance(tables, dict) else None
     return tables
 
 
@@ -84,11 +123,15 @@ def _rewritten_line(line: str, entry: re.Match[str], read: Any, old: Any, new: A
 
 
 def _with_unit(read: Any, old: Any, new: Any) -> str:
-    """Return a value in SI as TOML, in the unit of the value that a file has: a list, a text with a unit or a number."""
+    """Return a value in SI as TOML, in the unit of the value that a file has: a list, a table, a text or a number."""
     if isinstance(new, list):
         size = len(new)
         reads, olds = (each if isinstance(each, list) and len(each) == size else [each] * size for each in (read, old))
         return f"[{', '.join(map(_with_unit, reads, olds, new))}]"
+    if isinstance(new, dict) and isinstance(read, dict):
+        olds = old if isinstance(old, dict) else {}
+        each = [f"{name} = {_with_unit(value, olds.get(name), new.get(name))}" for name, value in read.items()]
+        return f"{{ {', '.join(each)} }}"
     written = _NUMBER_AND_UNIT.fullmatch(read) if isinstance(read, str) else None
     if isinstance(new, str):
         return f'"{new}"'

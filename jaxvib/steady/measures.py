@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -141,8 +142,9 @@ class VibrationMeasures(eqx.Module):
     - `static_load` (ns,), N: weight that each support carries; NaN if the directions of the coordinates are unknown
     - `dynamic_load` (ns,) and `side_load` (ns,), N zero to peak: vertical and horizontal force of the vibration on each support
     - `torque` (exciter,), N m, and `power` (exciter,), W: means at the shaft of each drive
-    - `point` (2,) of a body in a plane, its `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s,
-      the estimate of `jaxvib.conveying_speed`; None for other machines
+    - `point` (2,) of a body in a plane, its `point_stroke`, m peak to peak along the long axis of its path, its
+      `point_acceleration`, g, `throw_angle`, rad, and `throw_number`, see `Ellipse`, and `conveying_speed`, m/s, the estimate
+      of `jaxvib.conveying_speed`; with a leading axis if several points were requested; None for other machines
     - `coordinates` (nt,): names of the coordinates
     """
 
@@ -158,6 +160,8 @@ class VibrationMeasures(eqx.Module):
     torque: Array = eqx.field(metadata=in_unit("N m", "exciter"))
     power: Array = eqx.field(metadata=in_unit("W", "exciter"))
     point: Array | None = eqx.field(metadata=in_unit("m", "direction"), default=None)
+    point_stroke: Array | None = eqx.field(metadata=in_unit("m"), default=None)
+    point_acceleration: Array | None = eqx.field(metadata=in_unit(""), default=None)
     throw_angle: Array | None = eqx.field(metadata=in_unit("rad"), default=None)
     throw_number: Array | None = eqx.field(metadata=in_unit(""), default=None)
     conveying_speed: Array | None = eqx.field(metadata=in_unit("m/s"), default=None)
@@ -175,10 +179,14 @@ class VibrationMeasures(eqx.Module):
         return there | {"isolation_efficiency": self.isolation_efficiency}
 
     def summary(self) -> str:
-        """Return the measures as text, one line for each coordinate, each support, the isolation, each shaft and the point."""
+        """Return the measures as text, one line for each coordinate, each support, the isolation, each shaft and each point.
+
+        The zone of ISO 20816-3 is not shown for a body in a plane, because decks of screens are always in zone D.
+        """
+        of, zones = ("", True) if self.point is None else (" of the centre of mass", False)
         lines = [
-            f"{name}: stroke {quantity_text(self.stroke[k], 'm', 4)} peak to peak, {float(self.acceleration[k]):.3g} g, "
-            f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS{_zone_text(float(self.velocity[k]))}"
+            f"{name}{of}: stroke {quantity_text(self.stroke[k], 'm', 4)} peak to peak, {float(self.acceleration[k]):.3g} g, "
+            f"{1e3 * float(self.velocity[k]):.4g} mm/s RMS{_zone_text(float(self.velocity[k])) if zones else ''}"
             for k, name in enumerate(self.coordinates)
             if not float(self.stroke[k]) < _NEGLIGIBLE * float(np.max(self.stroke))
         ]
@@ -197,12 +205,20 @@ class VibrationMeasures(eqx.Module):
         return "\n".join([*lines, *self._throw_text()])
 
     def _throw_text(self) -> list[str]:
-        if self.point is None or self.throw_angle is None or self.throw_number is None or self.conveying_speed is None:
+        names = ("point_stroke", "point_acceleration", "throw_angle", "throw_number", "conveying_speed")
+        values = [getattr(self, name) for name in names]
+        if self.point is None or any(each is None for each in values):
             return []
-        place, speed = ", ".join(f"{float(x):.4g}" for x in self.point), float(self.conveying_speed)
-        conveys = "flights longer than a turn" if np.isnan(speed) else f"conveys {speed:.3f} m/s"
-        angle = f"thrown at {quantity_text(self.throw_angle, 'rad', 4)}"
-        return [f"point ({place}) m: {angle}, throw number {float(self.throw_number):.3g}, {conveys}"]
+        lines = []
+        for place, *each in zip(np.atleast_2d(self.point), *map(np.atleast_1d, values), strict=True):
+            stroke, acceleration, angle, throw, speed = map(float, each)
+            conveys = "flights longer than a turn" if np.isnan(speed) else f"conveys {speed:.3f} m/s"
+            lines += [
+                f"point ({', '.join(f'{float(x):.4g}' for x in place)}) m: stroke {quantity_text(stroke, 'm', 4)} peak to peak "
+                f"at {quantity_text(angle, 'rad', 4)}, {acceleration:.3g} g,",
+                f"  throw number {throw:.3g}, {conveys}",
+            ]
+        return lines
 
     def __repr__(self) -> str:
         return self.summary() if is_single(self) else super().__repr__()
@@ -217,7 +233,7 @@ def vibration_measures(
     scene: Scene,
     motion: Jam | Vibration,
     *,
-    at: int | Number | Sequence[Number] | None = None,
+    at: int | Number | Sequence[Number] | Sequence[Sequence[Number]] | None = None,
     body: int = 0,
     slope: Number = 0.0,
 ) -> VibrationMeasures:
@@ -233,7 +249,8 @@ def vibration_measures(
     - `scene`
     - `motion` of the scene: a jam of light loads such as `jam_modes(scene).select(3)`, or the `vibration()` of a run, of a
       synchronous regime or of a response
-    - `at`: point of a deck, (x, y) of the body number `body`, m; default: its centre of mass; typical: the middle of the deck
+    - `at`: point of a deck, (x, y) of the body number `body`, m, or a list of points; default: its centre of mass; typical:
+      both ends of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
 
     **Returns** `VibrationMeasures`, with derivatives. **Raises** `InputError` for a point that the machine does not have.
@@ -248,10 +265,13 @@ def vibration_measures(
     shaft: 0.2969 N m, 12.43 W
     """
     scene = validate_scene(scene)
-    place = on_body(read_place(at, "at"), scene.machine.require_body(body))
+    on = scene.machine.require_body(body)
+    has_list = isinstance(at, (list, tuple)) and len(at) > 0 and all(isinstance(each, (list, tuple)) for each in at)
+    points = cast("Sequence[Sequence[Number]]", at) if has_list else [cast("Sequence[Number] | None", at)]
+    places = tuple(on_body(read_place(point, "at"), on) for point in points)
     if isinstance(motion, Jam):
         motion = _vibration_of(scene, motion.omega, motion.displacement, motion.foundation_force)
-    return _measures(scene, motion, place, known_number(slope, "rad", "slope"))
+    return _measures(scene, motion, places if has_list else places[0], known_number(slope, "rad", "slope"))
 
 
 @cached
@@ -269,7 +289,7 @@ def exciter_force(model: JammedModel, omega: Array) -> Array:
 
 
 @cached
-def _measures(scene: Scene, motion: Vibration, place: Place, slope: Array) -> VibrationMeasures:
+def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...], slope: Array) -> VibrationMeasures:
     model = linear_model(scene)
     lengths = np.flatnonzero(np.asarray(model.carrier.units) == "m")
     amplitude, w = motion.amplitude[lengths], jnp.abs(motion.speed)
@@ -292,14 +312,25 @@ def _measures(scene: Scene, motion: Vibration, place: Place, slope: Array) -> Vi
     )
     if scene.machine.places != "plane":
         return found
+    each = [_measures_at(scene, motion, one, slope) for one in (place if isinstance(place, tuple) else (place,))]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each) if isinstance(place, tuple) else each[0]
+    return dataclasses.replace(found, **stacked)
+
+
+def _measures_at(scene: Scene, motion: Vibration, place: Place, slope: Array) -> dict[str, Array]:
+    """Return the measures of a point of a body in a plane by the names of their fields."""
+    w = jnp.abs(motion.speed)
     moved = rows_in_plane(scene.machine, place) @ motion.displacement
     path = ellipse_at(moved, w, slope, jnp.zeros_like(w))
     at = place.at if isinstance(place, BodyPoint) else place
-    point = jnp.zeros(2, amplitude.dtype) if at is None else jnp.asarray(at, amplitude.dtype)
-    speed = conveying_speed_at(moved, w, slope)
-    return dataclasses.replace(
-        found, point=point, throw_angle=path.direction, throw_number=path.throw_number, conveying_speed=speed
-    )
+    return {
+        "point": jnp.zeros(2, motion.amplitude.dtype) if at is None else jnp.asarray(at, motion.amplitude.dtype),
+        "point_stroke": 2.0 * path.semi_major,
+        "point_acceleration": path.acceleration,
+        "throw_angle": path.direction,
+        "throw_number": path.throw_number,
+        "conveying_speed": conveying_speed_at(moved, w, slope),
+    }
 
 
 def require_platforms(scene: Scene, what: str) -> Platforms:

@@ -418,7 +418,24 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     np.testing.assert_allclose(np.abs([regime["phases"][1] for regime in regimes]), [np.pi, 0.0], atol=1e-9)
     assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
     out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg")[1]
-    assert "954.887" in out and "point (0.4, 0.1) m: thrown at" in out and max(map(len, out.splitlines())) <= 80
+    assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)
+    out = typed("regimes", "screen.toml", "--deck", "-0.4, 0.1", "--deck", "0.4,10 cm", "--json")[1]
+    measures = json.loads(out)["regimes"][0]["measures"]
+    deck = jv.working_regime(scene).deck([(-0.4, 0.1), (0.4, 0.1)]).ellipses
+    np.testing.assert_allclose(measures["point"], [[-0.4, 0.1], [0.4, 0.1]], rtol=1e-12)
+    np.testing.assert_allclose(measures["point_stroke"], 2.0 * deck.semi_major, rtol=1e-6)
+    np.testing.assert_allclose(measures["point_acceleration"], deck.acceleration, rtol=1e-6)
+
+
+@pytest.mark.parametrize("command", [("simulate", "--until", "1s"), ("settle",)])
+def test_points_of_a_deck_are_checked_before_the_run(typed, monkeypatch, command):
+    for name in ("simulate", "settle"):
+        monkeypatch.setattr(f"jaxvib.{name}", lambda *_, **__: pytest.fail("a run was begun"))
+    name, *rest = command
+    code, _, err = typed(name, "machine.toml", *rest, "--deck", "1,2")
+    assert code == 2 and "--deck is for bodies in a plane, not for a machine of kind 'two_mass'" in err
+    code, _, err = typed(name, "machine.toml", *rest, "--deck", "1.5")
+    assert code == 2 and "--deck" in err

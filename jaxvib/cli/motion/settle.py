@@ -20,7 +20,15 @@ from jaxvib.cli.app import (
     shared,
     tolerance_table,
 )
-from jaxvib.cli.document import SEPARATION, chosen_steps, deck_options, measured_document, run_document, run_measures
+from jaxvib.cli.document import (
+    SEPARATION,
+    chosen_steps,
+    deck_options,
+    measured_document,
+    require_deck_options,
+    run_document,
+    run_measures,
+)
 from jaxvib.cli.output import csv_options
 from jaxvib.errors import InputError
 
@@ -57,6 +65,7 @@ def settle(
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
     require_tolerances(loaded, tolerances)
+    require_deck_options(loaded)
     run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("history.png", run.plot)
     output.keep("run.npz", run)

@@ -5,15 +5,46 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.machine.files import TEMPLATES
+from jaxvib.machine.files import SCREENS, TEMPLATES
+from jaxvib.machine.numbers.named import numbers_of, put_numbers
 from jaxvib.machine.rewrite import rewrite_scene
 
 CHANGES = [("stiffness", (1.1, 0.7)), ("mass", (1.01, 2.0))]
 
 
-@pytest.mark.parametrize("kind", TEMPLATES)
+ALL = TEMPLATES | SCREENS
+
+
+@pytest.mark.parametrize("kind", ALL)
 def test_unchanged_scene_keeps_its_text(kind):
-    assert rewrite_scene(TEMPLATES[kind], jv.scene_from_toml(TEMPLATES[kind])) == TEMPLATES[kind]
+    assert rewrite_scene(ALL[kind], jv.scene_from_toml(ALL[kind])) == ALL[kind]
+
+
+@pytest.mark.parametrize("kind", SCREENS)
+def test_screens_keep_comments_if_all_numbers_change(kind):
+    scene = jv.scene_from_toml(SCREENS[kind])
+    found = [each for each in numbers_of(scene).values() if not each.name.startswith("effects")]
+    values = np.concatenate([1.01 * np.asarray(each.read(scene)) + 0.01 * ("angle" in each.name) for each in found])
+    changed = put_numbers(scene, found, values)
+    text = rewrite_scene(SCREENS[kind], changed)
+    again = jv.scene_from_toml(text)
+    np.testing.assert_allclose(np.concatenate([each.read(again) for each in found]), values, rtol=1e-7)
+    assert text.count("angle = 0.01  # was 0, the default") == 2 and 'rpm"  # was "' in text
+    assert all(line in text.splitlines() for line in SCREENS[kind].splitlines() if line.startswith("#"))
+
+
+def test_inline_tables_keep_their_units():
+    source = """
+machine = { kind = "one_mass", mass = 200.0, stiffness = "800 N/mm", damping = 600.0 }
+
+[[exciters]]  # one
+unbalance = "0.2 kg m"
+drive = { kind = "dc_motor", speed = "1500 rpm", stall_torque = 12.0, inertia = 0.1 }
+"""
+    scene = jv.scene_from_toml(source.replace("1500 rpm", "1200 rpm").replace("0.2 kg", "0.3 kg"))
+    text = rewrite_scene(source, scene)
+    assert 'drive = { kind = "dc_motor", speed = "1200 rpm", stall_torque = 12, inertia = 0.1 }  # was { kind' in text
+    assert 'unbalance = "0.3 kg m"  # was "0.2 kg m"' in text and 'stiffness = "800 N/mm"' in text
 
 
 @pytest.mark.parametrize(("name", "factors"), CHANGES)
