@@ -39,8 +39,13 @@ def recorded_from_sep005(timeseries: Sequence[Mapping[str, Any]], source: str) -
             raise InputError(where, f"has no entry {quoted(needed)}; SEP-005 needs data, name, unit_str, and fs or time")
         try:
             values = np.asarray([np.nan if x is None else x for x in each["data"]], float)
-            time = np.arange(values.size) / float(each["fs"]) if each.get("time") is None else np.asarray(each["time"], float)
-        except (TypeError, ValueError, ZeroDivisionError) as error:
+            if each.get("time") is not None:
+                time = np.asarray(each["time"], float)
+            elif (rate := float(each["fs"])) > 0.0:
+                time = np.arange(values.size) / rate
+            else:
+                raise ValueError(rate)
+        except (TypeError, ValueError) as error:
             raise InputError(where, "has data, fs or time that are not numbers; fs must be greater than 0") from error
         found.append(Recorded(str(each["name"]), str(each["unit_str"]), time, values))
     return found
