@@ -140,7 +140,10 @@ def _regular_sets(n: int) -> np.ndarray:
 
 
 def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return speeds (n,) and phases (n, count) at which the sum of all torques passes 0, one for each root."""
+    """Return speeds (n,) and phases (n, count) at which the sum of all torques passes 0, one for each root.
+
+    Between two of the given speeds lie two roots or none if the sum nearly touches 0 there; Newton's method starts from both.
+    """
     if balance.is_prescribed.any():
         return np.full(len(sets), np.asarray(balance.speed)), sets
     influence, torque = _data_at(balance, speeds)
@@ -150,7 +153,18 @@ def _starts(balance: TorqueBalance, speeds: np.ndarray, sets: np.ndarray) -> tup
     place, passed = np.nonzero(total[:, :-1] * total[:, 1:] <= 0.0)
     low, high = total[place, passed], total[place, passed + 1]
     share = low / np.where(low == high, 1.0, low - high)
-    return (speeds[passed] + share * (speeds[passed + 1] - speeds[passed])).astype(speeds.dtype), sets[place]
+    roots = speeds[passed] + share * (speeds[passed + 1] - speeds[passed])
+    touched, middle = _nearly_touching(total)
+    starts = np.concatenate([roots, speeds[middle - 1], speeds[middle + 1]])
+    return starts.astype(speeds.dtype), sets[np.concatenate([place, touched, touched])]
+
+
+def _nearly_touching(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices of local minima of |values| (n, points), between equal signs, that are below the change beside them."""
+    left, size, right = (np.abs(x) for x in (values[:, :-2], values[:, 1:-1], values[:, 2:]))
+    same = (values[:, :-2] * values[:, 1:-1] > 0.0) & (values[:, 1:-1] * values[:, 2:] > 0.0)
+    row, point = np.nonzero(same & (size <= np.minimum(left, right)) & (2.0 * size <= np.maximum(left, right)))
+    return row, point + 1
 
 
 def _related(phases: np.ndarray, prescribed: np.ndarray) -> np.ndarray:

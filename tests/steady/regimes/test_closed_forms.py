@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 import jaxvib as jv
 
@@ -150,6 +151,15 @@ def test_regimes_of_one_motor_are_roots_of_a_polynomial(stall, regimes):
     np.testing.assert_allclose(np.sort(found.speed)[::-1], expected, rtol=1e-10)
     slopes = [stall / 100.0 + derivative(w) > 0 for w in np.asarray(found.speed)]
     assert (found.quasi_static < 0).tolist() == slopes
+
+
+@pytest.mark.parametrize(("side", "count"), [(-1e-6, 3), (1e-6, 1)])
+def test_two_regimes_end_at_the_fold_of_the_motor(side, count):
+    """Torque at which the motor's line touches the resonance curve, 1e-6 less and 1e-6 more."""
+    curve = lambda w: 600.0 * S**2 * w**5 / abs(6e4 - MASS * w**2 + 600.0j * w) ** 2 / (1.0 - w / 100.0)  # noqa: E731
+    top = minimize_scalar(lambda w: -curve(w), bounds=(13.0, 15.5), method="bounded", options={"xatol": 1e-12}).x
+    motor = jv.DCMotor(100.0, stall_torque=(1.0 + side) * curve(top), inertia=0.5)
+    assert jv.synchronous_regimes(scene_of([(0.0, 0.0)], [1], body(3e4, 300.0), [motor])).speed.size == count
 
 
 def derivative(w, mass=MASS, stiffness=3e5, damping=600.0):
