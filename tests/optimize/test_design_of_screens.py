@@ -34,6 +34,23 @@ def place(low=0.2, high=1.2):
     return {"exciters[1].position[0]": (low, high), "exciters[1].position[1]": (low, high)}
 
 
+def test_search_finds_the_place_at_which_the_body_does_not_turn():
+    """Ideal drives force the body along x: its turn is 0 if i (a_2 - a_1) - (b_1 + b_2) = 2 D_(psi x) / D_xx."""
+    machine, speed = screen().machine, 100.0
+    drive = jv.ConstantSpeed(speed)
+    exciters = [
+        jv.Exciter(drive=drive, unbalance=4.0, at=(0.1, 0.4)),
+        jv.Exciter(drive=drive, unbalance=4.0, at=(0.5, 0.5), direction=-1),
+    ]
+    best = synthesize(
+        DesignSpace(jv.Scene(machine, exciters=exciters), place(-1.0, 1.0)), motion_spread(DECK), starts=4, verify=False
+    )
+    k = 2.0 * (280e3 + 1j * speed * 2000.0)  # two springs, 0.3 m below the centre
+    share = 2.0 * 0.3 * k / (k - speed**2 * 2600.0)
+    assert best.status_name == "done" and best.same == 4 and best.values.min() < 1e-6
+    np.testing.assert_allclose(best.scene.exciters[1].position, [0.1 + share.imag, -0.4 - share.real], atol=1e-6)
+
+
 @pytest.mark.slow
 def test_designs_without_a_regime_end_in_a_named_status():
     """A light unbalance does not couple motors of 1000 and at least 2000 rpm."""
