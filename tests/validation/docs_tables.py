@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Sequence
 
+from exciter_forms import FORMS, TIERS
 from hard_cases import CASES
 from hard_cases.case import PRECISIONS, Case
 from papers.catalogue import NUMBERS, PAPERS
@@ -31,7 +32,7 @@ def tables() -> dict[str, dict[str, str]]:
         "different": _different(),
         "numbers": _numbers(),
     }
-    return {"validation.md": {"hard cases": _hard_cases()}, "published.md": papers}
+    return {"validation.md": {"closed forms": _closed_forms(), "hard cases": _hard_cases()}, "published.md": papers}
 
 
 def with_tables(text: str, named: dict[str, str]) -> str:
@@ -52,6 +53,11 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _hard_cases() -> str:
     rows = [[c.name, c.hard, c.quantity, c.against, *(_outcome(c, precision) for precision in PRECISIONS)] for c in CASES]
     return _table(["case", "difficulty", "quantity", "compared with", *PRECISIONS], rows)
+
+
+def _closed_forms() -> str:
+    rows = [[form.name, form.formula, *(f"{bound:g}" if bound else "unstable" for bound in form.within)] for form in FORMS]
+    return _table(["machine", "closed form", *TIERS], rows)
 
 
 def _outcome(case: Case, precision: str) -> str:
