@@ -68,7 +68,7 @@ class PhaseJams(AbstractPhaseJam):
     def select(self, index: int) -> PhaseJam:
         """Return the jam with an `index`, counted from 0. **Raises** `InputError` if there are fewer jams."""
         n = self.omega.shape[0]
-        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
+        if not 0 <= index < n:
             raise InputError("index", f"is {quoted(index)}; there are {n} jams, counted from 0")
         fields = {name: getattr(self, name) for name in PhaseJam.__dataclass_fields__}
         return _select_jams(PhaseJam(**fields), np.asarray(index, np.uint32))

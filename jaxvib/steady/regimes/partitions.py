@@ -90,7 +90,7 @@ class RegimePartitions(Result):
         **Raises** `InputError` if there are fewer motions.
         """
         n = self.speed.shape[0]
-        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
+        if not 0 <= index < n:
             raise InputError("index", f"is {quoted(index)}; there are {n} motions, counted from 0")
         regimes = []
         for number in range(int(np.max(self.group[index])) + 1):

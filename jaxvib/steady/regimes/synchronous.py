@@ -196,7 +196,7 @@ class SynchronousRegimes(AbstractSynchronousRegime):
     def select(self, index: int) -> SynchronousRegime:
         """Return the regime with an `index`, counted from 0. **Raises** `InputError` if there are fewer regimes."""
         n = self.speed.shape[0]
-        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
+        if not 0 <= index < n:
             raise InputError("index", f"is {quoted(index)}; there are {n} regimes, counted from 0")
         fields = {name: getattr(self, name) for name in SynchronousRegime.__dataclass_fields__ if name != "scene"}
         return SynchronousRegime(**jax.tree.map(lambda leaf: leaf[index], fields), scene=self.scene)
@@ -315,11 +315,10 @@ def _read_group(masses: Sequence[int] | None, count: int) -> tuple[int, ...] | N
     """Return the numbers of some masses in ascending order, or None for all."""
     if masses is None:
         return None
-    numbers = list(masses) if isinstance(masses, (list, tuple)) else []
-    whole = all(isinstance(k, (int, np.integer)) and not isinstance(k, bool) and 0 <= k < count for k in numbers)
-    if not numbers or not whole or len(set(numbers)) < len(numbers):
+    numbers = sorted(int(k) for k in masses)
+    if not numbers or len(set(numbers)) < len(numbers) or numbers[0] < 0 or numbers[-1] >= count:
         raise InputError("masses", f"is {quoted(masses)}; give different numbers of rotating masses, 0 to {count - 1}")
-    return tuple(sorted(int(k) for k in numbers)) if len(numbers) < count else None
+    return tuple(numbers) if len(numbers) < count else None
 
 
 @cached

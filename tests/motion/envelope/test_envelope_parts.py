@@ -14,6 +14,7 @@ import jaxvib as jv
 from jaxvib.equations.averaged import Amplitudes, averaged_model
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.model import assemble
+from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.envelope import envelope as module
 from jaxvib.motion.envelope import run_up as run_ups
 from jaxvib.motion.envelope.result import Envelopes, plot_histories
@@ -86,6 +87,7 @@ def test_numbers_of_results_have_units_and_axes(part):
     fields = {name: field.metadata for name, field in part.__dataclass_fields__.items()}
     assert {name: (m["unit"], m["axes"]) for name, m in fields.items() if "unit" in m} == UNITS[part]
     assert {name: m["prefix"] for name, m in fields.items() if m.get("prefix")} == PREFIXES.get(part, {})
+    assert part is Envelopes or fields["scene"] == SCENE
     if part is Envelopes:
         assert fields["rotor_speeds"]["name"] == "rotor_speed"
 
@@ -155,7 +157,7 @@ def test_state_of_rest_counts_phases_from_their_mean():
     (angle,) = jv.initial_state(scene).angle
     np.testing.assert_allclose(rest.phase, angle - np.mean(angle), atol=1e-15)
     assert np.ptp(rest.phase) == pytest.approx(np.pi / 180.0) and rest.rate.tolist() == [0.0, 0.0]
-    assert np.all(np.asarray(rest.displacement) == 0.0) and rest.velocity.dtype == complex
+    assert rest.displacement.tolist() == [0.0] == rest.velocity.tolist() and rest.velocity.dtype == complex
 
 
 def test_envelope_of_a_state_has_signed_speeds():

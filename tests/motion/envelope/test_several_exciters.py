@@ -115,6 +115,8 @@ def test_envelope_ends_in_a_synchronous_regime():
     np.testing.assert_allclose(np.exp(1j * (phase - phase[0])), np.exp(1j * regime.phases), atol=1e-4)
     np.testing.assert_allclose(run.load_speed, float(run.omega) * np.array([1.0, -1.0, 1.0]), rtol=1e-6)
     np.testing.assert_allclose(run.amplitude, regime.amplitude, rtol=1e-4)
+    np.testing.assert_array_equal(run.ripple, np.max(run.window.ripple, axis=0))
+    assert np.ptp(run.ripple) > 0.1 * np.max(run.ripple)
     np.testing.assert_allclose(run.ellipse((0.3, 0.1)).semi_major, regime.ellipse((0.3, 0.1)).semi_major, rtol=1e-4)
 
 
