@@ -136,13 +136,9 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
     if not np.all(np.isfinite(total)):
         return _Trial(x, np.zeros(len(right)), np.inf)
     linear = _solve(matrix, right)
-    for k, known in enumerate(problem.unbalances):
-        pair = linear[2 * k : 2 * k + 2]
-        if known is not None:
-            linear[2 * k : 2 * k + 2] = pair * known.value / max(float(np.hypot(*pair)), 1e-300)
     prior_cost = 0.0
     if any(problem.unbalances):
-        for _ in range(8):
+        for _ in range(8):  # the right side of each step depends on the directions of the last unbalances, not on their sizes
             information, gradient, prior_cost = unbalance_prior(problem, linear)
             linear = linear + _solve(matrix + information, right - matrix @ linear + gradient)
         prior_cost = unbalance_prior(problem, linear)[2]

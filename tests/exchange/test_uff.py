@@ -47,6 +47,13 @@ def test_responses_go_through_pyuff_and_back(responses):
     assert read.nodes == {1: (0.0, 0.0, 0.0), 2: (1.0, 0.0, 0.0), 3: (2.0, 0.0, 0.0)}
 
 
+def test_default_frequencies_reach_above_all_modes(responses):
+    """2048 lines up to 1.5 times the highest natural frequency; the spacing has five digits."""
+    spacing = 1.5 * float(jv.natural_frequencies(scene("three_mass"))[-1]) / (2.0 * np.pi * 2048)
+    for each in jv.read_uff(responses).functions:
+        np.testing.assert_allclose(each.x, float(f"{spacing:.4e}") * np.arange(1, 2049), rtol=1e-5)
+
+
 def screen(*others):
     """A body in a plane with two unbalances of opposite directions, and two more at the place of the first."""
     supports = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.2, 1.2)]

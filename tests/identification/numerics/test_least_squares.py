@@ -233,6 +233,23 @@ def test_filters_are_computed_until_the_noise_is_steady(monkeypatch):
     assert passes == [False, False, True, True]
 
 
+def test_best_of_several_minima_is_kept(monkeypatch):
+    costs = {0.0: 3.0, 1.0: 1.0, 2.0: 2.0}
+
+    def minimize(problem, x):
+        return fit._Trial(x, LINEAR, costs[x[0]]), f"data {x[0]}", f"known {x[0]}", x[0] == 1.0
+
+    monkeypatch.setattr(fit, "minimize", minimize)
+    noise = [[Noise(np.ones(1), 1.0, 0.1, 5.0), Noise(np.ones(1), 2.0)]] * 2
+    found = fit._pass(problem_with(), noise, None, [np.array([k, 0.0]) for k in costs])
+    assert found.x.tolist() == [1.0, 0.0] and (found.information, found.prior, found.converged) == (
+        "data 1.0",
+        "known 1.0",
+        True,
+    )
+    assert [each.tolist() for each in found.outliers] == [[0.1, 0.0]] * 2
+
+
 def test_masked_readings_are_not_numbers_in_the_residuals():
     mask = np.ones((N, CHANNELS), bool)
     mask[5, 1] = False
