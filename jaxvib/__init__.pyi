@@ -12,7 +12,7 @@ from jaxvib.units.tables import csv_column
 # Machines
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
-from jaxvib.machine.mount import Mount
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.structures.matrices import from_matrices
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
@@ -111,7 +111,7 @@ from jaxvib.motion.growth import Growth, GrowthStatus, growth
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
-from jaxvib.motion.steps import Accuracy, EqualSteps, Tolerance
+from jaxvib.motion.plan import Accuracy, EqualSteps, Tolerance
 from jaxvib.study.maps.run_ups import run_ups
 
 # Accuracy and its cost

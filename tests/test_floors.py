@@ -142,7 +142,8 @@ PLANS = (
     "jaxvib.machine.validation",
     "jaxvib.steady.outcome",
     "jaxvib.motion.plan",
-    "jaxvib.steady.orbits.plan",
+    "jaxvib.steady.orbits.jam_orbit",
+    "jaxvib.steady.orbits.synchronous",
     "optimize.quantities.evaluation",
 )
 """Modules that may ask whether numbers have values, and those in them; constructors use `when_known`."""

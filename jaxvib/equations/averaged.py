@@ -61,10 +61,10 @@ from jax import Array
 from jaxvib.equations.linear import LinearModel, linear_model, require_circular, require_terms, turning_loads
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, within
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.terms import GravityField, LoadPotential, Term
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.linalg import eigenvalues_in_turn, magnitude, small_solve, times, unrolled_inverse
 

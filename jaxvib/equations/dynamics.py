@@ -25,9 +25,9 @@ from jaxvib.equations.exciter import (
 from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.sliding import ContactSolution
 from jaxvib.equations.state import State
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
-from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times

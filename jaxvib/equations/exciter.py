@@ -30,6 +30,7 @@ from jaxvib.equations.sliding import (
 )
 from jaxvib.equations.state import ExciterState, Spin
 from jaxvib.errors import InputError
+from jaxvib.machine.carrier import scaled
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
@@ -43,7 +44,6 @@ from jaxvib.machine.effects.terms import (
     SlipRelease,
 )
 from jaxvib.machine.loads import DrillingSpin, Loads
-from jaxvib.machine.mount import scaled
 from jaxvib.numerics.linalg import small_inverse
 
 Axes = dict[int, Array]

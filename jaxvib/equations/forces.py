@@ -17,6 +17,7 @@ from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.sliding import contact_force, dot, kinematics
 from jaxvib.equations.state import ExciterState, State
 from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.effects.base import Effect, terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
     ContactFriction,
@@ -27,7 +28,6 @@ from jaxvib.machine.effects.terms import (
     SupportForce,
 )
 from jaxvib.machine.loads import Loads
-from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.programs import cached

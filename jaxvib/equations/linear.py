@@ -15,11 +15,11 @@ from jaxvib.boundary import validated
 from jaxvib.equations.modal import ModalResponse, modal_response
 from jaxvib.equations.model import Model, assemble
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.drives.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadInteraction, LoadPotential, RotorImbalance, Term
 from jaxvib.machine.loads import CircularLoads, Loads
-from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import (
@@ -319,9 +319,7 @@ def peak_force(force: Array) -> Array:
 
 def circular_loads(scene: Scene) -> CircularLoads:
     """Return the loads of a scene, for an analysis that requires loads on a circle at one point of the machine."""
-    loads, mount = _turning_loads(scene, TURNING_TERMS)
-    _require_one_point(mount)
-    return loads
+    return turning_loads(scene, at_one_point=True)
 
 
 def jammed_loads(scene: Scene) -> CircularLoads:
@@ -329,9 +327,31 @@ def jammed_loads(scene: Scene) -> CircularLoads:
 
     Otherwise the requirements are those of `circular_loads`.
     """
-    loads, mount = _turning_loads(scene, JAM_TERMS)
-    _require_one_point(mount)
-    return loads
+    return turning_loads(scene, JAM_TERMS, at_one_point=True)
+
+
+def turning_loads(
+    scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS, *, at_one_point: bool = False
+) -> CircularLoads:
+    """Return the loads of a scene, for an analysis of loads on circles in a rotor of prescribed speed.
+
+    **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`, and names the property; for
+    effects with terms that are not `included`, and names these terms; with `at_one_point` also for loads at several stations.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
+    loads, drive, effects, mount = scene.loads, scene.drive, scene.all_effects, scene.mounting
+    at_stations = at_one_point and not mount.at_one_point
+    if mount.turn is not None:
+        problem = (
+            "rotates with the housing of its exciter, which this function does not include: use simulate, settle or ensemble"
+        )
+        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
+    require_circular(loads, drive)
+    require_terms(effects, included)
+    if at_stations:
+        raise _stations_differ()
+    return cast(CircularLoads, loads)
 
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
@@ -346,40 +366,15 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 def require_one_point(scene: Scene) -> None:
     """**Raises** `InputError` if the loads have different stations along the machine's axis."""
-    _require_one_point(scene.mounting)
+    if not scene.mounting.at_one_point:
+        raise _stations_differ()
 
 
-def _require_one_point(mount: Mount) -> None:
-    if not mount.at_one_point:
-        problem = (
-            "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, or simulate"
-        )
-        raise InputError("machine.stations", problem)
-
-
-def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS) -> CircularLoads:
-    """Return the loads of a scene, for an analysis of loads on circles in a rotor of prescribed speed.
-
-    **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`, and names the property; for
-    effects with terms that are not `included`, and names these terms.
-    """
-    return _turning_loads(scene, included)[0]
-
-
-def _turning_loads(scene: Scene, included: tuple[type[Term], ...]) -> tuple[CircularLoads, Mount]:
-    """Return the loads and the shapes of their mount, see `turning_loads`."""
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
-    loads, drive = scene.loads, scene.drive
-    mount = scene.mounting
-    if mount.turn is not None:
-        problem = (
-            "rotates with the housing of its exciter, which this function does not include: use simulate, settle or ensemble"
-        )
-        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}, which {problem}")
-    require_circular(loads, drive)
-    require_terms(scene.all_effects, included)
-    return cast(CircularLoads, loads), mount
+def _stations_differ() -> InputError:
+    problem = (
+        "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, or simulate"
+    )
+    return InputError("machine.stations", problem)
 
 
 def require_circular(loads: Loads, drive: Drive) -> None:

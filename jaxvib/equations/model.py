@@ -10,10 +10,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.state import State
-from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.carrier import Carrier, Mount
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import SupportForce
-from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 
 

@@ -25,11 +25,11 @@ from jax import Array
 
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
 from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive
 from jaxvib.machine.effects.base import has_term, terms_of, total_gravity
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
-from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics.linalg import small_solve, times
 from jaxvib.runtime.programs import cached

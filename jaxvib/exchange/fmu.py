@@ -30,7 +30,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.start import Start, initial_state, validate_state
+from jaxvib.motion.start import Start, start_state
 from jaxvib.motion.stiffness import fastest_decay
 from jaxvib.ode.scalarize import NotScalarizable, scalar_program
 from jaxvib.runtime.compat import HAS_JAXPRS
@@ -123,7 +123,7 @@ def export_fmu(
     if isinstance(start, str) and start == "spin_up":
         raise InputError("start", "is 'spin_up', which replaces the drive; give the scene a SpinUp drive and start at 'rest'")
     scene = validate_scene(scene)
-    state = validate_state(scene, start, mode) if isinstance(start, State) else initial_state(scene, start, mode=mode)
+    state = start_state(scene, start, mode)
     path = Path(path)
     path = path if path.suffix == ".fmu" else path.with_name(path.name + ".fmu")
     require_writable(path)

@@ -17,7 +17,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.linear import estimated_frequencies, linear_model
 from jaxvib.errors import InputError, open_regular, optional_module, quoted, require_one_of, require_writable, written
 from jaxvib.exchange.state_space import state_space
-from jaxvib.machine.mount import Place, on_body
+from jaxvib.machine.carrier import Place, on_body
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory

@@ -12,12 +12,11 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted, within
-from jaxvib.machine.carrier import Machine, shapes_of
+from jaxvib.machine.carrier import Machine, Mount, Place, on_body, read_place, shapes_of
 from jaxvib.machine.drives.drive import Clockwise, Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, GravityField, RotorImbalance, SlipRelease, SupportForce
 from jaxvib.machine.loads import Loads
-from jaxvib.machine.mount import Mount, Place, on_body, read_place
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import when_known

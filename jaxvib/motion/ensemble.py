@@ -25,8 +25,7 @@ from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import BATCH_SIZE, advance, pack_batch, stretches
 from jaxvib.motion.integrate import is_finite, wrap_angles
-from jaxvib.motion.plan import ENSEMBLE_PARTS, plan_ensemble
-from jaxvib.motion.steps import EqualSteps
+from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
 from jaxvib.motion.stiffness import is_unresolved
 from jaxvib.ode.types import Y
 from jaxvib.results.estimate import Share, estimate_share

@@ -18,11 +18,10 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, with_nearest_turns
 from jaxvib.motion.integrate import whole_turns, wrap_angles
-from jaxvib.motion.plan import plan_stretch, start_state, with_settled_drives
+from jaxvib.motion.plan import Tolerance, plan_stretch, with_settled_drives
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import last_state, run_planned, simulate
-from jaxvib.motion.start import Start
-from jaxvib.motion.steps import Tolerance
+from jaxvib.motion.start import Start, start_state
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure, member, status_name

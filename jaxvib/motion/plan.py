@@ -25,15 +25,14 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.integrate import MIN_SAMPLES_PER_TURN, IntegrationPlan, StepControl, frequency_bounds
-from jaxvib.motion.start import Start, initial_state, require_start, validate_state, with_spin, with_spin_up_drive
-from jaxvib.motion.steps import Accuracy, EqualSteps, StepChoice, Tolerance, require, validate_tolerance
+from jaxvib.motion.start import Start, initial_state, require_start, start_state, with_spin, with_spin_up_drive
 from jaxvib.motion.stiffness import equal_step_length, fastest_decay, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.devices import known as numpy_of_known
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import unknown_is_positive
-from jaxvib.units import Number, count, known_number
+from jaxvib.units import Number, count, known_number, require_real, validate_tolerance
 from jaxvib.units.known import is_known, when_known
 
 Control = StepControl | diffrax.AbstractStepSizeController
@@ -51,6 +50,80 @@ _IMPLICIT_STEPS_FACTOR = 16.0
 
 _STRETCH_TURNS = 2.0e4
 """Number of turns after which single precision no longer resolves time; longer runs are divided into stretches."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Steps whose error is at most `tolerance`, both relative and absolute in natural units.
+
+    Natural units are the unbalance radius S/M of the loads for displacements, S/M times the rotor speed for velocities, and
+    1 rad for angles. The error of an angle is only absolute.
+
+    **Arguments**: `tolerance`; typical: 1e-6 to 1e-10 in double precision, 1e-5 in single. For one hundredth of the tolerance,
+    the methods of order 8 need about 1.8 times as many steps.
+
+    **Raises** `InputError` for a value that is not a real number.
+
+    >>> import jaxvib as jv
+    >>> jv.Tolerance(1e-6)
+    Tolerance(tolerance=1e-06)
+    """
+
+    tolerance: float
+
+    def __post_init__(self) -> None:
+        require_real(self.tolerance, "", "tolerance")
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Steps with which the estimated error of the whole result is at most `error`; the run is repeated to find them.
+
+    **Arguments**: `error`, relative; typical: 1e-3 to 1e-8. An error of 1e-8 takes about twice the time of an error of 1e-4.
+
+    **Raises** `InputError` for a value that is not a real number.
+
+    >>> import jaxvib as jv
+    >>> jv.Accuracy(1e-4)
+    Accuracy(error=0.0001)
+    """
+
+    error: float
+
+    def __post_init__(self) -> None:
+        require_real(self.error, "", "error")
+
+
+@dataclass(frozen=True)
+class EqualSteps:
+    """A number of steps of equal length.
+
+    **Arguments**: `number` of steps; typical: 4 for each radian of the fastest motion, 25 for each turn. The computing time is
+    proportional to it.
+
+    **Raises** `InputError` for a value that is not a real number.
+
+    >>> import jaxvib as jv
+    >>> jv.EqualSteps(2000)
+    EqualSteps(number=2000)
+    """
+
+    number: int
+
+    def __post_init__(self) -> None:
+        require_real(self.number, "", "steps")
+
+
+StepChoice = Tolerance | Accuracy | EqualSteps | diffrax.AbstractStepSizeController
+"""Types of `stepsize_controller`."""
+
+
+def require(chosen: object, *kinds: type) -> None:
+    """**Raises** `InputError` for a choice of steps of another type."""
+    if chosen is not None and not isinstance(chosen, kinds):
+        names = {diffrax.AbstractStepSizeController: "a step size controller of diffrax"}
+        allowed = ", ".join(names.get(kind, f"{kind.__name__}(...)") for kind in kinds)
+        raise InputError("stepsize_controller", f"is {quoted(chosen)}; it must be one of: {allowed}")
 
 
 @dataclass(frozen=True)
@@ -104,21 +177,22 @@ def plan_run(
     end = known_number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
-    if samples is None:
-        samples = _enough_samples(given_scene, end)
-    else:
-        samples = count(samples, "samples", low=2, each=_sample_size(given_scene))
-    periods = np.asarray(count(turns, "turns"), end.dtype)
-    control = _step_control(end, steps, estimate)
+    speed = given_scene.top_speed
     scene = with_spin_up_drive(given_scene, end, start, spin_up)
     state = start_state(scene, start, mode, separation, throw=throw)
 
     known = is_known(scene, end, state)
+    fastest, slowest = map(numpy_of_known, frequency_bounds(scene))
+    stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
+    control = _step_control(end, steps, estimate)
+    if samples is None:
+        samples = _enough_samples(speed, end)
+    else:
+        samples = count(samples, "samples", low=2, each=_sample_size(given_scene))
+    periods = np.asarray(count(turns, "turns"), end.dtype)
     is_estimated = isinstance(control, StepControl) and (known if estimate is None else estimate)
     if isinstance(steps, Accuracy) and not known:
         raise InputError("accuracy", "repeats the run and cannot be used inside jit, grad or vmap; use Tolerance(...)")
-    fastest, slowest = map(numpy_of_known, frequency_bounds(scene))
-    stiff = stiff_solver(scene, state, fastest) if solver is None and known else None
     if max_steps is None:
         max_steps = enough_steps((1.0 if stiff is None else _IMPLICIT_STEPS_FACTOR) * fastest, end)
     if (solver := stiff if solver is None else solver) is None and not known and end.dtype.itemsize >= 8:
@@ -160,15 +234,6 @@ def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *
     )  # fmt: skip
 
 
-def start_state(
-    scene: Scene, start: Start | State, mode: int | None, separation: Number | None, *, throw: bool = True
-) -> State:
-    """Return the state of a start by name, or a user's state, validated. **Raises** `InputError`."""
-    if isinstance(start, State):
-        return validate_state(scene, start, mode, separation)
-    return initial_state(scene, start, mode=mode, separation=separation, throw=throw)
-
-
 def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
     """Return a maximum number of steps: 500 for each turn of the `fastest` motion, rad/s, rounded up to a power of 2.
 
@@ -187,8 +252,8 @@ def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
     return _UNKNOWN_STEPS if steps is None else steps
 
 
-def _enough_samples(scene: Scene, end: Array) -> int:
-    """Return a number of samples that is large enough to show the vibration in a figure without aliasing.
+def _enough_samples(speed: Array, end: Array) -> int:
+    """Return a number of samples that shows the vibration at a rotor `speed`, rad/s, in a figure without aliasing.
 
     The number has one of two values, so that few programs are compiled.
     """
@@ -196,7 +261,7 @@ def _enough_samples(scene: Scene, end: Array) -> int:
     def samples_of(end: float, speed: float) -> int:
         return _FEW_SAMPLES if MIN_SAMPLES_PER_TURN * end * speed / (2.0 * math.pi) <= _FEW_SAMPLES else _MANY_SAMPLES
 
-    samples = when_known(samples_of, end, scene.top_speed)
+    samples = when_known(samples_of, end, speed)
     return _UNKNOWN_SAMPLES if samples is None else samples
 
 
@@ -223,10 +288,10 @@ def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) 
     if isinstance(chosen, Accuracy):
         if estimate is False:
             raise InputError("estimate", "is False together with accuracy, which needs error estimates; give a Tolerance")
-        accuracy = validate_tolerance(chosen.error, "accuracy", end, 1e3)
+        accuracy = validate_tolerance(chosen.error, "accuracy", end.dtype, 1e3)
         return StepControl(tolerance=np.asarray(max(1e-2 * accuracy, 10.0 * precision), end.dtype))
     default = 1e-8 if precision < 1e-10 else 1e-5
-    tolerance = default if chosen is None else validate_tolerance(chosen.tolerance, "tolerance", end, 10.0)
+    tolerance = default if chosen is None else validate_tolerance(chosen.tolerance, "tolerance", end.dtype, 10.0)
     return StepControl(tolerance=np.asarray(tolerance, end.dtype))
 
 

@@ -18,7 +18,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.forces import normal_force
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.mount import on_body, read_place
+from jaxvib.machine.carrier import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory

@@ -19,11 +19,10 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.analysis.separation import prepare_separation
 from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turns
-from jaxvib.motion.plan import RunPlan, plan_stretch, start_state, with_settled_drives
+from jaxvib.motion.plan import RunPlan, StepChoice, Tolerance, plan_stretch, with_settled_drives
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.simulate import last_state, prepare_run, run_planned
-from jaxvib.motion.start import START_SEPARATION, Start, initial_state
-from jaxvib.motion.steps import StepChoice, Tolerance
+from jaxvib.motion.start import START_SEPARATION, Start, initial_state, start_state
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached

@@ -21,10 +21,9 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, with_nearest_turns
 from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate, whole_turns, wrap_angles
-from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, plan_run
+from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, StepChoice, plan_run
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.start import Start
-from jaxvib.motion.steps import StepChoice
 from jaxvib.motion.stiffness import advice
 from jaxvib.results.status import status_name
 from jaxvib.runtime.devices import known, on_device

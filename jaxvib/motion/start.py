@@ -217,6 +217,15 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
     return ExciterState(state.angle, state.rate, state.rotor, spin)
 
 
+def start_state(
+    scene: Scene, start: Start | State, mode: int | None, separation: Number | None = None, *, throw: bool = True
+) -> State:
+    """Return the state of a start by name, or a user's state, validated. **Raises** `InputError`."""
+    if isinstance(start, State):
+        return _validate_state(scene, start, mode, separation)
+    return initial_state(scene, start, mode=mode, separation=separation, throw=throw)
+
+
 def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
     """Return the scene; for the start "spin_up", with drives whose speed rises during the time `spin_up`, s (default: `end`/2).
 
@@ -237,7 +246,7 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
     return eqx.tree_at(lambda s: [exciter.drive for exciter in s.exciters], scene, drives)
 
 
-def validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None = None) -> State:
+def _validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None) -> State:
     """Return a user's initial state, converted to the precision of JAX and completed by `with_spin`.
 
     **Raises** `InputError` if its shapes do not fit the scene, or if a `mode` or `separation` is given together with it.

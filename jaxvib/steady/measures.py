@@ -17,9 +17,9 @@ from jaxvib.display import quantity_text
 from jaxvib.equations.coincident import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.carrier import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
-from jaxvib.machine.mount import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import Platforms
 from jaxvib.machine.validation import validate_scene

@@ -20,7 +20,7 @@ from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import enumeration_of
-from jaxvib.units.known import is_known, when_known
+from jaxvib.units.known import is_known
 
 REFUSED = "a traced parameter has a value that is not allowed: call the function outside of jit, grad and vmap to see which one"
 """Message of the status `refused`."""
@@ -48,17 +48,13 @@ def outcome(
 
     **Raises** `ComputationError`.
     """
-
-    def check(_: eqx.Enumeration) -> None:
-        if (name := status_name(result.status)) in failures:
-            raise failure(result.status, hint(name))
-
-    if throw:
-        when_known(check, result.status)
-    conditions = (None if scene is None else allowed_unknowns(scene), unknown_is_positive(end))
-    if not (unknown := [each for each in conditions if each is not None]):
+    is_positive = unknown_is_positive(end)
+    if throw and is_known(result.status) and (name := status_name(result.status)) in failures:
+        raise failure(result.status, hint(name))
+    allowed = None if scene is None else allowed_unknowns(scene)
+    if allowed is None and is_positive is None:
         return result
-    allowed = functools.reduce(jnp.logical_and, unknown)
+    allowed = functools.reduce(jnp.logical_and, [each for each in (allowed, is_positive) if each is not None])
     refused = enumeration_of(result.status).refused  # pyright: ignore[reportAttributeAccessIssue]
     status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), result.status, refused)
     return eqx.tree_at(lambda result: result.status, without_numbers(allowed, result), status)

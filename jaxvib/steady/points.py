@@ -19,8 +19,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, quantity_text
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.carrier import Machine
-from jaxvib.machine.mount import Place, on_body, read_place
+from jaxvib.machine.carrier import Machine, Place, on_body, read_place
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.results.fields import in_unit, is_single, part
 from jaxvib.results.result import Result

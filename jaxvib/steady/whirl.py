@@ -14,7 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, SpeedUnit, speed_text, speed_unit
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError, quoted, require_one_of
-from jaxvib.machine.mount import Mount
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import MAX_EIGENVALUE_ERROR, hermitian_error, hermitian_modes, relative_to

@@ -36,6 +36,7 @@ __all__ = [
     "to_float",
     "traced",
     "unit_ratio",
+    "validate_tolerance",
 ]
 
 
@@ -258,3 +259,21 @@ def random_numbers(seed: object) -> np.random.Generator:
     jaxvib.errors.InputError: seed is -1; it must be a whole number, at least 0
     """
     return np.random.default_rng(count(seed, "seed", low=0))
+
+
+def validate_tolerance(value: float, name: str, dtype: np.dtype, least: float) -> float:
+    """Return a tolerance or an accuracy; it must be at least `least` times the rounding unit of the precision `dtype`.
+
+    **Raises** `InputError` for other values.
+    """
+    precision = float(jnp.finfo(dtype).eps)
+    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (plain and least * precision <= value < 1.0):
+        # 5 % more, so that the value in the message, rounded to two digits, is allowed.
+        raise InputError(
+            name,
+            f"is {quoted(value)}; in {dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"
+            + ("" if plain else ", a Python number such as 1e-6")
+            + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
+        )
+    return value

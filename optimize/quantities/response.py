@@ -19,7 +19,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import speed_text
 from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.mount import Place, on_body
+from jaxvib.machine.carrier import Place, on_body
 from jaxvib.steady.points import ellipse_at, rows_in_plane
 from jaxvib.steady.response import motion_at, operation_of, require_unbalances
 from jaxvib.units import Number, count

@@ -47,7 +47,7 @@ def terms_of(effects: Iterable[Effect], *kinds: type[T]) -> list[T]:
 
 def has_term(effects: Iterable[Effect], *kinds: type[Term]) -> bool:
     """True if an effect adds a term of one of these `kinds`."""
-    return any(isinstance(term, kinds) for effect in effects for term in effect.terms())
+    return bool(terms_of(effects, *kinds))
 
 
 def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:

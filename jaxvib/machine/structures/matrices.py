@@ -12,8 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import is_real
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.mount import Mount, Place
+from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import unit
 from jaxvib.units import count
 from jaxvib.units.known import when_known

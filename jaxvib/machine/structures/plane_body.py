@@ -12,8 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.mount import BodyPoint, Mount, Place
+from jaxvib.machine.carrier import BodyPoint, Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.machine.structures.damping import damping_constants
 from jaxvib.units import Number, count

@@ -13,8 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.mount import Mount, Place
+from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.machine.structures.damping import damping_constants
 from jaxvib.units import Number, Numbers

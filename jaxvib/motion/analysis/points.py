@@ -15,10 +15,9 @@ from jaxvib.equations.forces import drive_torques
 from jaxvib.equations.linear import linear_model, peak_force
 from jaxvib.equations.model import assemble
 from jaxvib.equations.torque_balance import resultant_of
-from jaxvib.machine.carrier import Machine
+from jaxvib.machine.carrier import Machine, Place
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
-from jaxvib.machine.mount import Place
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory, turning_angles, turning_directions
 from jaxvib.results.fields import in_unit

@@ -11,9 +11,9 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.machine.carrier import scaled
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
-from jaxvib.machine.mount import scaled
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory, mean_speeds

@@ -40,9 +40,9 @@ from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
+from jaxvib.motion.plan import Tolerance, require
 from jaxvib.motion.run import SETTLED_DRIFT
-from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
-from jaxvib.motion.steps import Tolerance, require, validate_tolerance
+from jaxvib.motion.start import Start, initial_state, start_state, with_spin_up_drive
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import Decision, WrappedController, step_success
 from jaxvib.ode.replay import solve
@@ -56,7 +56,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.monodromy import at_constant_speed
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.outcome import outcome
-from jaxvib.units import Number, count, number
+from jaxvib.units import Number, count, number, validate_tolerance
 from jaxvib.units.known import when_known
 
 _WINDOW_SAMPLES = 512
@@ -207,18 +207,15 @@ def envelope(
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if isinstance(chosen, Tolerance):
-        chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
+        chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end.dtype, 10.0), end.dtype)
     given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     choices = solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     if isinstance(start, str) and start == "jam" and scene.is_plain and not jams_of.is_ready(scene):
         rest = initial_state(scene)
         in_background(partial(_run.prepare, scene, end, rest, *choices), partial(_prepare_growth, scene, rest))
-    if isinstance(start, State):
-        state = validate_state(scene, start, mode, separation)
-    else:
-        # The state of rest exists for every scene; therefore it is computed in the compiled run, which takes less time.
-        known = start in ("rest", "spin_up") and mode is None and separation is None
-        state = None if known else initial_state(scene, start, mode=mode, separation=separation, throw=throw)
+    # The state of rest exists for every scene; therefore it is computed in the compiled run, which takes less time.
+    is_rest = isinstance(start, str) and start in ("rest", "spin_up") and mode is None and separation is None
+    state = None if is_rest else start_state(scene, start, mode, separation, throw=throw)
     run = _run(scene, end, state, *choices)
     run = outcome(
         run, given_scene, end, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps)

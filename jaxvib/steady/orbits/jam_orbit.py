@@ -1,11 +1,15 @@
-"""Exact jams of a mode, of a load speed, or near a load speed."""
+"""Exact jams of a mode, of a load speed, or near a load speed.
+
+Choices that depend on parameters of a scene are made on the host (`plan_orbit`), before a program is traced. Under a JAX
+transformation the number of collocation points is fixed.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,27 +19,35 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.coincident import coincident_model
-from jaxvib.equations.linear import jammed_model
+from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
+from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import has_half_turn_symmetry
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.runtime.devices import known, numpy_of, on_device
 from jaxvib.runtime.parallel import in_background
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, differentiable_fields, orbits
-from jaxvib.steady.orbits.plan import OrbitPlan, plan_orbit
 from jaxvib.steady.orbits.search import exact_mode_speeds
 from jaxvib.steady.orbits.solve import Parameter, periodic_motion
-from jaxvib.steady.orbits.stability import steps_for
+from jaxvib.steady.orbits.stability import is_stiff, steps_for
 from jaxvib.steady.outcome import outcome
-from jaxvib.units import Number
+from jaxvib.units import Number, count, number, validate_tolerance
+from jaxvib.units.known import is_known
 
 _MAX_SPEED_DIFFERENCE = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
 _UNKNOWN_STEPS = 64
 """Number of integration steps for the multipliers under a JAX transformation; reverse derivatives need a static number."""
+
+_COLLOCATION_POINTS = (16, 32, 64, 128)
+"""Collocation points on half a period, tried one after the other until the accuracy is reached."""
+
+_BYTES_PER_POINT = 16.0
 
 
 @validated
@@ -99,27 +111,125 @@ def jam_orbit(
     scene = validate_scene(scene)
     if mode is not None and not jams_of.is_ready(scene):
         rough = plan_orbit(scene, mode=None, omega=None, near=scene.drive.speed, accuracy=accuracy, points=points)
-        rough = dataclasses.replace(rough, direction=np.ones_like(rough.value))
-        in_background(partial(_solve_program.prepare, *_arguments(rough, rough.points[0])))
+        problem = rough.problem._replace(direction=np.ones_like(rough.problem.value))
+        in_background(partial(_solve_program.prepare, problem, rough.points[0], None))
     plan = plan_orbit(scene, mode=mode, omega=omega, near=near, accuracy=accuracy, points=points)
     if not plan.is_known:
-        return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
+        return outcome(_solve_program(plan.problem, plan.points[0], _UNKNOWN_STEPS), scene)
     orbit = _solve_accurately(plan)
-    if plan.mode is not None and not abs(float(orbit.omega) / float(plan.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
+    if plan.mode is not None and not abs(float(orbit.omega) / float(plan.problem.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
         # The mode does not exist in leading order, or is far from it: search the whole exact branch.
         orbit = _solve_accurately(_from_search(plan, plan.mode))
     return outcome(orbit, throw=throw, failures=("absent", "not_converged"))
+
+
+class JamProblem(NamedTuple):
+    """Problem whose solution is one exact jam.
+
+    **Attributes**: the `scene`; `given`: the name of the prescribed speed; its `value`, and the `start` of the other speed,
+    rad/s; `exists`: true if the mode exists in leading order; `direction`: the sign of dn/dOmega that the mode needs, or None;
+    relative `accuracy`; `implicit`: true for implicit integration of the multipliers; `is_settled_first`: true if Newton's
+    method starts from the motion at the load speed `start`, for a start near the solution.
+    """
+
+    scene: Scene
+    given: Parameter
+    value: Array
+    start: Array
+    exists: Array
+    direction: Array | np.ndarray | None
+    accuracy: float
+    implicit: bool
+    is_settled_first: bool = False
+
+
+class OrbitPlan(NamedTuple):
+    """Plan of an exact jam.
+
+    **Attributes**: the `problem`; `mode`: its number, or None; `points`: numbers of collocation points to try one after the
+    other; `is_known`: true if no parameter is traced.
+    """
+
+    problem: JamProblem
+    mode: int | None
+    points: tuple[int, ...]
+    is_known: bool
+
+
+def plan_orbit(
+    scene: Scene, *, mode: int | None, omega: Number | None, near: Number | None, accuracy: float | None, points: int | None
+) -> OrbitPlan:
+    """Validate the other arguments of `jam_orbit`, and choose start, points and method. **Raises** `InputError`."""
+    named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
+    if len(named) != 1:
+        given = " and ".join(named) if named else "none"
+        raise InputError("jam_orbit", f"was called with {given}; give exactly one of mode, omega and near, for example mode=3")
+    all_known = is_known(scene, omega, near)
+    # Starts have no derivatives. A known scene stays the same object, because it is validated already.
+    frozen = scene if all_known else jax.tree.map(lambda x: x if is_known(x) else jax.lax.stop_gradient(x), scene)
+    loads = jammed_loads(frozen)
+    require_drag(loads)
+    dtype = scene.drive.speed.dtype
+    if accuracy is None:
+        accuracy = 1e-9 if dtype.itemsize >= 8 else 1e-3
+    accuracy = validate_tolerance(accuracy, "accuracy", dtype, 1e3)
+    if points is None:
+        # The points lie on half a period if the motion has the half-turn symmetry, otherwise on a period.
+        half = has_half_turn_symmetry(scene.all_effects)
+        tried = _COLLOCATION_POINTS if half else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
+        tried = tried if all_known else tried[:1]
+    else:
+        size = _BYTES_PER_POINT * (1 if loads.alike else loads.count) ** 2 * float(points if isinstance(points, int) else 1)
+        tried = (count(points, "points", low=2, each=size),)
+
+    exists, direction, start = on_device(np.asarray(True)), None, frozen.drive.speed
+    which: Parameter = "rotor_speed"
+    value = scene.drive.speed
+    if mode is not None:
+        exists, direction, start = _mode_start(frozen, mode)
+    elif near is not None:
+        start = number(near, "rad/s", "near", low=0.0, open_low=True)
+    elif omega is not None:
+        value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
+        which, start = "omega", _light_rotor_speed(frozen, jax.lax.stop_gradient(value))
+    speeds = (value, start) if which == "omega" else (start, value)
+    # Traced parameters may include a strong drag.
+    implicit = bool(_is_stiff(frozen, *speeds)) if all_known else True
+    problem = JamProblem(scene, which, value, start, exists, direction, accuracy, implicit)
+    return OrbitPlan(problem, None if mode is None else int(mode), tried, all_known)
+
+
+def _mode_start(scene: Scene, mode: int) -> tuple[Array, Array, Array]:
+    """Return True if the jam mode exists in leading order, the sign of dn/dOmega there, and its load speed, rad/s."""
+    if scene.mounting.gyroscopic is not None:
+        raise InputError("mode", "is not defined for a machine whose resonances depend on the rotor speed; give omega or near")
+    jams = jams_of(scene)
+    light, speed = known(jams.omega)[jams.row(mode)], known(scene.drive.speed)
+    direction = on_device(np.asarray(1.0 if mode % 2 == 1 else -1.0, speed.dtype))
+    xp = numpy_of((light, speed))
+    exists = on_device(xp.asarray(xp.isfinite(light)))
+    return exists, direction, on_device(xp.asarray(xp.where(xp.isfinite(light), light, speed)))
+
+
+@cached
+def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
+    return light_rotor_speed(jammed_model(scene), omega)
+
+
+@cached
+def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
+    return is_stiff(coincident_model(jammed_model(scene)), omega, speed)
 
 
 def _solve_accurately(plan: OrbitPlan) -> Orbit:
     """Return the first orbit that is accurate enough, or the best one, because more points only add rounding near a fold."""
     best, least = None, math.inf
     for points in plan.points:
-        orbit = _solve(plan, points)
+        orbit = _solve_program(plan.problem, points, None)
         error = float(orbit.error)
         if best is None or error < least:
             best, least = orbit, error
-        if not error > plan.accuracy:  # NaN if there is no motion
+        if not error > plan.problem.accuracy:  # NaN if there is no motion
             break
     assert best is not None
     return best
@@ -127,68 +237,27 @@ def _solve_accurately(plan: OrbitPlan) -> Orbit:
 
 def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
     """Return the plan that starts from the mode in a search of the whole branch."""
-    found = exact_mode_speeds(plan.scene).get(mode)
-    start = plan.start if found is None else jnp.asarray(found, dtype=plan.start.dtype)
-    return dataclasses.replace(plan, exists=jnp.asarray(found is not None), start=start, is_settled_first=True)
-
-
-def _solve(plan: OrbitPlan, points: int, steps: int | None = None) -> Orbit:
-    return _solve_program(*_arguments(plan, points, steps))
-
-
-def _arguments(plan: OrbitPlan, points: int, steps: int | None = None) -> tuple[Any, ...]:
-    return (
-        plan.scene,
-        plan.value,
-        plan.start,
-        plan.exists,
-        plan.direction,
-        plan.given,
-        points,
-        steps,
-        plan.accuracy,
-        plan.implicit,
-        plan.is_settled_first,
+    found, start = exact_mode_speeds(plan.problem.scene).get(mode), plan.problem.start
+    start = start if found is None else jnp.asarray(found, dtype=start.dtype)
+    return plan._replace(
+        problem=plan.problem._replace(exists=jnp.asarray(found is not None), start=start, is_settled_first=True)
     )
 
 
-def _outputs(
-    orbit: Orbit,
-    scene: Scene,
-    value: Array,
-    start: Array,
-    exists: Array,
-    direction: Array | None,
-    given: Parameter,
-    points: int,
-    *_: object,
-) -> Orbit:
+def _outputs(orbit: Orbit, problem: JamProblem, points: int, steps: int | None) -> Orbit:
     """Return the outputs that follow from the solved motion, without multipliers and errors."""
-    empty = jax.tree.map(lambda _: None, orbit)
-    return dataclasses.replace(
-        empty, **differentiable_fields(coincident_model(jammed_model(scene)), orbit, value, start, given, points)
-    )
+    model = coincident_model(jammed_model(problem.scene))
+    fields = differentiable_fields(model, orbit, problem.value, problem.start, problem.given, points)
+    return dataclasses.replace(jax.tree.map(lambda _: None, orbit), **fields)
 
 
 @cached(outputs_from_solution=_outputs)
-def _solve_program(
-    scene: Scene,
-    value: Array,
-    start: Array,
-    exists: Array,
-    direction: Array | None,
-    given: Parameter,
-    points: int,
-    steps: int | None,
-    accuracy: float,
-    implicit: bool,
-    settle: bool = False,
-) -> Orbit:
+def _solve_program(problem: JamProblem, points: int, steps: int | None) -> Orbit:
     """Solve for one exact jam.
 
-    **Arguments**: `steps` of the `implicit` or explicit method for the multipliers (default: as many as the speeds need,
-    without reverse derivatives); `settle`: start from the motion at the load speed `start`, for a start near the solution.
+    **Arguments**: `steps` of the method for the multipliers (default: as many as the speeds need, without reverse derivatives).
     """
+    scene, given, value, start, exists, direction, accuracy, implicit, settle = problem
     model, deviation = coincident_model(jammed_model(scene)), None
     if settle:
         grid = grid_of(points, model.half_turn)

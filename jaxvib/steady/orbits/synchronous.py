@@ -1,9 +1,12 @@
-"""Exact synchronous motions: every exciter turns once in a period of the machine's motion."""
+"""Exact synchronous motions: every exciter turns once in a period of the machine's motion.
+
+Choices that depend on parameters of a scene are made on the host (`plan_synchronous`), before a program is traced.
+"""
 
 from __future__ import annotations
 
 import itertools
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -14,15 +17,20 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, quantity_text, speed_text
 from jaxvib.equations.forces import drive_torques
+from jaxvib.equations.linear import require_terms
 from jaxvib.equations.state import State
-from jaxvib.machine.scene import Scene
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.drives.drive import SwitchedOff
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import ContactFriction, GravityField, LoadPotential, RotorImbalance, SupportForce
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.orbits.describe import half_range, judgement_of, plot_period
-from jaxvib.steady.orbits.plan import SynchronousPlan, plan_synchronous
 from jaxvib.steady.orbits.whole import (
     PeriodicScene,
     WholeMotion,
@@ -36,7 +44,8 @@ from jaxvib.steady.orbits.whole import (
 )
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.points import Harmonic, PathsOfPoints
-from jaxvib.units import Number, Numbers, known_number
+from jaxvib.units import Number, Numbers, count, known_number, number, numbers, validate_tolerance
+from jaxvib.units.known import is_known
 
 __all__ = ["HasSpeedAndPhases", "SynchronousOrbit", "SynchronousStatus", "synchronous_orbit"]
 
@@ -46,6 +55,13 @@ _UNKNOWN_STEPS = 64
 _STABLE_MARGIN = 1e3
 """Distance of the largest multiplier from 1, in units of rounding, below which a disturbance counts as neither growing nor
 decaying."""
+
+
+_SYNCHRONOUS_POINTS = (17, 33, 65, 129)
+"""Collocation points on a period, tried one after the other until the accuracy is reached."""
+
+_SYNCHRONOUS_TERMS = (GravityField, LoadPotential, RotorImbalance, ContactFriction, SupportForce)
+"""Terms that exact synchronous motions include."""
 
 
 class SynchronousStatus(eqx.Enumeration):
@@ -229,14 +245,103 @@ def synchronous_orbit(
     if not plan.is_known:
         return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
     orbit = None
-    for count in plan.points:
-        new = _solve(plan, count)
+    for points in plan.points:
+        new = _solve(plan, points)
         if orbit is None or float(new.error) < float(orbit.error):
             orbit = new
         if not float(new.error) > plan.accuracy:  # NaN if there is no motion
             break
     assert orbit is not None
     return outcome(orbit, throw=throw, failures=("not_converged", "different_speeds"))
+
+
+class SynchronousPlan(NamedTuple):
+    """Plan of an exact synchronous motion.
+
+    **Attributes**: the `scene` with its drives in their final state; starts of `speed`, rad/s, and `phases` (N,), rad; numbers
+    of collocation `points` to try one after the other; relative `accuracy`; `is_known`: True if no parameter is traced.
+    """
+
+    scene: Scene
+    speed: Array
+    phases: Array
+    points: tuple[int, ...]
+    accuracy: float
+    is_known: bool
+
+
+def plan_synchronous(
+    scene: Scene,
+    regime: HasSpeedAndPhases | None,
+    *,
+    speed: Number | None,
+    phases: Numbers | None,
+    accuracy: float | None,
+    points: int | None,
+) -> SynchronousPlan:
+    """Validate the arguments of `synchronous_orbit`, and choose start and points. **Raises** `InputError`."""
+    if regime is not None and (speed is not None or phases is not None):
+        raise InputError("regime", "is given together with speed or phases; leave one of them out")
+    if regime is not None:
+        speed, phases = regime.speed, regime.phases
+    scene = validate_scene(scene)
+    require_terms(scene.all_effects, _SYNCHRONOUS_TERMS, "is|are not part of a synchronous motion")
+    for k, exciter in enumerate(scene.exciters):
+        _require_one_body(exciter, scene.prefix_of(k))
+        scene = eqx.tree_at(lambda s, k=k: s.exciters[k].drive, scene, exciter.drive.settled())
+    shaken = [e for e in scene.exciters if e.drive.ideal and e.loads is None]
+    motors = [e.drive.speed for e in scene.exciters if not e.drive.ideal and not isinstance(e.drive, SwitchedOff)]
+    if shaken:
+        start = shaken[0].drive.speed
+    elif speed is not None:
+        start = number(speed, "rad/s", "speed", low=0.0, open_low=True)
+    elif motors:
+        start = jnp.mean(jnp.stack(motors))
+    else:
+        raise InputError("speed", "is missing; give the speed near which the loads turn, rad/s, for example speed=95.0")
+    count_of = len(scene.exciters)
+    angles = jnp.zeros(count_of, start.dtype) if phases is None else numbers(phases, "rad", "phases", count_of)
+    all_known = is_known(scene, start, angles)
+    if accuracy is None:
+        accuracy = 1e-8 if start.dtype.itemsize >= 8 else 1e-3
+    tried = _SYNCHRONOUS_POINTS if all_known else _SYNCHRONOUS_POINTS[1:2]
+    return SynchronousPlan(
+        scene=scene,
+        speed=start,
+        phases=angles,
+        points=tried if points is None else (count(points, "points", low=3, each=256.0),),
+        accuracy=validate_tolerance(accuracy, "accuracy", start.dtype, 1e3),
+        is_known=all_known,
+    )
+
+
+def _require_one_body(exciter: Exciter, place: str) -> None:
+    """**Raises** `InputError` for an exciter whose bodies have no common speed."""
+    loads, drive = exciter.loads, exciter.drive
+    if drive.state_units():
+        problem = (
+            "whose states, such as currents, this function does not include; use a motor with a steady torque, or simulate"
+        )
+        raise InputError(f"{place}drive", f"is {quoted(drive.kind)}, {problem}")
+    if loads is None:
+        return
+    if exciter.unbalance is not None or has_term(exciter.effects, RotorImbalance):
+        problem = (
+            "do not turn at the speed of the rotor's unbalance, so that no motion repeats; leave one of them out, or simulate"
+        )
+        raise InputError(f"{place}loads", problem)
+    if not drive.ideal:
+        raise InputError(
+            f"{place}drive", f"is {quoted(drive.kind)}; loads need a drive of prescribed speed here, use ConstantSpeed"
+        )
+    if not loads.circular:
+        raise InputError(
+            f"{place}loads.kind", f"is {quoted(loads.kind)}; this function needs loads on a circle; use simulate for others"
+        )
+    if getattr(loads, "ball_radius", None) is not None and loads.count > 1:
+        raise InputError(
+            f"{place}loads.ball_radius", "is given, but this function places the loads at one angle; leave it out, or simulate"
+        )
 
 
 def _solve(plan: SynchronousPlan, points: int, steps: int | None = None) -> SynchronousOrbit:

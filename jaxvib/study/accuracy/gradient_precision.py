@@ -15,9 +15,8 @@ from jax import Array
 
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.plan import enough_steps
+from jaxvib.motion.plan import Tolerance, enough_steps
 from jaxvib.motion.simulate import simulate
-from jaxvib.motion.steps import Tolerance
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import Cost, relative, row_of

@@ -21,11 +21,10 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, with_nearest_turns
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.plan import enough_steps
+from jaxvib.motion.plan import Tolerance, enough_steps
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
-from jaxvib.motion.steps import Tolerance
 from jaxvib.results.result import Result
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit

@@ -11,11 +11,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.carrier import Carrier, Machine, Mount, Place
 from jaxvib.machine.drives.drive import ConstantSpeed, SpinUp
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.files import EFFECTS
-from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.scene import Scene
 
 _DROOP = 0.015

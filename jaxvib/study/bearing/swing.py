@@ -17,7 +17,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.friction import dry_lever
-from jaxvib.motion.steps import Tolerance, require
+from jaxvib.motion.plan import Tolerance, require
 from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result

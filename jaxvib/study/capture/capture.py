@@ -23,9 +23,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import require_torus_balls
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.ensemble import Equations, ensemble
+from jaxvib.motion.plan import EqualSteps
 from jaxvib.motion.run import Run
 from jaxvib.motion.start import Rotation, with_spin
-from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second

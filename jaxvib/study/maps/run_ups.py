@@ -22,10 +22,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import REGIMES, Regime
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.plan import enough_steps
+from jaxvib.motion.plan import StepChoice, Tolerance, enough_steps
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state, require_start
-from jaxvib.motion.steps import StepChoice, Tolerance
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed

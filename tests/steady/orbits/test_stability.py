@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 
 import jaxvib as jv
 from jaxvib.steady.orbits.diagram import SpecialPoint
-from jaxvib.steady.orbits.plan import _is_stiff
+from jaxvib.steady.orbits.jam_orbit import _is_stiff
 from jaxvib.steady.orbits.stability import _small_solve, deflate
 from jaxvib.study.maps.stability_onset import StabilityMap, stability_onset
 

@@ -18,7 +18,7 @@ from jaxvib.machine.effects.supports import Stop
 from jaxvib.machine.loads import balls, pendulums
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import one_mass
-from jaxvib.motion.steps import Tolerance
+from jaxvib.motion.plan import Tolerance
 
 __all__ = ["CASES", "stop_law"]
 

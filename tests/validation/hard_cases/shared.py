@@ -16,9 +16,9 @@ from hard_cases.reference_integration import Outcome, run_out
 from hard_cases.reference_model import light_modes, light_speed, platforms, reference_model
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.plan import StepChoice
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
-from jaxvib.motion.steps import StepChoice
 from jaxvib.results.status import status_name, status_names
 from jaxvib.steady.jams.jam import jam_modes
 

@@ -19,7 +19,7 @@ from jaxvib.machine.effects.spin import FreeSpin
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import require_torus_balls
 from jaxvib.motion.ensemble import Equations, ensemble
-from jaxvib.motion.steps import EqualSteps
+from jaxvib.motion.plan import EqualSteps
 from jaxvib.study.capture.capture import MAX_CAPTURED_SLIP, moving_state
 from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
 from papers.machines import TORUS_SPEED, published_torus
