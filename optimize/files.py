@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import Tables, build_part, load_scene, misplaced_name, read_toml, suggest_name
+from jaxvib.machine.files import Tables, Templates, build_part, load_scene, misplaced_name, read_toml, suggest_name
 from jaxvib.machine.numbers.named import find_number
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.startup import start
@@ -63,9 +63,9 @@ def load_design(path: str | Path) -> Design:
 
     >>> import pathlib, tempfile
     >>> from jaxvib.machine.files import TEMPLATES
-    >>> from optimize.files import TEMPLATE, load_design
+    >>> from optimize.files import TEMPLATES as DESIGNS, load_design
     >>> folder = pathlib.Path(tempfile.mkdtemp())
-    >>> for name, text in (("machine.toml", TEMPLATES["two_mass"]), ("design.toml", TEMPLATE)):
+    >>> for name, text in (("machine.toml", TEMPLATES["two_mass"]), ("design.toml", DESIGNS["design"])):
     ...     _ = (folder / name).write_text(text)
     >>> load_design(folder / "design.toml").objective.name
     'force_per_amplitude'
@@ -202,13 +202,7 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     return quantity, {k: table[k] for k in more if k in table}
 
 
-_FOLDER = Path(__file__).with_name("templates")
+_NAMES = ("design", "linear-screen-design", "circular-screen-design", "feeder-design")
 
-TEMPLATE = (_FOLDER / "design.toml").read_text(encoding="utf-8")
-"""Commented example of a design file."""
-
-SCREEN_TEMPLATES = {
-    name: (_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
-    for name in ("linear-screen-design", "circular-screen-design", "feeder-design")
-}
-"""Design files of screens and feeders by their names in `jaxvib new`."""
+TEMPLATES = Templates(Path(__file__).with_name("templates"), {name: (name,) for name in _NAMES})
+"""Commented design files of a machine, of screens and of a feeder, by their names in `jaxvib new`."""

@@ -30,7 +30,8 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
-from optimize.files import TEMPLATE, load_design
+from optimize.files import TEMPLATES as DESIGNS
+from optimize.files import load_design
 
 sys.path[:0] = [str(pathlib.Path(__file__).parents[2] / "tests" / "helpers")]
 
@@ -72,7 +73,7 @@ def scenes(folder: pathlib.Path):
 
 def designs(folder: pathlib.Path):
     jv.save_scene(machine(), folder / "machine.toml")
-    return _files(folder / "design.toml", load_design, mutations.design_key, [file_texts.DESIGN, TEMPLATE])
+    return _files(folder / "design.toml", load_design, mutations.design_key, [file_texts.DESIGN, DESIGNS["design"]])
 
 
 def records(folder: pathlib.Path):

@@ -35,10 +35,9 @@ def new(kind: str, output: Output) -> None:
     from jaxvib.machine.files import SCREENS, TEMPLATES
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
-    from optimize.files import SCREEN_TEMPLATES
-    from optimize.files import TEMPLATE as DESIGN
+    from optimize.files import TEMPLATES as DESIGNS
 
-    files = {"design": DESIGN, **SCREEN_TEMPLATES, "identification": IDENTIFICATION, "measurement": MEASUREMENT, "sweep": STUDY}
+    files = {**DESIGNS, "identification": IDENTIFICATION, "measurement": MEASUREMENT, "sweep": STUDY}
     text = files[kind] if kind in files else {**TEMPLATES, **SCREENS}[kind.replace("-", "_")]
     name = "study" if kind == "sweep" else kind
     path = output.file(f"{name}.toml" if kind in files else "machine.toml")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -37,6 +37,7 @@ __all__ = [
     "SECTIONS",
     "TEMPLATES",
     "Tables",
+    "Templates",
     "build_part",
     "load_scene",
     "misplaced_name",
@@ -437,20 +438,33 @@ def _plain(value: np.ndarray | float, *, unwrap: bool) -> float | list:
     return array.item() if array.ndim == 0 or (array.size == 1 and unwrap) else array.tolist()
 
 
-def _template(kind: str, ending: str = "", speed: str = "") -> str:
-    """Return the text of a template; `ending`: file with the loads, the drive and the effects of all machines of one sort."""
-    folder = Path(__file__).with_name("templates")
-    parts = [(folder / f"{name}.toml").read_text(encoding="utf-8") for name in (kind, ending) if name]
-    return "\n".join(parts).replace("{speed}", speed)
+class Templates(Mapping[str, str]):
+    """Commented example files by name; each is read when it is used.
+
+    **Arguments**: the `folder` of the files; for each name the names of the `parts` of its text, without ".toml"; rotor
+    `speeds` that replace 1500 rpm.
+    """
+
+    def __init__(self, folder: Path, parts: Mapping[str, tuple[str, ...]], **speeds: str) -> None:
+        self._folder, self._parts, self._speeds = folder, parts, speeds
+
+    def __getitem__(self, name: str) -> str:
+        text = "\n".join((self._folder / f"{part}.toml").read_text(encoding="utf-8") for part in self._parts[name])
+        return text.replace("{speed}", self._speeds.get(name, "1500 rpm"))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
 
 
-TEMPLATES: dict[str, str] = {
-    "one_mass": _template("one_mass", "platforms_end", "600 rpm"),
-    **{kind: _template(kind, "platforms_end", "1500 rpm") for kind in ("two_mass", "three_mass", "network")},
-    **{kind: _template(kind, "rotors_end") for kind in ("planar_rotor", "rotor")},
-    "torus": _template("torus"),
-}
+_FOLDER = Path(__file__).with_name("templates")
+_PLATFORMS = {name: (name, "platforms_end") for name in ("one_mass", "two_mass", "three_mass", "network")}
+_ROTORS = {name: (name, "rotors_end") for name in ("planar_rotor", "rotor")}
+
+TEMPLATES = Templates(_FOLDER, {**_PLATFORMS, **_ROTORS, "torus": ("torus",)}, one_mass="600 rpm")
 """Scene files with comments for every kind of platforms and rotors, and for a rotor with balls in a torus."""
 
-SCREENS = {kind: _template(kind) for kind in ("linear_screen", "circular_screen", "feeder")}
+SCREENS = Templates(_FOLDER, {name: (name,) for name in ("linear_screen", "circular_screen", "feeder")})
 """Scene files of a linear screen, a circular screen and a feeder, with the numbers of a data sheet."""

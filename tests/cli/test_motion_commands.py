@@ -17,7 +17,7 @@ from jaxvib.cli.app import _HOMES, app, loaded_scene, run
 from jaxvib.machine.files import EFFECTS, SCREENS, SECTIONS, TEMPLATES
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
-from optimize.files import SCREEN_TEMPLATES
+from optimize.files import TEMPLATES as DESIGNS
 
 UNBALANCED = """
 machine = { kind = "one_mass", mass = 200.0, stiffness = "800 N/mm", damping = 600.0 }
@@ -250,7 +250,7 @@ def test_help_imports_nothing_slow_and_lists_the_choices():
     }
     assert options["cost", "quantity"] == QUANTITIES and options["cost", "solvers"] == tuple(SOLVERS)
     machines = tuple(name.replace("_", "-") for name in (*TEMPLATES, *SCREENS))
-    assert options["new", "kind"] == (*machines, "design", *SCREEN_TEMPLATES, "identification", "measurement", "sweep")
+    assert options["new", "kind"] == (*machines, *DESIGNS, "identification", "measurement", "sweep")
 
 
 def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):

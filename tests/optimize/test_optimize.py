@@ -23,7 +23,7 @@ from optimize import (
     synthesize,
     total,
 )
-from optimize.files import TEMPLATE
+from optimize.files import TEMPLATES as DESIGNS
 
 FREE = {"machine.stiffness": (0.01, 0.3), "machine.link_stiffness": (0.1, 1.0)}
 
@@ -216,7 +216,7 @@ def test_own_quantities_can_be_sought():
 
 def test_design_file_is_read(tmp_path):
     (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
-    (tmp_path / "design.toml").write_text(TEMPLATE)
+    (tmp_path / "design.toml").write_text(DESIGNS["design"])
     design = load_design(tmp_path / "design.toml")
     assert design.space.size == 3
     assert design.objective.name == "force_per_amplitude" and design.objective.of == (1, 2)
@@ -224,7 +224,8 @@ def test_design_file_is_read(tmp_path):
     np.testing.assert_allclose(design.space.held[0].value, 570 * np.pi / 30)
     assert design.search == {"starts": 256, "seed": 0}
     more = (
-        TEMPLATE.replace("# tolerances", "tolerances")
+        DESIGNS["design"]
+        .replace("# tolerances", "tolerances")
         .replace("# statistic", "statistic")
         .replace("# [[demand]] ", "[[demand]]  ")
     )
@@ -235,7 +236,9 @@ def test_design_file_is_read(tmp_path):
     design = load_design(tmp_path / "design.toml")
     assert [d.words for d in design.subject_to] == ["amplitude of platform 1 against 2, mode 3, exact at least 2 mm"]
     assert design.space.counts == (2, 3, 4) and design.objective.words.startswith("worst force per amplitude")
-    every = TEMPLATE.replace("# iterations", "iterations").replace("# rate", "rate").replace("# polishing", "polishing")
+    every = (
+        DESIGNS["design"].replace("# iterations", "iterations").replace("# rate", "rate").replace("# polishing", "polishing")
+    )
     (tmp_path / "design.toml").write_text(every)
     search = load_design(tmp_path / "design.toml").search
     assert search == {"starts": 256, "seed": 0, "iterations": 100, "rate": 0.05, "polishing": 12}
@@ -317,7 +320,7 @@ def test_design_files_mean_what_they_say(tmp_path, monkeypatch):
 )
 def test_wrong_design_files_are_said_in_one_sentence(tmp_path, change, says):
     (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
-    text = TEMPLATE.replace(*change).replace('# statistic = "worst"', 'statistic = "worts"')
+    text = DESIGNS["design"].replace(*change).replace('# statistic = "worst"', 'statistic = "worts"')
     (tmp_path / "design.toml").write_text(text)
     with pytest.raises(jv.InputError) as caught:
         load_design(tmp_path / "design.toml")
