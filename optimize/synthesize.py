@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -32,7 +33,7 @@ from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.exciters import RegimeQuantity, working_amplitude, working_speed
 from optimize.quantities.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
 from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, walk
-from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
+from optimize.result import Limit, Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Options, Searcher, SearchResult, choose, require_searcher
 from optimize.search.polish import FEASIBILITY_TOLERANCE
 from optimize.search.problem import Problem, evaluate_quantities, problem_of, scenes_of
@@ -129,30 +130,13 @@ def synthesize(
     options = _options(starts, seed, iterations, polishing, rate, searcher)
     demands = _validate_demands(space, objective, subject_to)
 
-    searching = _SEARCH_SHARE if verify else 0.9
-
-    def report(what: str, share: float) -> None:
-        """Report the share of the whole time; 0.9 of the steps are the search."""
-        if progress is not None:
-            shown = share * searching / 0.9 if share <= 0.9 else searching + (share - 0.9) / 0.1 * (1.0 - searching)
-            call_user(progress, "progress", what, shown)
-
+    report = partial(_report, progress, _SEARCH_SHARE if verify else 0.9)
     if begin is not None:
         options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
     space, problem, found = _search(space, objective, demands, options, report)
-    best = found.best
     others = scenes_of(problem, neighbours(problem, found))
     scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], others)))
-    kept = found.violation < 10.0 * FEASIBILITY_TOLERANCE
-    done = kept & (found.remaining_decrease < _CONVERGED_DECREASE)
-    values = np.where(kept, found.point.values[:, 0], np.inf)
-    if found.interrupted:
-        status = SynthesisStatus.interrupted
-    elif not kept[best]:
-        status = SynthesisStatus.contradictory
-    else:
-        status = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged
-
+    status, unfinished, searched = _searched(found)
     motion = _motion_of(space, objective, demands)
     named = _named_quantities(space, scene, objective, demands, motion)
     sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
@@ -160,14 +144,10 @@ def synthesize(
     reports = evaluate_quantities((*(q for _, q in named), objective, *sides), batch, problem)
     limits = limits_of(problem, demands, found, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
-        unmet = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.violation)
-        raise failure(
-            SynthesisStatus.contradictory, f" (not met by the nearest machine: {unmet}); widen the bounds or relax a demand"
-        )
+        raise _unmet(limits)
     report("integrating the best machine" if verify else "computing quantities", 0.9)
-    verify = verify and bool(kept[best]) and not found.interrupted
-    unfinished = "the search was interrupted" if found.interrupted else "the machine does not meet all demands"
-    run, unverified = _run(scene, motion, verify) if kept[best] and not found.interrupted else (None, unfinished)
+    verify = verify and not unfinished
+    run, unverified = (None, unfinished) if unfinished else _run(scene, motion, verify)
     report("computing the exact motion", 0.99)
     other = _other_tiers(scene, [q for _, q in named], verify, run, motion)
     rows = _table(space, scene, named, reports[:2, : len(named)], other)
@@ -183,21 +163,54 @@ def synthesize(
         verified=verified,
         run=run,
         unverified=unverified,
-        starts=len(found.point.z),
-        drawn=found.drawn,
-        converged=int(np.sum(done)),
-        same=int(np.sum(kept & (np.max(np.abs(found.point.z - found.point.z[best]), axis=1) < _SAME_DESIGN_DISTANCE))),
-        designs=found.point.z,
-        values=values,
-        done=done,
-        history=found.history,
         objective=objective.name,
         unit=objective.unit,
-        kkt=float(found.optimality.kkt[best]),
         table=rows,
         limits=limits,
         influences=influences_of(problem, reports[1:, len(named)]),
         machines=machines_of(problem, found, _SAME_DESIGN_DISTANCE),
+        **searched,
+    )
+
+
+def _report(progress: Progress | None, searching: float, what: str, share: float) -> None:
+    """Report the share of the whole time; 0.9 of the steps are the search, which takes the share `searching`."""
+    if progress is not None:
+        shown = share * searching / 0.9 if share <= 0.9 else searching + (share - 0.9) / 0.1 * (1.0 - searching)
+        call_user(progress, "progress", what, shown)
+
+
+def _unmet(limits: tuple[Limit, ...]) -> ComputationError:
+    unmet = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.violation)
+    hint = f" (not met by the nearest machine: {unmet}); widen the bounds or relax a demand"
+    return failure(SynthesisStatus.contradictory, hint)
+
+
+def _searched(found: SearchResult) -> tuple[SynthesisStatus, str, dict[str, Any]]:
+    """Return the status of a search, why its machine is not verified, and the fields of `Synthesis` from its designs."""
+    best, z = found.best, found.point.z
+    kept = found.violation < 10.0 * FEASIBILITY_TOLERANCE
+    done = kept & (found.remaining_decrease < _CONVERGED_DECREASE)
+    if found.interrupted:
+        status, unfinished = SynthesisStatus.interrupted, "the search was interrupted"
+    elif not kept[best]:
+        status, unfinished = SynthesisStatus.contradictory, "the machine does not meet all demands"
+    else:
+        status, unfinished = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged, ""
+    return (
+        status,
+        unfinished,
+        {
+            "starts": len(z),
+            "drawn": found.drawn,
+            "converged": int(np.sum(done)),
+            "same": int(np.sum(kept & (np.max(np.abs(z - z[best]), axis=1) < _SAME_DESIGN_DISTANCE))),
+            "designs": z,
+            "values": np.where(kept, found.point.values[:, 0], np.inf),
+            "done": done,
+            "history": found.history,
+            "kkt": float(found.optimality.kkt[best]),
+        },
     )
 
 

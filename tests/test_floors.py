@@ -185,6 +185,21 @@ def test_folders_and_files_are_small():
     assert long == []
 
 
+def lengths_of_functions(text):
+    """(name, number of lines without the docstring) of every function in the text of a module."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            docstring = node.body[0] if ast.get_docstring(node) is not None else None
+            ignored = 0 if docstring is None else docstring.end_lineno - docstring.lineno + 1
+            yield node.name, node.end_lineno - node.lineno + 1 - ignored
+
+
+def test_functions_have_at_most_60_lines():
+    assert list(lengths_of_functions('def f():\n    """A\n\n    B."""\n    return 1\n')) == [("f", 2)]
+    found = [(module, *each) for module, text in sources().items() for each in lengths_of_functions(text)]
+    assert [each for each in found if each[-1] > 60] == []
+
+
 def test_contributing_names_every_package():
     page = (ROOT / "CONTRIBUTING.md").read_text()
     packages = {package.replace(".", "/") for floor in FLOORS for package in floor}

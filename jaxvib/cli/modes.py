@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -95,15 +96,7 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
         "rotor_speed": scene.drive.speed,
         "resonances": found.resonances,
         "judged": STABILITY_CRITERION,
-        "modes": [
-            {
-                **fields_of(jam, "mode", "omega", "stable"),
-                "growth_of_free_loads": growth[int(jam.mode)],
-                "status": jam.message,
-                **fields_of(jam, "amplitude", "foundation_force"),
-            }
-            for jam in jams
-        ],
+        "modes": [_mode_document(jam, growth[int(jam.mode)]) for jam in jams],
         "unresolved": found.unresolved,
         "measures": [{"mode": mode, **each.document()} for mode, each in measures.items()],
         "folds": [{"omega": found.folds.omega[k], "rotor_speed": found.folds.rotor_speed[k]} for k in folds],
@@ -135,6 +128,11 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
         return "\n".join([*lines, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
+
+
+def _mode_document(jam: jv.Jam, growth: float) -> dict[str, Any]:
+    first, last = fields_of(jam, "mode", "omega", "stable"), fields_of(jam, "amplitude", "foundation_force")
+    return {**first, "growth_of_free_loads": growth, "status": jam.message, **last}
 
 
 def _left_out(scene: jv.Scene) -> list[str]:

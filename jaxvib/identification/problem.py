@@ -131,10 +131,11 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     if isinstance(unknown, str) or not unknown:
         raise InputError("unknown", f"is {quoted(unknown)}; it must be a list of names, such as ['machine.stiffness']")
     numbers = _singles(scene, unknown)
-    found: dict[str, tuple[NamedNumber, Known]] = {}
-    for name, text in known.items():
-        for number in _singles(scene, [name], "known"):
-            found[number.name] = number, read_known(text, number, f"known[{name!r}]")
+    found = {
+        number.name: (number, read_known(text, number, f"known[{name!r}]"))
+        for name, text in known.items()
+        for number in _singles(scene, [name], "known")
+    }
     fixed = [(number, each) for number, each in found.values() if each.error == 0.0]
     if fixed:
         scene = put_numbers(scene, [number for number, _ in fixed], np.array([each.value for _, each in fixed]))
@@ -150,16 +151,9 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     unbalances = tuple(_known_unbalance(scene, k, free, found) for k in range(len(scene.exciters)))
 
     values = np.array([float(number.read(scene)[0]) for number in moved])
-    positive = np.array(
-        [number.spec.bounds.low == 0.0 and value > 0.0 for number, value in zip(moved, values, strict=True)], bool
-    )
+    positive = (values > 0.0) & np.array([number.spec.bounds.low == 0.0 for number in moved], bool)
     scale = np.where(values != 0.0, np.abs(values), [number.spec.typical or 1.0 for number in moved])
-    means, errors = np.zeros(len(moved)), np.full(len(moved), np.inf)
-    for k, number in enumerate(moved):
-        if number.name in found and found[number.name][1].error > 0.0:
-            each = found[number.name][1]
-            means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
-            errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
+    means, errors = _known_means(moved, found, values, positive, scale)
 
     runs = [_with_own_rate(scene, run) for run in runs]
     notes = [note for run in runs for note in run.notes]
@@ -168,9 +162,8 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     notes += [note for each in angles for angle in each for note in angle.notes]
     marked = [all(angle.marked for angle in each) for each in angles]
     gains = {c.name: c.gain_error for run in runs for c in run.of_kind(*MOTIONS) if c.gain_error > 0.0}
-    turns = [k for k, is_marked in enumerate(marked) if k and not (is_marked and marked[0])]
-    if len(scene.exciters) > 1 and turns:
-        turns = []  # each drive's schedule fixes its angle in every run
+    # With several exciters, each drive's schedule fixes its angle in every run.
+    turns = [k for k, is_marked in enumerate(marked) if k and not (is_marked and marked[0]) and len(scene.exciters) == 1]
     unknowns = Unknowns(tuple(moved), jnp.asarray(values), jnp.asarray(scale), jnp.asarray(positive), tuple(gains), len(turns))
     cases = enumerate(zip(runs, angles, strict=True))
     prepared = [_samples(scene, run, angle, turns.index(k) if k in turns else None) for k, (run, angle) in cases]
@@ -193,6 +186,23 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
         angle_errors=tuple(max(angle.error for angle in each) for each in angles),
         notes=tuple(dict.fromkeys(notes)),
     )
+
+
+def _known_means(
+    moved: Sequence[NamedNumber],
+    found: Mapping[str, tuple[NamedNumber, Known]],
+    values: np.ndarray,
+    positive: np.ndarray,
+    scale: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means and standard errors of the unknowns whose values are known with an error; 0 and infinity for others."""
+    means, errors = np.zeros(len(moved)), np.full(len(moved), np.inf)
+    for k, number in enumerate(moved):
+        if number.name in found and found[number.name][1].error > 0.0:
+            each = found[number.name][1]
+            means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
+            errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
+    return means, errors
 
 
 def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:

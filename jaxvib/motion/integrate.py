@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -178,19 +179,14 @@ def integrate(
         progress=plan.progress_meter,
     )
     assert solution.ts is not None and solution.ys is not None
-    times, states = jax.tree.map(
-        lambda value: jnp.where(exists, value, jnp.nan), (solution.ts[0], motion.unpack(solution.ys[0]))
-    )
+    present = partial(jax.tree.map, lambda value: jnp.where(exists, value, jnp.nan))
+    times, states = present((solution.ts[0], motion.unpack(solution.ys[0])))
     window = trajectory(model, times, states)
     whole = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
-    if is_measured is None:
-        numbers = measure(model, field, times, states, unit)
-    else:  # of a run with larger steps only the states are used
-        numbers = jax.lax.cond(
-            is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(model, states)
-        )
-    parts = numbers, whole, window.rotor_speeds  # those of ideal drives do not follow from the states
-    numbers, whole, speeds = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), parts)
+    measured = partial(measure, model, field, times, states, unit)
+    # Of a run with larger steps only the states are used.
+    numbers = measured() if is_measured is None else jax.lax.cond(is_measured, measured, partial(unmeasured, model, states))
+    numbers, whole, speeds = present((numbers, whole, window.rotor_speeds))  # speeds of ideal drives are not in the states
     window = dataclasses.replace(window, rotor_speeds=speeds)
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not reach its end has no window; its last state shows if it diverged.

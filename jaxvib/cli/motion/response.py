@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -10,6 +11,11 @@ import jaxvib as jv
 from jaxvib.cli.app import SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.cli.document import deck_options, indented, measures_of
 from jaxvib.cli.output import csv_options
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxvib.steady.response import AbstractResponse
 
 
 @app.command("response")
@@ -39,7 +45,6 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
     output.csv(csv, found, "speed")
     operating = np.flatnonzero(found.operating.exists).tolist()
     folds = np.flatnonzero(found.folds.exists).tolist()
-    peaks = found.peaks()
     stays = found.operating.stable
     sizes = [measures_of(loaded, found.operating.vibration(k)) if stays[k] else None for k in operating]
     measures = ("speed", "amplitude", "phase", "acceleration", "velocity", "exciter_force", "foundation_force")
@@ -55,50 +60,55 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
             row | ({} if own is None else {"measures": own.document()})
             for row, own in zip(rows_of(found.operating, operating, *measures, *rest, "growth", "stable"), sizes, strict=True)
         ],
-        "peaks": rows_of(found, peaks, *measures, *rest),
+        "peaks": rows_of(found, found.peaks(), *measures, *rest),
         "folds": rows_of(found.folds, folds, "speed", "factor", "torque", "lands_at"),
     }
+    output.done(document, lambda: _text(found, phases, sizes, operating, folds), "response", found)
 
-    def text() -> str:
-        from jaxvib.display import shown_unit, speed_text, speed_unit  # slow import, which --help does not need
 
-        unit, scale = speed_unit()
-        structure = found.scene.machine.structure()
-        kinds = [shown_unit(each, float(np.max(found.amplitude[:, k]))) for k, each in enumerate(structure.units)]
-        moves = [f"{name}, {shown}" for name, (shown, _) in zip(structure.coordinates, kinds, strict=True)]
+def _text(
+    found: jv.Response, phases: np.ndarray, sizes: list[jv.VibrationMeasures | None], operating: list[int], folds: list[int]
+) -> str:
+    """Return the operating points, peaks and folds as tables; `sizes`: measures at the stable operating points."""
+    import numpy as np  # slow import, which --help does not need
 
-        def motion(of: jv.Response, k: int, *texts: str) -> list[str]:
-            moved = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
-            last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
-            return [f"{scale * of.speed[k]:.5g}", *texts, *moved, *last]
+    from jaxvib.display import shown_unit, speed_text, speed_unit
 
-        lines = [f"natural frequencies {speed_text(found.resonances)}"]
-        end = ["force, N", "torque, N m"]
-        if operating:
-            points = found.operating
-            rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]
-            lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
-            stable = [(k, own) for k, own in zip(operating, sizes, strict=True) if own is not None]
-            lines += [indented(f"at {speed_text(points.speed[k])}:", own) for k, own in stable]
-        elif len(found.scene.exciters) > 1:
-            written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases))
-            lines.append(f"phases of the unbalances {written} deg; for speeds and stability use: jaxvib regimes")
-        else:
-            lines.append("the motor supplies the torque that the vibration needs at no speed")
-        if peaks:
-            lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(found, k) for k in peaks]))
-        if folds:
-            rows = [
-                [
-                    f"{scale * found.folds.speed[k]:.5g}",
-                    f"{found.folds.torque[k]:.4g}",
-                    f"{found.folds.factor[k]:.4g}",
-                    f"{scale * found.folds.lands_at[k]:.5g}" if np.isfinite(found.folds.lands_at[k]) else "-",
-                ]
-                for k in folds
+    unit, scale = speed_unit()
+    structure = found.scene.machine.structure()
+    kinds = [shown_unit(each, float(np.max(found.amplitude[:, k]))) for k, each in enumerate(structure.units)]
+    moves = [f"{name}, {shown}" for name, (shown, _) in zip(structure.coordinates, kinds, strict=True)]
+
+    def motion(of: AbstractResponse, k: int, *texts: str) -> list[str]:
+        moved = [f"{factor * a:.4g}" for a, (_, factor) in zip(of.amplitude[k], kinds, strict=True)]
+        last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
+        return [f"{scale * of.speed[k]:.5g}", *texts, *moved, *last]
+
+    lines = [f"natural frequencies {speed_text(found.resonances)}"]
+    end = ["force, N", "torque, N m"]
+    if operating:
+        points = found.operating
+        rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]
+        lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
+        stable = [(k, own) for k, own in zip(operating, sizes, strict=True) if own is not None]
+        lines += [indented(f"at {speed_text(points.speed[k])}:", own) for k, own in stable]
+    elif len(found.scene.exciters) > 1:
+        written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases))
+        lines.append(f"phases of the unbalances {written} deg; for speeds and stability use: jaxvib regimes")
+    else:
+        lines.append("the motor supplies the torque that the vibration needs at no speed")
+    if peaks := found.peaks():
+        lines.append(table("peaks of the foundation force", [unit, *moves, *end], [motion(found, k) for k in peaks]))
+    if folds:
+        rows = [
+            [
+                f"{scale * found.folds.speed[k]:.5g}",
+                f"{found.folds.torque[k]:.4g}",
+                f"{found.folds.factor[k]:.4g}",
+                f"{scale * found.folds.lands_at[k]:.5g}" if np.isfinite(found.folds.lands_at[k]) else "-",
             ]
-            head = [unit, "torque, N m", "times the motor's torque", f"jump to, {unit}"]
-            lines.append(table("folds: the speed jumps if the motor has this torque", head, rows))
-        return "\n".join(lines)
-
-    output.done(document, text, "response", found)
+            for k in folds
+        ]
+        head = [unit, "torque, N m", "times the motor's torque", f"jump to, {unit}"]
+        lines.append(table("folds: the speed jumps if the motor has this torque", head, rows))
+    return "\n".join(lines)

@@ -277,8 +277,7 @@ def swing_states(
     pendulum = eqx.tree_at(lambda p: p.g, pendulum, jnp.where(exists, pendulum.g, 1.0))
     frequency, dry = pendulum.frequency, friction.dry
     if dry is not None and width is None:
-        zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
-        width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
+        width = _usual_width(pendulum, dry)
     margin = None if dry is None or width is None else _margin_to_rest(pendulum, friction, dry, width)
     # The function of the event does not change its sign if friction already holds the pendulum at the start.
     free = None if margin is None else margin(times[0], (angle, rate), None) > 0.0
@@ -319,6 +318,13 @@ def swing_states(
         width=jnp.full_like(frequency, jnp.nan) if width is None else width,
         steps=solution.stats["num_steps"],
     )
+
+
+def _usual_width(pendulum: BearingPendulum, dry: Array) -> Array:
+    """Return the width of the smoothed dry friction, 5 % of the speed of a swing through the dead zone, rad/s."""
+    frequency = pendulum.frequency
+    zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
+    return 0.05 * jnp.where(zone > 0.0, zone, frequency)
 
 
 def _status(exists: Array, finished: Array, stopped: Array) -> SwingStatus:
