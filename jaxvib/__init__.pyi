@@ -67,7 +67,7 @@ from jaxvib.steady.points import Deck, Ellipse, ellipse_of
 # Jams of light loads
 from jaxvib.steady.branches import Branches, branches
 from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
-from jaxvib.steady.jams.patterns import PhasePattern
+from jaxvib.steady.jams.phases import PhasePattern
 from jaxvib.steady.jams.phase_search import PhaseJams, phase_jams
 from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus
 from jaxvib.steady.shapes import ModeShapes, mode_shapes

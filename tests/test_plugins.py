@@ -13,7 +13,7 @@ from scenes import machines, published
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_field
 from jaxvib.steady.jams.folds import jam_rotor_speed
-from jaxvib.study.accuracy.tier import TIERS
+from jaxvib.study.audit.tiers import TIERS
 
 TORQUE = 2e-5
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from dataclasses import dataclass
 
@@ -16,7 +18,6 @@ from jaxvib.motion.start import Start
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.compat import enumeration_names
 from jaxvib.sweeps.axes import Grid, Target
-from jaxvib.sweeps.identity import digest
 from jaxvib.sweeps.measures import Measure
 from optimize.quantities.quantity import Tier
 
@@ -117,3 +118,19 @@ class Study:
     def nothing(self, cases: int) -> list[np.ndarray]:
         """Return placeholders for the measures of cases without a value: NaN, or -1 for integers."""
         return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]
+
+
+def digest(value: Plain) -> str:
+    """Return a digest of plain data, a string of 32 hexadecimal digits."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def difference(one: Plain, other: Plain, name: str = "") -> tuple[str, Plain, Plain] | None:
+    """Return the path of the first difference between two plain values, and both entries there; None for equal values."""
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        pairs = [(f"{name}.{key}" if name else key, one[key], other[key]) for key in one]
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        pairs = [(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(zip(one, other, strict=True))]
+    else:  # compared as strings, because 1 == 1.0 == True in Python
+        return None if json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True) else (name, one, other)
+    return next((found for key, a, b in pairs if (found := difference(a, b, key))), None)

@@ -20,8 +20,7 @@ from jaxvib.results.fields import Plain
 from jaxvib.runtime.operations import calls_python, program_text
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Target, put, put_start
-from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, Study
-from jaxvib.sweeps.identity import digest
+from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, Study, digest
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
 

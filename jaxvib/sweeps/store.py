@@ -30,8 +30,7 @@ from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence
 from jaxvib.sweeps import seals
 from jaxvib.sweeps.axes import SAMPLE
-from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, CaseStatus, Study
-from jaxvib.sweeps.identity import difference
+from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, CaseStatus, Study, difference
 from jaxvib.sweeps.measures import RunMeasure
 from jaxvib.sweeps.program import Chunk
 

@@ -17,7 +17,7 @@ from scenes import ROTOR, scene
 
 import jaxvib as jv
 import optimize
-from jaxvib.sweeps.identity import difference
+from jaxvib.sweeps.definition import difference
 from jaxvib.sweeps.study import study
 from jaxvib.sweeps.sweep import run_study
 from optimize import Quantity, amplitude, largest

@@ -6,8 +6,7 @@ from papers.machines import published_rotor, rotor_run_ups
 
 import jaxvib as jv
 from jaxvib.results.status import status_name
-from jaxvib.steady.jams.patterns import phase_pattern
-from jaxvib.steady.jams.phases import phase_jam
+from jaxvib.steady.jams.phases import phase_jam, phase_pattern
 
 BOTH = "uncoupled, both dampers"
 

@@ -22,7 +22,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.compat import enumeration_names
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
+from jaxvib.steady.jams.phases import PhasePattern, phase_pattern
 from jaxvib.steady.whirl import whirl
 
 _SAME_SPEED = 3e-3

@@ -23,7 +23,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.orbits.newton import Linearized, newton
+from jaxvib.steady.orbits.solve import Linearized, newton
 from jaxvib.steady.orbits.synchronous import HasSpeedAndPhases, synchronous_orbit
 from jaxvib.steady.orbits.whole import (
     PeriodicScene,

@@ -21,7 +21,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling
 from jaxvib.numerics.linalg import small_solve, solve_in_turn
-from jaxvib.steady.orbits.newton import Linearized, newton
+from jaxvib.steady.orbits.solve import Linearized, newton
 from jaxvib.steady.orbits.stability import deflate
 
 

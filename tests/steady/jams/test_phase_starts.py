@@ -11,9 +11,8 @@ from scipy.optimize import brentq
 import jaxvib as jv
 from jaxvib.equations.torque_balance import assemble_torque_balance, influence_of, torques_at
 from jaxvib.steady.jams import phase_starts
-from jaxvib.steady.jams.patterns import phase_pattern
 from jaxvib.steady.jams.phase_starts import _regular_phases, at_speed, distinct_rows, load_speeds, phases_near, starts_of
-from jaxvib.steady.jams.phases import solve_balance
+from jaxvib.steady.jams.phases import phase_pattern, solve_balance
 
 MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
 RESONANCE = np.sqrt(1.16e6 / 37.1)

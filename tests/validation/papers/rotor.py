@@ -13,8 +13,7 @@ import numpy as np
 from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.rotor import Rotor, rotor
-from jaxvib.steady.jams.phase_branch import PhaseBranch
-from jaxvib.steady.jams.phase_search import phase_branch
+from jaxvib.steady.jams.phase_search import PhaseBranch, phase_branch
 from jaxvib.steady.jams.phases import phase_jam
 from jaxvib.steady.whirl import critical_speeds
 from jaxvib.study.maps.run_ups import RunUps
