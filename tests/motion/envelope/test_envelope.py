@@ -277,11 +277,11 @@ def test_what_cannot_be_averaged_is_refused(change, says):
 def test_what_is_measured_of_a_window():
     """Forces, the larger one of which grows from 3 to 4 N; amplitudes of millimetres, the larger one 3 % larger in the later
     half; loads that speed up, the mean of the later half 1 % above that of all."""
-    late = np.arange(8) >= 4
+    late, beat = np.arange(8) >= 4, np.array([1.0, 0.5] * 4)[:, None]
     window = SimpleNamespace(
         time=np.arange(8.0),
-        amplitude=jnp.asarray(np.stack([np.where(late, 1.03e-3, 1e-3), np.full(8, 2e-4)], axis=1)),
-        foundation_force=jnp.asarray(np.stack([np.where(late, 4.0, 3.0), np.where(late, 2.0, 3.0)], axis=1)),
+        amplitude=jnp.asarray(beat * np.stack([np.where(late, 1.03e-3, 1e-3), np.full(8, 2e-4)], axis=1)),
+        foundation_force=jnp.asarray(beat * np.stack([np.where(late, 4.0, 3.0), np.where(late, 2.0, 3.0)], axis=1)),
         load_speed=jnp.full((8, 2), 50.0),
     )
     found = _measure(assemble(published().scene()), window)

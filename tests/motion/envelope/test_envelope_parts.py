@@ -254,11 +254,11 @@ def test_gravity_on_loads_has_a_height_and_a_torque():
 
 
 def judged(phase, rate, plain, drift=1e-4, status="done", growth=1.0, end=2.0):
-    """Name of the status of a run with the given phases and speeds over 0 to `end` seconds."""
+    """Name of the status of a run with the given phases and speeds over `end` seconds."""
     phase, scene = np.asarray(phase, float), platform() if plain else mixed()
     window = SimpleNamespace(
         phase=phase,
-        time=np.linspace(0.0, end, len(phase)),
+        time=np.linspace(3.0, 3.0 + end, len(phase)),
         load_speed=np.asarray(rate, float),
         omega=np.full(len(phase), 60.0),
         displacement=np.zeros((len(phase), 1)),
