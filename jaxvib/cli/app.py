@@ -49,20 +49,21 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     """
     from jaxvib.machine.drives.drive import ConstantSpeed  # slow imports, which --help does not need
     from jaxvib.machine.files import load_scene
-    from jaxvib.machine.validation import implausible_numbers
+    from jaxvib.machine.validation import implausible_numbers, start_notes
 
     scene = load_scene(path)
     if speed is not None:
         scene = _with_exciters(scene, lambda each: each.with_parts(each.loads, ConstantSpeed(speed), each.effects))
     elif constant:
         scene = _with_exciters(scene, _at_final_speed)
-    for note in implausible_numbers(scene):
-        click.echo(f"note: {note}", err=True)
     there = [effect.kind for effect in scene.all_effects]
     for kind in without:
         if kind not in there:
             raise InputError("--without", f"is {quoted(kind)}; the scene's effects are: {', '.join(there) or 'none'}")
-    return _without_effects(scene, without) if without else scene
+    scene = _without_effects(scene, without) if without else scene
+    for note in (*implausible_numbers(scene), *start_notes(scene)):
+        click.echo(f"note: {note}", err=True)
+    return scene
 
 
 def _with_exciters(scene: Scene, change: Callable[[Exciter], Exciter]) -> Scene:
@@ -214,6 +215,7 @@ _GROUPS = {
         "simulate": "commands",
         "settle": "motion.settle",
         "envelope": "motion.settle",
+        "run-up": "motion.run_ups",
         "run-ups": "motion.run_ups",
         "growth": "motion.settle",
         "capture": "study.capture",

@@ -27,10 +27,11 @@ from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torqu
 from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
 from jaxvib.machine.carrier import Mount
 from jaxvib.machine.drives.drive import ConstantSpeed, Drive
-from jaxvib.machine.effects.base import has_term, terms_of, total_gravity
+from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.validation import lifting_torques
 from jaxvib.numerics.linalg import small_solve, times
 from jaxvib.runtime.programs import cached
 
@@ -354,13 +355,5 @@ def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = N
 
 def can_start(scene: Scene) -> Array:
     """Return True for each exciter whose motor lifts its unbalance from rest against gravity, or that has none to lift."""
-    gravity = total_gravity(scene.all_effects)
-    each = []
-    for exciter in scene.exciters:
-        zero = jnp.zeros_like(exciter.drive.speed)
-        motor = exciter.drive.torque_and_inertia(zero, zero)
-        if exciter.unbalance is None or motor is None or 1 not in gravity:
-            each.append(jnp.asarray(True))
-        else:
-            each.append(motor[0] > exciter.unbalance * jnp.abs(gravity[1]))
-    return jnp.stack(each)
+    each = lifting_torques(scene)
+    return jnp.stack([jnp.asarray(True) if torques is None else torques[1] > torques[0] for torques in each])

@@ -16,6 +16,7 @@ from jax import Array
 from jaxvib.boundary import call_user
 from jaxvib.display import speed_text
 from jaxvib.errors import InputError, quoted, within
+from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
@@ -131,6 +132,46 @@ def implausible_numbers(scene: Scene) -> list[str]:
         sag = f"{9.80665 * mass / stiffness:.3g} m"
         largest = float(np.max(scene.machine.stiffness))  # pyright: ignore[reportAttributeAccessIssue]
         note("machine.stiffness", f"so small that the machine sags by {sag}", "N/m", f"{largest:g} N/mm")
+    return notes
+
+
+def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
+    """Return S g, the largest torque of the weight of the unbalance, and L(0), the torque of the motor at rest, N m.
+
+    The list has an entry for each exciter; it is None if there is no motor, no unbalance or no gravity.
+    """
+    gravity = total_gravity(scene.all_effects)
+    found: list[tuple[Array, Array] | None] = []
+    for exciter in scene.exciters:
+        zero = jnp.zeros_like(exciter.drive.speed)
+        motor = exciter.drive.torque_and_inertia(zero, zero)
+        if exciter.unbalance is None or motor is None or 1 not in gravity:
+            found.append(None)
+        else:
+            found.append((exciter.unbalance * jnp.abs(gravity[1]), motor[0]))
+    return found
+
+
+def start_notes(scene: Scene) -> list[str]:
+    """Return a sentence for each motor that cannot lift its unbalance against gravity.
+
+    Motors whose torque at rest changes over time, such as those of converters, are not judged.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.DCMotor(100.0, stall_torque=3.0, inertia=0.5)
+    >>> start_notes(jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0),
+    ...                      exciters=[jv.Exciter(drive=motor, unbalance=0.4)], effects=jv.Gravity()))
+    ['the motor cannot start: the weight of its unbalance needs 3.92 N m, its starting torque is 3 N m']
+    """
+    notes = []
+    for k, (exciter, torques) in enumerate(zip(scene.exciters, lifting_torques(scene), strict=True)):
+        if torques is None or exciter.drive.jump_ts() or float(torques[1]) > float(torques[0]):
+            continue
+        which = f" of exciter {k}" if len(scene.exciters) > 1 else ""
+        weight, start = (f"{float(each):.3g} N m" for each in torques)
+        notes.append(
+            f"the motor{which} cannot start: the weight of its unbalance needs {weight}, its starting torque is {start}"
+        )
     return notes
 
 

@@ -290,3 +290,30 @@ def test_options_change_scenes_of_several_exciters(tmp_path, capsys):
         ("constant_speed", 95.0),
     ]
     assert capsys.readouterr().err.count("the final speed of the drive (spin_up)") == 2
+
+
+def test_run_up_command_gives_the_result_of_python(typed, tmp_path):
+    (tmp_path / "table.toml").write_text(UNBALANCED)
+    code, out, err = typed("run-up", "table.toml", "--until", "5s", "--out", "o", "--csv", "run_up.csv")
+    found = jv.run_up(jv.load_scene("table.toml"), "5s")
+    assert (code, err) == (0, "") and out.startswith(found.summary()) and (tmp_path / "o" / "run_up.png").exists()
+    document = json.loads((tmp_path / "o" / "run_up.json").read_text())
+    assert document["status"] == found.status_name and document["peak_force"] == float(found.peak_force)
+    assert read(tmp_path / "run_up.csv")[0][0] == "trajectory_time (s)"
+    code, _, err = typed("run-ups", "table.toml", "--until", "5s")
+    assert code == 2 and "for motors with unbalances use `jaxvib run-up`" in err
+    code, _, err = typed("run-up", "machine.toml", "--until", "5s")
+    assert code == 2 and "for loads use run_ups" in err
+
+
+def test_a_motor_that_cannot_start_is_named(tmp_path, capsys):
+    path = tmp_path / "screen.toml"
+    path.write_text(SCREENS["linear_screen"].replace("breakdown_torque = 80.0", "breakdown_torque = 40.0", 1))
+    loaded_scene(path)
+    scene = jv.load_scene(path)
+    weight = 9.80665 * float(scene.exciters[0].unbalance)
+    start = float(scene.exciters[0].drive.torque(0.0))
+    note = f"note: the motor of exciter 0 cannot start: the weight of its unbalance needs {weight:.3g} N m"
+    assert capsys.readouterr().err == f"{note}, its starting torque is {start:.3g} N m\n" and start < weight
+    loaded_scene(path, ["gravity"])
+    assert capsys.readouterr().err == ""

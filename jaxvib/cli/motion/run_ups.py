@@ -1,4 +1,4 @@
-"""jaxvib run-ups."""
+"""jaxvib run-up, run-ups."""
 
 from __future__ import annotations
 
@@ -8,8 +8,30 @@ from typing import Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.cli.document import SEPARATION, chosen_steps
+from jaxvib.cli.output import csv_options, fields_of
+from jaxvib.errors import InputError
+
+
+@app.command("run-up")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--until", required=True, help="End time, such as 20s.")
+@click.option("--least", is_flag=True, help="Also search for the smallest torques of the motors with which all exciters pass.")
+@WITHOUT
+@csv_options
+@shared
+def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
+    """Run the motors of SCENE up from rest by averaged equations: resonances that catch exciters, and peaks on the way.
+
+    --out adds the figure. For loads (balls, pendulums) and several drags use `run-ups`."""
+    found = jv.run_up(loaded_scene(scene, without), until, least=least)
+    output.picture("run_up.png", found.plot)
+    output.csv(csv, found.run, "trajectory_time")
+    names = ("resonances", "speed", "caught_at", "peak_amplitude", "peak_force")
+    rest = {"least_torque": found.least_torque} if least else {}
+    document = {"status": found.status_name, "message": found.message, **fields_of(found, *names), **rest}
+    output.done(document, found.summary, "run_up", found)
 
 
 @app.command("run-ups")
@@ -27,7 +49,10 @@ def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output
     from jaxvib.units import number
 
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
-    found = jv.run_ups(loaded_scene(scene), drag=each, stepsize_controller=chosen_steps(tolerance), **options)
+    loaded = loaded_scene(scene)
+    if all(exciter.loads is None for exciter in loaded.exciters):
+        raise InputError("scene", "has no loads (balls, pendulums); for motors with unbalances use `jaxvib run-up`")
+    found = jv.run_ups(loaded, drag=each, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("run_ups.png", found.plot)
     output.keep("run_ups.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))

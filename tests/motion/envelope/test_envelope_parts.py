@@ -445,16 +445,17 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     )
     run = eqx.tree_at(lambda r: (r.window, r.scene), run_of(), (window, scene))
     run = eqx.tree_at(lambda r: r.trajectory, run, whole, is_leaf=lambda x: x is None)
-    asked = []
+    asked, angles = [], []
 
-    def averaged(scene, end, *, samples, throw):
+    def averaged(scene, end, *, samples, throw, start=None):
         asked.append((float(end), samples, throw))
+        angles.append(0.0 if start is None else float(start.exciters[0].rotor[0]))
         return run
 
     monkeypatch.setattr(run_ups, "envelope", averaged)
     monkeypatch.setattr(run_ups, "_least_torque", lambda *_, passed: 0.5 if passed else 2.0)
     found = jv.run_up(scene, "9 s")
-    assert asked == [(9.0, 4096, False)] and found.status_name == "passed" and np.isnan(found.least_torque)
+    assert asked == [(9.0, 4096, False)] * 8 and found.status_name == "passed" and np.isnan(found.least_torque)
     assert found.peak_amplitude.tolist() == [4e-3, 5e-3, 0.03] and float(found.peak_force) == pytest.approx(np.sqrt(37.0))
     assert found.speed.tolist() == [90.0, 80.0] and found.caught_at.tolist() == [0, 0]
     np.testing.assert_allclose(found.resonances, np.sort(jv.natural_frequencies(scene)), rtol=1e-12)
@@ -463,9 +464,11 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     lines = again.summary().splitlines()
     assert lines[0] == "all exciters pass all resonances below their working speeds"
     assert lines[1:3] == ["  exciter 0: 859.44 rpm", "  exciter 1: 763.94 rpm"]
-    assert lines[3].startswith("  peaks on the way: ") and lines[3].endswith("; foundation force 6.083 N")
-    assert lines[4] == "  all pass with torques of at least 0.5 times those of the motors" and len(lines) == 5
-    assert len(found.summary().splitlines()) == 4
+    np.testing.assert_allclose(angles[:8], np.arange(8) * np.pi / 4.0, rtol=1e-12)
+    assert lines[3] == "  peaks on the way (largest over the initial angles of the exciters):"
+    assert lines[4].startswith("    x 4 mm") and lines[4].endswith("; foundation force 6.083 N")
+    assert lines[5] == "  all pass with torques of at least 0.5 times those of the motors" and len(lines) == 6
+    assert len(found.summary().splitlines()) == 5
     slow = eqx.tree_at(lambda r: r.window.rotor_speeds[0], run, jnp.full(3, -5.0))
     monkeypatch.setattr(run_ups, "envelope", lambda *_, **__: slow)
     caught = jv.run_up(scene, "9 s", least=True)
