@@ -110,15 +110,16 @@ class BatchPlan(NamedTuple):
 class BatchRun(NamedTuple):
     """A run with its measurements.
 
-    **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured` and `regime` of the window; `part_speed`
-    (PARTS_OF_RUN, count): mean speeds of the loads, rad/s, over the equal parts before the window, each `part_length` s long;
-    `finite`: True if the motion stayed finite.
+    **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured` and `regime` of the window, the latter
+    None without loads or with several exciters; `part_speed` (PARTS_OF_RUN, count): mean speeds of the loads, or of rotors
+    without loads, rad/s, over the equal parts before the window, each `part_length` s long; `finite`: True if the motion
+    stayed finite.
     """
 
     scene: Scene
     window: Trajectory
     measured: Measured
-    regime: Regime
+    regime: Regime | None
     part_speed: Array
     part_length: Array
     finite: Array
@@ -157,5 +158,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
-    found = measure(model, field, times, states, natural_units(scene)), regime(scene, window)
-    return BatchRun(scene, window, *found, speed, jnp.asarray(length, dtype), is_finite(states))
+    measured = measure(model, field, times, states, natural_units(scene))
+    has_regime = len(scene.exciters) == 1 and scene.exciter.loads is not None
+    kind = regime(scene, window) if has_regime else None
+    return BatchRun(scene, window, measured, kind, speed, jnp.asarray(length, dtype), is_finite(states))

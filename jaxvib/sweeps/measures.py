@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import suggest_name
+from jaxvib.motion.analysis.measure import mean_speeds, turning_angles, turning_directions
 from jaxvib.motion.analysis.points import vibration_of
 from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.batch import BatchRun
@@ -52,17 +53,40 @@ Measure: TypeAlias = Quantity | RunMeasure
 """Type of a measure of a study."""
 
 
-def _regime(run: BatchRun) -> Array:
-    (which,) = jax.tree.leaves(run.regime.name)
-    return which
+def _of_regime(name: str, unit: str, field: str, meanings: tuple[str, ...] = ()) -> RunMeasure:
+    """Return a measure with the name of a `field` of `Regime`."""
+
+    def read(run: BatchRun) -> Array:
+        if run.regime is None:
+            problem = f"is {name}, which needs a scene with one exciter and loads"
+            raise InputError("measure", f"{problem}; for other scenes use run.load_speed, run.slip or run.shaft_torque")
+        (value,) = jax.tree.leaves(getattr(run.regime, field))
+        return value
+
+    return RunMeasure(name, unit, read, meanings=meanings)
 
 
 def _settling(run: BatchRun) -> Array:
-    """Return the end, s, of the last part of the run in which the speed of a load differs from its final speed."""
-    last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
-    away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * jnp.abs(rotor), axis=1)
-    late = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
-    return jnp.where(run.regime.change < _SETTLED_SPEED_SHARE, late, run.window.time[-1])
+    """Return the end, s, of the last part of the run in which the speed of a load or rotor differs from its final speed."""
+    last = run.measured.load_speed
+    if run.regime is None:
+        end, half = run.window.time.shape[0] - 1, run.window.time.shape[0] // 2
+        motion = turning_angles(run.scene, lambda: run.window.time, run.window.state)
+        early, late = mean_speeds(run.window.time, *motion, first=(0, half), last=(half - 1, end))
+        top = jnp.max(jnp.abs(last))
+        change = jnp.max(jnp.abs(late - early)) / top
+    else:
+        top, change = jnp.abs(run.window.rotor_speed[-1]), run.regime.change
+    away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * top, axis=1)
+    at = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
+    return jnp.where(change < _SETTLED_SPEED_SHARE, at, run.window.time[-1])
+
+
+def _slip(run: BatchRun) -> Array:
+    """Return the largest difference, rad, between the angles through which two loads or rotors turn in the window."""
+    angles, _ = turning_angles(run.scene, lambda: run.window.time, run.window.state)
+    turned = turning_directions(run.scene) * (angles[-1] - angles[0])
+    return jnp.max(turned) - jnp.min(turned)
 
 
 def _of_vibration(name: str, unit: str, field: str, axis: str = "") -> RunMeasure:
@@ -89,13 +113,14 @@ _DYNAMIC = _of_vibration("", "N", "dynamic_load", "support")
 RUN_MEASURES = {
     measure.name: measure
     for measure in (
-        RunMeasure("run.regime", "", _regime, meanings=REGIMES),
-        RunMeasure("run.mode", "", "regime.mode"),
+        _of_regime("run.regime", "", "name", REGIMES),
+        _of_regime("run.mode", "", "mode"),
         RunMeasure("run.load_speed", "rad/s", "measured.omega"),
         RunMeasure("run.amplitude", "m or rad", "measured.amplitude", axis="coordinate"),
         RunMeasure("run.foundation_force", "N", "measured.foundation_force"),
-        RunMeasure("run.ripple", "rad/s", "regime.ripple"),
-        RunMeasure("run.rotor_speed", "rad/s", "regime.rotor_speed"),
+        _of_regime("run.ripple", "rad/s", "ripple"),
+        _of_regime("run.rotor_speed", "rad/s", "rotor_speed"),
+        RunMeasure("run.slip", "rad", _slip),
         RunMeasure("run.drift", "", "measured.drift"),
         RunMeasure("run.settling_time", "s", _settling),
         _of_vibration("run.stroke", "m", "stroke", "translation"),
@@ -110,10 +135,12 @@ RUN_MEASURES = {
     )
 }
 """Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
-foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time, with
-a resolution of 1/64 of the run, after which each load speed differs from its final value by less than 1 % of the rotor
-speed. The measures from stroke to conveying speed are those of `VibrationMeasures`, for the centre of mass as the point. The
-support load is the sum of the static and the vertical dynamic load."""
+foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time,
+with a resolution of 1/64 of the run, after which each load speed differs from its final value by less than 1 % of the rotor
+speed. The slip is the largest difference between the angles through which two loads, or rotors without loads, turn in the
+measuring window. Regime, jam mode, ripple and rotor speed need a scene with one exciter and loads. The measures from stroke
+to conveying speed are those of `VibrationMeasures`, for the centre of mass as the point. The support load is the sum of the
+static and the vertical dynamic load."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

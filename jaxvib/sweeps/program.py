@@ -97,7 +97,7 @@ def _cases(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tu
 def _speeds(scene: Scene, values: Array, targets: tuple[Target, ...]) -> tuple[Array, Array, Array, Array]:
     def one(value: Array) -> tuple[Array, Array, Array, Array]:
         this = put(scene, targets, value)
-        return (*frequency_bounds(this), fastest_decay(this), this.drive.speed)
+        return (*frequency_bounds(this), fastest_decay(this), this.top_speed)
 
     return jax.vmap(one)(values)
 
