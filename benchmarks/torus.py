@@ -31,8 +31,7 @@ from machines import CONTACT, MODELS, published_tables, published_torus  # noqa:
 from parts import native_torus  # noqa: E402
 from parts.common import machine_line  # noqa: E402
 
-from jaxvib.study.capture.capture import moving_state  # noqa: E402
-from jaxvib.study.capture.refinement import DOUBLINGS  # noqa: E402
+from jaxvib.study.capture.capture import DOUBLINGS, moving_state  # noqa: E402
 
 SCENE = published_torus(2.5)
 TOUCHING = jv.Scene(SCENE.machine, SCENE.loads, SCENE.drive, (*SCENE.all_effects, CONTACT))

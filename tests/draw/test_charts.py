@@ -8,12 +8,11 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from jaxvib.draw.charts import before_after, branch_diagram
+from jaxvib.draw.charts import before_after, branch_diagram, regime_chart
 from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.criterion import agreement_maps, criterion_chart
 from jaxvib.draw.motion.histories import amplitude_histories, time_histories
 from jaxvib.draw.motion.spectra import path_chart
-from jaxvib.draw.regimes import regime_chart
 from jaxvib.draw.results import growth_chart, phase_circles, shapes_chart
 from jaxvib.draw.sweeps import label_map
 

@@ -9,7 +9,7 @@ from torus import OWN, RADIUS, balls
 import jaxvib as jv
 from jaxvib.machine.effects.contact import damping_ratio
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.study.capture.refinement import steps_per_second
+from jaxvib.study.capture.capture import steps_per_second
 
 HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
 

@@ -6,7 +6,7 @@ import pytest
 import jaxvib as jv
 from jaxvib.draw.machine.deck import ellipses
 from jaxvib.draw.machine.parts import turning_arrow
-from jaxvib.show.motion import motion_of_run
+from jaxvib.show.animate import motion_of_run
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import at_rest
 

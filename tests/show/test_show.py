@@ -11,7 +11,7 @@ from PIL import Image
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.show.motion import motion_of_orbit, motion_of_run
+from jaxvib.show.animate import motion_of_orbit, motion_of_run
 from jaxvib.show.views import Tie, order_of_ties, view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest
 

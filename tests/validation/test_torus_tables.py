@@ -9,7 +9,7 @@ from papers.printed_torus import TABLES, cosine_torus, gap_torus, printed_torus
 from papers.torus_tables import published_tables
 
 from jaxvib.equations.state import State
-from jaxvib.study.capture.refinement import steps_per_second
+from jaxvib.study.capture.capture import steps_per_second
 
 
 @pytest.mark.parametrize(("equations", "lever"), [(printed_torus, 15.0), (gap_torus, 2.5), (cosine_torus, 15.0)])

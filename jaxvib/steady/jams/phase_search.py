@@ -92,7 +92,7 @@ class PhaseJams(AbstractPhaseJam):
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a `unit` other than "rad/s", "rpm",
         "Hz".
         """
-        from jaxvib.draw.phases import drag_diagram  # slow import
+        from jaxvib.draw.results import drag_diagram  # slow import
 
         omega = np.asarray(self.omega)
         speeds = np.unique(np.concatenate([load_speeds(assemble_torque_balance(self.scene)), omega]))
@@ -357,7 +357,7 @@ class PhaseBranch(Result):
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
-        from jaxvib.draw.phases import drag_diagram  # slow import
+        from jaxvib.draw.results import drag_diagram  # slow import
 
         alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
         times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag / drag of the scene")

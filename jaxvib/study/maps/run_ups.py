@@ -91,7 +91,7 @@ class RunUps(Result):
         """
         shares = {kind: self.fraction(kind) for kind in (*REGIMES, _FAILED) if np.any(self.kind == kind)}
         rotor = np.max(np.asarray(self.regime.rotor_speed), initial=0.0, where=self.finished)
-        from jaxvib.draw.regimes import regime_chart  # slow import
+        from jaxvib.draw.charts import regime_chart  # slow import
 
         return regime_chart(self.drag, shares, self.omega, float(rotor), unit=unit, ax=ax)
 

@@ -14,8 +14,7 @@ from papers.printed_torus import printed_torus
 import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.draw.capture import torus_paths
-from jaxvib.study.capture.capture import capture_time, moving_state
-from jaxvib.study.capture.refinement import refine, steps_per_second
+from jaxvib.study.capture.capture import capture_time, moving_state, refine, steps_per_second
 
 
 def test_a_threshold_is_bracketed_ever_finer():

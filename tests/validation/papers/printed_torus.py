@@ -89,7 +89,7 @@ class PrintedTorus(eqx.Module):
     paper's tables come out nearer with it than with rho (`papers.torus_tables`). For comparison with the paper only.
 
     With R_1 the smoothed friction of the smallest ball is stiff, up to 116 w: steps that do not resolve it hide every capture
-    (`jaxvib.study.capture.refinement`).
+    (`jaxvib.study.capture.capture`).
 
     **Attributes**: the scene's parts; `lever` L m; `sine` 1, or 0 for the unbalance with the correct cosine.
     """
