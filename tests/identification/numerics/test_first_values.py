@@ -54,6 +54,14 @@ def test_few_turns_are_not_put_together():
     assert amplitudes(np.zeros((100, 1)), np.ones((100, 1), bool), angle[:100] * 20.0, 0.01)[0].size == 0  # 5 samples a turn
 
 
+def test_each_turn_begins_at_its_first_sample():
+    """An amplitude that grows by 1 from turn to turn of 49.95 samples."""
+    turns = np.arange(999) / 49.95
+    readings = (1.0 + np.floor(turns)) * np.sin(2.0 * np.pi * turns)
+    _, sizes, _ = amplitudes(readings[:, None], np.ones((999, 1), bool), 2.0 * np.pi * turns, 0.01)
+    np.testing.assert_allclose(sizes[:, 0], 1.0 + np.arange(19), rtol=1e-9)
+
+
 CHANNELS = (
     jv.Channel("a", "acceleration", at=(0.3, -0.1), direction=(0.6, 0.8)),
     jv.Channel("v", "velocity", at=(-0.2, 0.1), direction="across"),
