@@ -24,7 +24,8 @@ _WIDTH = 80
 def describe(group: str | None, name: str | None, output: Output) -> None:
     """List the contents of scene files: machines, loads, drives, effects, their arguments with units, defaults and meanings.
 
-    GROUP is machines, loads, drives or effects; NAME is a part, such as three_mass, whose whole documentation is printed."""
+    GROUP is machines, loads, drives, effects or tables ([[exciters]], [[machine.supports]], [[machine.bodies]]); NAME is a
+    part, such as three_mass or exciter, whose whole documentation is printed."""
     from jaxvib.machine.files import suggest_name
     from jaxvib.report.arguments import GROUPS, arguments_of, described
 

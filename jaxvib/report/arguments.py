@@ -10,14 +10,18 @@ from typing import NamedTuple
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import EFFECTS, SECTIONS, suggest_name
 from jaxvib.machine.numbers import PLAIN, number_specs
+from jaxvib.machine.scene import Exciter
+from jaxvib.machine.structures.plane_body import body, support
 
 GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
     "machines": SECTIONS["machine"],
     "loads": SECTIONS["loads"],
     "drives": SECTIONS["drive"],
     "effects": EFFECTS,
+    "tables": {"exciter": Exciter, "support": support, "body": body},
 }
-"""Parts of a scene, by group and by their name in a scene file."""
+"""Parts of a scene, by group and by their name in a scene file; "tables" are those of [[exciters]], [[machine.supports]] and
+[[machine.bodies]]."""
 
 
 class Argument(NamedTuple):

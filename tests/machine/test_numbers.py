@@ -225,9 +225,9 @@ def test_every_number_is_swept_and_freed(name):
 
 def test_described_units_and_bounds_are_those_of_fields():
     for kinds in GROUPS.values():
-        for kind, build in kinds.items():
+        for build in kinds.values():
             for argument in arguments_of(build):
-                spec = number_specs(PART_CLASSES[kind]).get(argument.name)
+                spec = number_specs(part_of(build)).get(argument.name)
                 assert (argument.unit, argument.bounds) == (spec.unit, spec.bounds.words) if spec else argument.unit == ""
 
 

@@ -72,6 +72,11 @@ UNITS = {
         "free_spin": {},
         "sliding": {"width": "m/s"},
     },
+    "tables": {
+        "exciter": {"unbalance": "kg m", "unbalance_mass": "kg"},
+        "support": {"at": "m", "stiffness": "N/m", "damping": "N s/m", "angle": "rad", "at_other": "m"},
+        "body": {"mass": "kg", "inertia": "kg m^2"},
+    },
 }
 
 

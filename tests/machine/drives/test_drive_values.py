@@ -347,3 +347,11 @@ def test_steady_torque_is_that_of_the_equivalent_circuit(speed):
     matrix = np.array([[0.4 + 377.0j * 0.072, 377.0j * 0.07], [1j * slip * 0.07, 0.8 + 1j * slip * 0.073]])
     stator, rotor = np.linalg.solve(matrix, [220.0 * np.sqrt(2.0 / 3.0), 0.0])
     np.testing.assert_allclose(motor.torque(speed), 3.0 * 0.07 * np.imag(rotor.conj() * stator), rtol=1e-12)
+
+
+def test_a_belt_divides_speeds_and_multiplies_torques():
+    """The data of a motor as seen from a shaft that turns 1.5 times as slowly, as documented."""
+    motor = jv.NamePlateMotor("7.5 kW", "1440 rpm", breakdown_ratio=2.6, inertia=0.045)
+    shaft = jv.NamePlateMotor("7.5 kW", "960 rpm", breakdown_ratio=2.6, inertia=0.1, frequency=2.0 * np.pi * 50.0 / 1.5)
+    speeds = np.linspace(0.0, 105.0, 9)
+    np.testing.assert_allclose(shaft.torque(speeds), 1.5 * motor.torque(1.5 * speeds), rtol=1e-9)
