@@ -173,8 +173,9 @@ def outcome(monkeypatch, **changes):
     rotors = [tuple(SimpleNamespace(error=each) for each in given["errors"])]
     two = np.array([[1.0, 2.0]])
     runs = [SimpleNamespace(channels=(channel("a"), channel("b")), taps=two)]
-    problem = SimpleNamespace(rotors=rotors, runs=runs, angles=[np.array([[7.0, 8.0]])], angle_errors=[0.05])
-    fitted = SimpleNamespace(problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(3))
+    unknowns = SimpleNamespace(count=5, errors=2)
+    problem = SimpleNamespace(unknowns=unknowns, rotors=rotors, runs=runs, angles=[np.array([[7.0, 8.0]])], angle_errors=[0.05])
+    fitted = SimpleNamespace(problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(5))
     status, least, notes = status_of(fitted, SimpleNamespace(undetermined=np.zeros((2, given["undetermined"]))))
     return status, least, notes
 
