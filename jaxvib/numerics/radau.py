@@ -11,6 +11,7 @@ from jax import Array
 from numpy.polynomial import legendre
 
 from jaxvib.numerics.linalg import small_solve
+from jaxvib.numerics.loops import repeat
 
 _STAGES = 6
 
@@ -73,15 +74,22 @@ def transition(slopes: Array, h: float | Array) -> Array:
     return jnp.tensordot(forms[:, -1], whole, 1).reshape(2 * m, 2 * m)
 
 
-def flow(slopes: Callable[[Array], Array], size: int, duration: float, steps: int | Array, dtype: jnp.dtype) -> Array:
+def flow(
+    slopes: Callable[[Array], Array],
+    size: int,
+    duration: float,
+    steps: int | Array,
+    dtype: jnp.dtype,
+    max_steps: int | None = None,
+) -> Array:
     """Transition matrix (2 m, 2 m) of (x, x') over a `duration` of x'' = P(t) x + R(t) x', in equal steps of `transition`.
 
-    **Arguments**: `slopes(t)`: [P, R] (m, 2 m); `size` m; `steps`, a Python number (then reverse derivatives exist) or a scalar
-    array.
+    **Arguments**: `slopes(t)`: [P, R] (m, 2 m); `size` m; `steps`, a Python number or a scalar array; `max_steps`: see
+    `repeat`.
     """
     h = jnp.asarray(duration / steps, dtype)
 
     def step(k: Array, over: Array) -> Array:
         return transition(jax.vmap(slopes)((k + jnp.asarray(NODES, dtype)) * h), h) @ over
 
-    return jax.lax.fori_loop(0, steps, step, jnp.eye(2 * size, dtype=dtype))
+    return repeat(step, steps, jnp.eye(2 * size, dtype=dtype), max_steps)

@@ -243,19 +243,21 @@ def orbits(
     deviation: Array | None = None,
     *,
     implicit: bool,
+    max_steps: int | None = None,
 ) -> tuple[Orbit, Floquet]:
     """Solve for several exact jams of one machine.
 
     **Arguments** (P jams, G bodies of loads, M points of the grid): `value` (P,): the given speed of each; `start` (P,):
-    initial values of the other speed; `deviation` (P, G, M): initial psi; `steps`, `implicit`: see `floquet`.
+    initial values of the other speed; `deviation` (P, G, M): initial psi; `steps`, `implicit`, `max_steps`: see `floquet`.
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`.
     """
     grid = grid_of(points, model.half_turn)
     motion, harmonics, measured = _solve_each(model, grid, given, (value, start, deviation))
-    resolved = jnp.asarray(steps) <= _MAX_INTEGRATION_STEPS
-    limited = min(steps, _MAX_INTEGRATION_STEPS) if isinstance(steps, int) else jnp.where(resolved, steps, 1)
-    growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit)
+    # Steps of twice the phase have errors of 1e-8.
+    resolved = jnp.asarray(steps) <= (_MAX_INTEGRATION_STEPS if max_steps is None else 2 * max_steps)
+    limited = jnp.where(resolved, steps if max_steps is None else jnp.minimum(steps, max_steps), 1)
+    growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit, max_steps=max_steps)
     multipliers, trivial, largest = _multipliers_of(growth, grid)
     slope, residual, speed_error, deviation_error, amplitude, force, power, contact_torque = measured
     tiny = jnp.finfo(slope.dtype).eps

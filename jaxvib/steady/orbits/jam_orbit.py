@@ -41,8 +41,8 @@ from jaxvib.units.known import is_known
 _MAX_SPEED_DIFFERENCE = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
-_UNKNOWN_STEPS = 64
-"""Number of integration steps for the multipliers under a JAX transformation; reverse derivatives need a static number."""
+_MAX_UNKNOWN_STEPS = 128
+"""Limit of the integration steps for the multipliers under a JAX transformation; reverse derivatives need a static limit."""
 
 _COLLOCATION_POINTS = (16, 32, 64, 128)
 """Collocation points on half a period, tried one after the other until the accuracy is reached."""
@@ -115,7 +115,7 @@ def jam_orbit(
         in_background(partial(_solve_program.prepare, problem, rough.points[0], None))
     plan = plan_orbit(scene, mode=mode, omega=omega, near=near, accuracy=accuracy, points=points)
     if not plan.is_known:
-        return outcome(_solve_program(plan.problem, plan.points[0], _UNKNOWN_STEPS), scene)
+        return outcome(_solve_program(plan.problem, plan.points[0], _MAX_UNKNOWN_STEPS), scene)
     orbit = _solve_accurately(plan)
     if plan.mode is not None and not abs(float(orbit.omega) / float(plan.problem.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
         # The mode does not exist in leading order, or is far from it: search the whole exact branch.
@@ -244,7 +244,7 @@ def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
     )
 
 
-def _outputs(orbit: Orbit, problem: JamProblem, points: int, steps: int | None) -> Orbit:
+def _outputs(orbit: Orbit, problem: JamProblem, points: int, max_steps: int | None) -> Orbit:
     """Return the outputs that follow from the solved motion, without multipliers and errors."""
     model = coincident_model(jammed_model(problem.scene))
     fields = differentiable_fields(model, orbit, problem.value, problem.start, problem.given, points)
@@ -252,10 +252,10 @@ def _outputs(orbit: Orbit, problem: JamProblem, points: int, steps: int | None) 
 
 
 @cached(outputs_from_solution=_outputs)
-def _solve_program(problem: JamProblem, points: int, steps: int | None) -> Orbit:
+def _solve_program(problem: JamProblem, points: int, max_steps: int | None) -> Orbit:
     """Solve for one exact jam.
 
-    **Arguments**: `steps` of the method for the multipliers (default: as many as the speeds need, without reverse derivatives).
+    **Arguments**: `max_steps`: limit of the steps for the multipliers, with which they have reverse derivatives.
     """
     scene, given, value, start, exists, direction, accuracy, implicit, settle = problem
     model, deviation = coincident_model(jammed_model(scene)), None
@@ -263,9 +263,9 @@ def _solve_program(problem: JamProblem, points: int, steps: int | None) -> Orbit
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
     speeds = (value, start) if given == "omega" else (start, value)
-    enough = steps_for(model, *speeds, implicit=implicit) if steps is None else steps
+    enough = steps_for(*jax.lax.stop_gradient((model, *speeds)), implicit=implicit)
     many = jnp.reshape(value, (1,)), jnp.reshape(start, (1,))
-    batch, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit)
+    batch, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit, max_steps=max_steps)
     orbit = jax.tree.map(lambda leaf: leaf[0], batch)
     # Odd modes lie on rising pieces of the branch, even modes on falling pieces.
     there = exists

@@ -17,6 +17,7 @@ from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid
 from jaxvib.numerics.linalg import small_solve
+from jaxvib.numerics.loops import repeat
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
 
@@ -245,6 +246,7 @@ def floquet(
     steps: int | Array,
     *,
     implicit: bool = False,
+    max_steps: int | None = None,
 ) -> Floquet:
     """Compute Floquet multipliers of the full state about periodic motions by one integration of all linear equations.
 
@@ -260,8 +262,8 @@ def floquet(
     All orbits are integrated with equal steps of the same length by Dormand and Prince's method of order 8 or, if `implicit`,
     by `radau.transition`, which resolves any drag of the loads and any damping of the carrier.
 
-    **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
-    derivatives exist) or a scalar array, see `steps_for`.
+    **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number or a scalar array, see
+    `steps_for`; `max_steps`: limit of a traced number, with which derivatives exist in reverse mode.
     """
     nd, count = model.linear.mass.shape[0], model.inertia.shape[0]
     equations = _Disturbances.about(model, motion)
@@ -273,7 +275,7 @@ def floquet(
     if has_relative_motion:
         fields, sizes = (*fields, equations.relative_motion), (*sizes, 1)
     transition = _implicit_transition if implicit else _explicit_transition
-    whole, *relative = transition(equations, grid, harmonics, fields, sizes, h, steps)
+    whole, *relative = transition(equations, grid, harmonics, fields, sizes, h, steps, max_steps)
     flip: Any = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
     trivial, rest = jax.vmap(deflate, in_axes=-1)(flip[:, None, None] * whole, equations.along_orbit(grid, harmonics))
     roots = _eigenvalues(rest).T
@@ -293,6 +295,7 @@ def _explicit_transition(
     sizes: Sequence[int],
     h: Array,
     steps: int | Array,
+    max_steps: int | None,
 ) -> tuple[Array, ...]:
     """Return transition matrices (2 n, 2 n, P) over a turn of the grid, one for each field, by explicit steps of length `h`."""
     dtype = equations.omega.dtype
@@ -316,7 +319,7 @@ def _explicit_transition(
         return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
 
     begin = lambda: tuple(_units(2 * size, equations) for size in sizes)  # noqa: E731
-    return _integrate(equations, grid, harmonics, _NODES, h, steps, begin, step)
+    return _integrate(equations, grid, harmonics, _NODES, h, steps, max_steps, begin, step)
 
 
 def _implicit_transition(
@@ -327,6 +330,7 @@ def _implicit_transition(
     sizes: Sequence[int],
     h: Array,
     steps: int | Array,
+    max_steps: int | None,
 ) -> tuple[Array, ...]:
     """Return the transition matrices of `_explicit_transition`, by implicit steps."""
     # One solve for all equations, because its program is as large as the rest of the step.
@@ -343,7 +347,7 @@ def _implicit_transition(
         return (jnp.einsum("abp,bcp->acp", over, state[0]),)
 
     begin = lambda: (_units(2 * total, equations),)  # noqa: E731
-    (end,) = _integrate(equations, grid, harmonics, radau.NODES, h, steps, begin, step)
+    (end,) = _integrate(equations, grid, harmonics, radau.NODES, h, steps, max_steps, begin, step)
     both = end.reshape(2, total, 2, total, orbits)
     parts = np.split(np.arange(total), np.cumsum(sizes)[:-1])
     return tuple(both[:, k][:, :, :, k].reshape(2 * k.size, 2 * k.size, orbits) for k in parts)
@@ -356,6 +360,7 @@ def _integrate(
     nodes: np.ndarray,
     h: Array,
     steps: int | Array,
+    max_steps: int | None,
     begin: Callable[[], tuple[Array, ...]],
     step: Callable[[_Coefficients, tuple[Array, ...]], tuple[Array, ...]],
 ) -> tuple[Array, ...]:
@@ -371,7 +376,7 @@ def _integrate(
         at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in found))
         return turned * turning, step(at, state)
 
-    return jax.lax.fori_loop(0, steps, whole_step, (jnp.ones_like(turning), begin()))[1]
+    return repeat(whole_step, steps, (jnp.ones_like(turning), begin()), max_steps)[1]
 
 
 def _units(size: int, equations: _Disturbances) -> Array:

@@ -49,8 +49,8 @@ from jaxvib.units.known import is_known
 
 __all__ = ["HasSpeedAndPhases", "SynchronousOrbit", "SynchronousStatus", "synchronous_orbit"]
 
-_UNKNOWN_STEPS = 64
-"""Number of integration steps for the multipliers under a JAX transformation; reverse derivatives need a static number."""
+_MAX_UNKNOWN_STEPS = 128
+"""Limit of the integration steps for the multipliers under a JAX transformation; reverse derivatives need a static limit."""
 
 _STABLE_MARGIN = 1e3
 """Distance of the largest multiplier from 1, in units of rounding, below which a disturbance counts as neither growing nor
@@ -243,7 +243,7 @@ def synchronous_orbit(
     """
     plan = plan_synchronous(scene, regime, speed=speed, phases=phases, accuracy=accuracy, points=points)
     if not plan.is_known:
-        return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
+        return outcome(_solve(plan, plan.points[0], _MAX_UNKNOWN_STEPS), plan.scene)
     orbit = None
     for points in plan.points:
         new = _solve(plan, points)
@@ -344,23 +344,22 @@ def _require_one_body(exciter: Exciter, place: str) -> None:
         )
 
 
-def _solve(plan: SynchronousPlan, points: int, steps: int | None = None) -> SynchronousOrbit:
-    return _solve_program(plan.scene, plan.speed, plan.phases, points, steps, plan.accuracy)
+def _solve(plan: SynchronousPlan, points: int, max_steps: int | None = None) -> SynchronousOrbit:
+    return _solve_program(plan.scene, plan.speed, plan.phases, points, max_steps, plan.accuracy)
 
 
 @cached
 def _solve_program(
-    scene: Scene, speed: Array, phases: Array, points: int, steps: int | None, accuracy: float
+    scene: Scene, speed: Array, phases: Array, points: int, max_steps: int | None, accuracy: float
 ) -> SynchronousOrbit:
     """Solve for one synchronous motion with a number of collocation points.
 
-    `steps`: number of integration steps in a period for the multipliers; None: as many as the machine needs, without reverse
-    derivatives.
+    `max_steps`: limit of the integration steps in a period for the multipliers, with which they have reverse derivatives.
     """
     whole, grid, forced = periodic_scene(scene, phases), grid_of(points, False), is_forced(scene)
     motion = solve_whole(whole, grid, speed, forced=forced)
     residual, error = collocation_error(whole, grid, motion, forced=forced)
-    multipliers, trivial = multipliers_of(whole, grid, motion, steps, forced=forced)
+    multipliers, trivial = multipliers_of(whole, grid, motion, max_steps, forced=forced)
     eps = float(jnp.finfo(speed.dtype).eps)
     largest = jnp.max(jnp.abs(multipliers))
     is_met = residual < 4096.0 * eps

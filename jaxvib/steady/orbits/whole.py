@@ -296,12 +296,13 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
 
 
 def multipliers_of(
-    scene: PeriodicScene, grid: Grid, motion: WholeMotion, steps: int | None, *, forced: bool
+    scene: PeriodicScene, grid: Grid, motion: WholeMotion, max_steps: int | None, *, forced: bool
 ) -> tuple[Array, Array]:
     """Return the Floquet multipliers of the full state about a periodic motion, and the trivial one.
 
-    Without forcing the trivial multiplier of a shift in time is not among the others; with forcing it is NaN. `steps` of
-    `radau.flow` in a period; None for as many as the carrier's fastest vibration needs.
+    Without forcing the trivial multiplier of a shift in time is not among the others; with forcing it is NaN. The
+    steps of `radau.flow` in a period are as many as the carrier's fastest vibration needs; `max_steps` is their limit, with
+    which derivatives exist in reverse mode.
     """
     x, omega = motion
     n, orders = x.shape[0], jnp.asarray(grid.deviation_orders, x.dtype)
@@ -312,7 +313,9 @@ def multipliers_of(
         at = theta, (harmonics @ wave).real, (harmonics @ (1j * orders * wave)).real, omega
         return scene.slopes(*at)[0][:, : 2 * n]
 
-    whole = radau.flow(slopes, n, 2.0 * np.pi, _steps_for(scene, omega) if steps is None else steps, x.dtype)
+    steps = _steps_for(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(omega))
+    steps = steps if max_steps is None else jnp.clip(steps, 1, max_steps)
+    whole = radau.flow(slopes, n, 2.0 * np.pi, steps, x.dtype, max_steps)
     if forced:
         return jnp.linalg.eigvals(whole), jnp.full_like(omega, jnp.nan)
     rate, second = _rates(grid, x)
