@@ -22,9 +22,13 @@ from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as IntegratorState
 from jaxvib.runtime.compat import fast_diffrax_loop_end
+from jaxvib.runtime.devices import is_processor
 
 BATCH_SIZE = 64
 """Number of runs in a batch on a core: enough to fill the vector registers, and few enough to fit into the cache."""
+
+_ACCELERATOR_BATCH_SIZE = 2**18
+"""Number of runs in a batch on an accelerator: enough to occupy all of its units, and few enough for its memory."""
 
 PARTS_OF_RUN = 64
 """Number of equal parts of a run before its window; the mean speeds of the loads are measured over each part."""
@@ -84,6 +88,11 @@ def pack_batch(
     if implicit:
         return PackedSystem(field, state, solver=Rodas4())
     return PackedSystem(field, state, wrapped=single, has_common_turns=has_common_turns, batch=True)
+
+
+def batch_size() -> int:
+    """Return the number of runs that advance together on JAX's default device."""
+    return BATCH_SIZE if is_processor() else _ACCELERATOR_BATCH_SIZE
 
 
 class BatchPlan(NamedTuple):

@@ -36,6 +36,12 @@ def shared_devices() -> list[object]:
     return list(found) if chosen is None and len(found) > 1 and found[0].platform != "cpu" else [None]
 
 
+def is_processor() -> bool:
+    """Return True if JAX computes on the processor at present, False on an accelerator."""
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return (chosen if isinstance(chosen, str) else (chosen or jax.local_devices()[0]).platform) == "cpu"
+
+
 def known(value: ArrayLike) -> Any:
     """Convert a value to NumPy, because arithmetic on JAX arrays would compile a program; return a tracer unchanged."""
     return value if traced(value) else np.asarray(value)
