@@ -35,7 +35,9 @@ def test_entries_of_a_batch_have_their_own_counts():
     counts, xs = np.array([3, 0, 7]), np.array([0.5, 0.6, -0.7])
     values, taken = jax.vmap(lambda x, n: polynomial(x, n, 9))(xs, counts)
     slopes = jax.grad(lambda xs: jnp.sum(jax.vmap(lambda x, n: polynomial(x, n, 9)[0])(xs, counts)))(xs)
-    np.testing.assert_allclose([values, slopes], np.transpose([closed_form(*each) for each in zip(xs, counts, strict=True)]), rtol=1e-14)
+    np.testing.assert_allclose(
+        [values, slopes], np.transpose([closed_form(*each) for each in zip(xs, counts, strict=True)]), rtol=1e-14
+    )
     np.testing.assert_array_equal(taken, counts)
 
 

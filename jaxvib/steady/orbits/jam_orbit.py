@@ -263,7 +263,7 @@ def _solve_program(problem: JamProblem, points: int, max_steps: int | None) -> O
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
     speeds = (value, start) if given == "omega" else (start, value)
-    enough = steps_for(*jax.lax.stop_gradient((model, *speeds)), implicit=implicit)
+    enough = steps_for(model, *speeds, implicit=implicit)
     many = jnp.reshape(value, (1,)), jnp.reshape(start, (1,))
     batch, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit, max_steps=max_steps)
     orbit = jax.tree.map(lambda leaf: leaf[0], batch)

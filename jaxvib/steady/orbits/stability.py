@@ -16,7 +16,7 @@ from jax import Array
 from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid
-from jaxvib.numerics.linalg import small_solve
+from jaxvib.numerics.linalg import relative_to, small_solve
 from jaxvib.numerics.loops import repeat
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
@@ -52,28 +52,28 @@ class Floquet(NamedTuple):
     trivial: Array
 
 
-class _Rates(NamedTuple):
-    """Fastest rates of the linear equations: `oscillation` of the carrier, rad/s, and decay by `damping` of the carrier and by
-    `drag` of the loads, 1/s."""
+def _oscillation(model: CoincidentModel, speed: Array) -> Array:
+    """Return the rate of the carrier's fastest oscillation at the rotor's `speed`, rad/s."""
+    linear, gyroscopic = model.linear, model.linear.mount.gyroscopic
+    square, half = relative_to(linear.mass, linear.carrier.stiffness)
+    fastest = jnp.sqrt(jnp.max(jnp.abs(jnp.linalg.eigvalsh(square, symmetrize_input=False))))
+    return fastest if gyroscopic is None else fastest + speed * jnp.linalg.norm(half @ gyroscopic @ half.T)
 
-    oscillation: Array
-    damping: Array
-    drag: Array
+
+def _damping_rate(model: CoincidentModel) -> Array:
+    """Return the fastest rate of decay by damping of the carrier, 1/s."""
+    square, _ = relative_to(model.linear.mass, model.linear.carrier.damping)
+    return jnp.max(jnp.linalg.eigvalsh(square, symmetrize_input=False))
 
 
-def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
-    """Return the rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
+def _drag_rate(model: CoincidentModel, omega: Array, speed: Array) -> Array:
+    """Return the fastest rate of decay by drag and friction of the loads at load speeds `omega`, 1/s.
 
-    The motion of a body of loads decays by drag and friction; the motion of the carrier reduces its inertia. The rate is
+    The motion of the carrier reduces the inertia of a body of loads. The rate is
 
         max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
     """
-    linear, carrier, mount = model.linear, model.linear.carrier, model.linear.mount
-    half = jnp.linalg.inv(jnp.linalg.cholesky(linear.mass))
-    oscillation = jnp.max(linear.modes()[0])
-    damping = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
-    if mount.gyroscopic is not None:
-        oscillation = oscillation + speed * jnp.linalg.norm(half @ mount.gyroscopic @ half.T)
+    linear, mount = model.linear, model.linear.mount
     still = jnp.zeros((len(mount.axes), 1), linear.mass.dtype)
 
     def fastest(omega: Array, speed: Array) -> Array:
@@ -81,16 +81,16 @@ def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
         by_rate = model.torque_slopes(0.0 * one, omega * one, speed, still)[1]
         return jnp.max(-by_rate[:, 0] / model.inertia)
 
-    accelerance = jnp.max(jnp.linalg.eigvalsh(mount.rows[0] @ half.T @ half @ mount.rows[0].T))
+    accelerance = jnp.max(jnp.linalg.eigvalsh(mount.rows[0] @ small_solve(linear.mass, mount.rows[0].T)))
     left = 1.0 - accelerance * jnp.sum(model.unbalance**2 / model.inertia)
-    return _Rates(oscillation, damping, jnp.vectorize(fastest)(omega, speed) / left)
+    return jnp.vectorize(fastest)(omega, speed) / left
 
 
 def is_stiff(model: CoincidentModel, omega: Array, speed: Array) -> Array:
     """Return True if multipliers at load speeds `omega` and the rotor's `speed` (rad/s) need the implicit method, because of
     the decay rates of loads and carrier."""
-    rates = _rates(model, omega, speed)
-    return jnp.maximum(rates.damping, rates.drag) > _STIFF_DECAY_RATIO * (rates.oscillation + 2.0 * omega)
+    decay = jnp.maximum(_damping_rate(model), _drag_rate(model, omega, speed))
+    return decay > _STIFF_DECAY_RATIO * (_oscillation(model, speed) + 2.0 * omega)
 
 
 def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
@@ -98,11 +98,10 @@ def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: b
 
     An `implicit` method is stable at any rate of decay; its steps follow the oscillation only.
     """
-    rates = _rates(model, omega, speed)
-    turn = np.pi if model.half_turn else 2.0 * np.pi
+    turn, fastest = np.pi if model.half_turn else 2.0 * np.pi, _oscillation(model, speed)
     if implicit:
-        return radau.steps_for(turn * (rates.oscillation / omega + 2.0))
-    return jnp.ceil(turn * (jnp.maximum(rates.oscillation, rates.damping) / omega + 2.0) / _PHASE_PER_STEP).astype(int)
+        return radau.steps_for(turn * (fastest / omega + 2.0))
+    return jnp.ceil(turn * (jnp.maximum(fastest, _damping_rate(model)) / omega + 2.0) / _PHASE_PER_STEP).astype(int)
 
 
 class _Coefficients(NamedTuple):
