@@ -1,6 +1,6 @@
 """Large batches on an accelerator, in multiples of two cores of the same computer; compile time apart.
 
-    python benchmarks/accelerator.py [--quick] [--out FOLDER]
+    python benchmarks/trials/accelerator.py [--quick] [--out FOLDER]
 
 The work is 1e6 runs with full equations (`ensemble`, 200 s each), 1e6 leading-order designs with gradient, 1e5 exact orbits,
 and 1e4 exact orbits with their multipliers. A process on two cores computes every hundredth run and every tenth orbit; its
@@ -31,6 +31,8 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from parts.common import best, cpu_name, first, published, thrown, versions  # noqa: E402
 
