@@ -3,7 +3,7 @@
 Each machine is a lightly damped body on two springs with two equal weak motors. The criterion is compared with the growth rate
 of the averaged equations.
 
-    python benchmarks/trials/quasi_static.py 4000
+    python benchmarks/exciters/quasi_static.py 4000
 """
 
 from __future__ import annotations
