@@ -92,6 +92,13 @@ def test_restitution_is_read_from_files_and_checked():
         jv.Scene(HEAVY, uneven, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))
 
 
+def test_compiled_run_ups_build_a_restitution_anew():
+    again = jax.jit(lambda damping, e: jv.LoadContact(1e5, damping, e).restitution)(0.0, 0.7)
+    assert float(again) == pytest.approx(0.7)
+    found = jv.run_ups(plane(0.7), 0.1, angles=[[0.0, 1.0]], stepsize_controller=jv.EqualSteps(200))
+    assert bool(np.all(found.finished))
+
+
 def test_overlapping_balls_are_refused_named_starts_avoid_them():
     s, zero = on_equator(0.5, count=3), jnp.zeros(2)
 

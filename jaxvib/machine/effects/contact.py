@@ -70,7 +70,8 @@ class LoadContact(Effect):
         self.restitution = None
         if restitution is not None:
             self.restitution = read(restitution=restitution)["restitution"]
-            if when_known(lambda damping: damping == 0.0, self.damping) is not True:
+            # A scene with traced values is built anew for its checks; the damping was then checked before.
+            if when_known(lambda damping: damping == 0.0, self.damping) is False:
                 problem = "excludes damping, which it determines; leave one of them out"
                 raise InputError("effects.load_contact.restitution", problem)
         self.kind = "load_contact"
