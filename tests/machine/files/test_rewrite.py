@@ -12,7 +12,7 @@ from jaxvib.machine.rewrite import rewrite_scene
 CHANGES = [("stiffness", (1.1, 0.7)), ("mass", (1.01, 2.0))]
 
 
-ALL = TEMPLATES | SCREENS
+ALL = {**TEMPLATES, **SCREENS}
 
 
 @pytest.mark.parametrize("kind", ALL)
