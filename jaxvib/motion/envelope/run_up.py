@@ -99,15 +99,10 @@ class MotorRunUp(Result):
         lines += [f"  peaks on the way{of}:", f"    {peaks}; foundation force {quantity_text(self.peak_force, 'N', 4)}"]
         if np.isfinite(self.least_torque):
             lines.append(f"  all pass with torques of at least {float(self.least_torque):.3g} times those of the motors")
-            lines += [
-                f"  (with {_lifting_factor(self.scene):.3g} times a motor just lifts its unbalance)"
-            ] * self._is_lifting_limit
+            lifting = _lifting_factor(self.scene)
+            if abs(float(self.least_torque) - lifting) < _LIFTING_SHARE * lifting:
+                lines.append(f"  (with {lifting:.3g} times a motor just lifts its unbalance)")
         return "\n".join(lines)
-
-    @property
-    def _is_lifting_limit(self) -> bool:
-        """True if the weight of an unbalance, and no resonance, decides the least torque."""
-        return bool(abs(float(self.least_torque) / max(_lifting_factor(self.scene), 1e-9) - 1.0) < _LIFTING_SHARE)
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
