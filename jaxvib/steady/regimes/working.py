@@ -139,7 +139,7 @@ def _fastest_starts(balance: TorqueBalance, sets: np.ndarray) -> Array:
     """Return for each set of phases (n, count) the largest speed (n,) at which the sum of all torques falls through 0."""
     if balance.is_prescribed.any():
         return jnp.full(len(sets), balance.speed)
-    speeds = balance.speed * np.linspace(_LOWEST_SPEED, _HIGHEST_SPEED, _SPEEDS, dtype=sets.dtype)
+    speeds = balance.speed * np.linspace(_LOWEST_SPEED, _HIGHEST_SPEED, _SPEEDS)
     influence, torque = jax.vmap(lambda w: (influence_of(balance, w), balance.driving_torque(w)))(speeds)
     forces = balance.unbalance[None] * np.exp(1j * sets)
     vibration = jnp.einsum("ai,gik,ak->ag", forces.conj(), influence, forces).imag * (speeds**4 / 2.0)[None]

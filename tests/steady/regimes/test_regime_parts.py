@@ -555,3 +555,16 @@ def test_wrong_groups_starts_and_speeds_are_refused():
     loads = jv.Exciter(jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(80.0))
     synchronous.require_one_speed(jv.Scene(body(), exciters=[exciters[0], loads]))
     assert synchronous.mass_owners(jv.Scene(body(), exciters=[exciters[0], loads, exciters[1]])).tolist() == [0, 1, 1, 2]
+
+
+def test_working_regime_starts_once_from_equal_phases(monkeypatch):
+    asked = []
+
+    def starts(balance, sets):
+        asked.append(sets)
+        raise StopIteration
+
+    monkeypatch.setattr(working, "_fastest_starts", starts)
+    with pytest.raises(StopIteration):
+        working._stable_solution(assemble_torque_balance(DRIVEN))
+    np.testing.assert_allclose(np.sort(np.mod(asked[0][:, 1], 2.0 * np.pi)), 0.5 * np.pi * np.arange(4), atol=1e-12)
