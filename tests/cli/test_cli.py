@@ -419,6 +419,7 @@ def test_regimes_lists_speeds_and_phases_of_exciters(typed, tmp_path):
     assert (tmp_path / "o" / "regimes.png").stat().st_size > 10_000
     out = typed("regimes", "screen.toml", "--deck", "0.4, 0.1", "--slope", "-5 deg")[1]
     assert "954.887" in out and "point (0.4, 0.1) m: stroke" in out and max(map(len, out.splitlines())) <= 80
+    assert "rotation: exciter 0 anticlockwise, exciter 1 clockwise" in out and "margin: factor" in out
     shown = float(out.split("throw number ")[1].split(",")[0])
     scene = jv.load_scene(tmp_path / "screen.toml")
     np.testing.assert_allclose(shown, jv.working_regime(scene).ellipse((0.4, 0.1), slope="-5 deg").throw_number, rtol=5e-3)

@@ -65,6 +65,12 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
         head = [unit, "", " ", "phases, degrees", "margin", "power, W", "foundation force, N"]
         drawn = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
         stable = [(regime, own) for regime, own in zip(each, measures, strict=True) if own is not None]
-        return "\n".join([drawn, *(indented(f"at {speed_text(regime.speed)}, stable:", own) for regime, own in stable)])
+        ways = ("anticlockwise" if each.direction == 1 else "clockwise" for each in loaded.exciters)
+        notes = [
+            f"rotation: {', '.join(f'exciter {k} {way}' for k, way in enumerate(ways))}",
+            "margin: factor by which the differences of the motors' torques can grow; inf for",
+            "equal motors",
+        ]
+        return "\n".join([drawn, *notes, *(indented(f"at {speed_text(regime.speed)}, stable:", own) for regime, own in stable)])
 
     output.done(document, text, "regimes", found)
