@@ -230,6 +230,7 @@ class Synthesis(Result):
             lines.append(f"  1 % less / more {each.what}: {changed(each.less, each.more)}")
         equal = [m for m in self.machines if abs(m.value - best) <= _EQUAL_VALUE * abs(best)]
         unit, factor = shown_unit(self.unit, abs(best))
+        factor = -factor if objective_text(self.objective).startswith("greatest ") else factor
         if len(equal) > 1 and len(equal) == len(self.machines):
             value = f"{best * factor:.4g} {unit}".rstrip()
             lines.append(

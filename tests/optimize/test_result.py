@@ -40,6 +40,8 @@ def test_results_are_given_in_the_units_of_designers(searched):
     assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
     assert [line.split(":")[0][-8:] for line in said[4:8]] == [f"number {k}" for k in (6, 5, 4, 3)]
     assert said[8] == "  2 different machines: 3 x 20, 1 x 30 kN"
+    greatest = dataclasses.replace(searched, objective="negative pull", machines=(Machine(3, -2e4, (1.0,)), machines[0]))
+    assert greatest.findings()[-1] == "  2 different machines: 3 x 20, 3 x -20 kN"
     one = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=machines[:1]).findings()
     assert one == ["  1 % less / more x: +400 kN / -0.2 kN"]  # 2000 % of 2e4 N: of almost nothing a share tells nothing
     none = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=()).findings()

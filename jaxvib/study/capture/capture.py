@@ -107,11 +107,12 @@ class Capture(Result):
     def summary(self) -> str:
         """Return the threshold with its uncertainty, and the share of captures below it, as text."""
         n = self.captured.shape[1]
-        head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
+        starts = "1 start" if n == 1 else f"{n} starts"
+        head = f"{self.message} ({self.speed.size} speeds, {starts} each, {int(self.turns)} turns)"
         doubled = (
             ""
             if np.isnan(self.last_change)
-            else f"; their last doubling changed the threshold by {float(self.last_change):.1e}"
+            else f"; the last doubling of the steps changed the threshold by {float(self.last_change):.1e}"
         )
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
@@ -137,7 +138,7 @@ class Capture(Result):
 
 
 def moving_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
-    """Return the state with the carrier at rest, and the loads side by side on the equator of the tube with a common speed.
+    """Return the state with the carrier at rest, and the loads side by side at the bottom of the tube with a common speed.
 
     **Arguments**: `speed` psi'/w relative to the rotor, -1 for loads at rest in space; `shift`, rad, of the loads along the
     ring, a scalar or (count,). The angle between neighbouring loads is 2 atan(r/R), as in the source of `capture`.

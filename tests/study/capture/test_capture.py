@@ -26,7 +26,7 @@ def test_a_threshold_is_bracketed_ever_finer():
     assert abs(float(fine.threshold) - float(coarse.threshold)) <= float(coarse.uncertainty)
     assert np.all(np.diff(fine.speed) > 0.0) and np.all(fine.finite)
     assert np.all(fine.captured[fine.speed > float(fine.threshold)])
-    assert "threshold" in fine.summary()
+    assert "4 speeds, 1 start each, 150 turns" in coarse.summary() and "threshold" in fine.summary()
     # A run of its own says the same on both sides.
     for speed, caught in ((float(fine.threshold) + 0.15, True), (float(fine.threshold) - 0.15, False)):
         until = 150.0 * 2.0 * np.pi / float(scene.drive.speed)
@@ -49,6 +49,7 @@ def test_thrown_balls_lie_side_by_side_from_their_shift_on():
     state = moving_state(scene, -0.4, shift=0.3)
     np.testing.assert_allclose(state.angle[0], 0.3 + beside * np.arange(scene.loads.count), rtol=1e-12)
     np.testing.assert_allclose(state.rate[0], 0.6 * float(scene.drive.speed), rtol=1e-12)
+    np.testing.assert_allclose(scene.loads.position(*state.angle)[2], -float(scene.loads.tube - scene.loads.ball_radius))
 
 
 def test_a_threshold_curve_is_captures_beside_each_other():
