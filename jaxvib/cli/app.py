@@ -205,6 +205,7 @@ _GROUPS = {
     "Steady states": {
         "modes": "modes",
         "criterion": "criterion",
+        "balance": "criterion",
         "whirl": "whirl",
         "response": "motion.response",
         "regimes": "motion.regimes",

@@ -1,7 +1,8 @@
-"""jaxvib criterion."""
+"""jaxvib criterion, balance."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,10 +10,13 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED, SPEED_TYPE, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from jaxvib.steady.balance.states import BalancedStability
 
 
 @app.command("criterion")
@@ -79,3 +83,80 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
 
 def _ends(span: Sequence[float | None], scale: float) -> list[str]:
     return ["no end" if end is None else f"{scale * end:.6g}" for end in span]
+
+
+@app.command("balance")
+@click.argument("scene", type=click.Path(path_type=Path))
+@SPEED
+@click.option(
+    "--between",
+    nargs=2,
+    type=SPEED_TYPE,
+    metavar="LOW HIGH",
+    help="Also find the rotor speeds between these two at which each arrangement is stable, such as '300 rpm' '1500 rpm'.",
+)
+@click.option("--points", type=int, default=200, show_default=True, help="Number of speeds for --between.")
+@WITHOUT
+@shared
+def balance(
+    scene: Path,
+    speed: str | None,
+    between: tuple[str, str] | None,
+    points: int,
+    without: tuple[str, ...],
+    output: Output,
+) -> None:
+    """List the arrangements in which the loads of SCENE balance its rotor, and their exact stability at the rotor speed;
+    --out adds a picture.
+
+    The loads run in one plane or at two stations. The stability follows from the Floquet multipliers of the full equations."""
+    from jaxvib.units import number  # slow import, which --help does not need
+
+    loaded = loaded_scene(scene, without, speed)
+    ends = None if between is None else [float(number(each, "rad/s", "--between", low=0.0)) for each in between]
+    found = jv.balanced_states(loaded)
+    judged = [found.stability(k) for k in range(len(found.angles))]
+    stable = [] if ends is None else [found.intervals(*ends, arrangement=k, points=points) for k in range(len(judged))]
+    output.picture("balance.png", found.plot)
+    document = {
+        "rotor_speed": loaded.drive.speed,
+        "status": found.message,
+        "share": found.share,
+        "neutral_directions": found.names,
+        "arrangements": [
+            {"angles": angles, **fields_of(each, "stable", "is_decided", "growth", "error")}
+            | ({"stable_between": stable[k]} if stable else {})
+            for k, (angles, each) in enumerate(zip(found.angles, judged, strict=True))
+        ],
+    }
+    output.done(document, lambda: _balance_text(found, judged, stable), "balance", found)
+
+
+def _balance_text(found: jv.BalancedStates, judged: list[BalancedStability], stable: list[list[list[float]]]) -> str:
+    """Return the arrangements as a table, below lines with the answer."""
+    from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
+    from jaxvib.results.status import status_name
+    from jaxvib.steady.jams.phases import degrees
+
+    unit, scale = speed_unit()
+    names = [status_name(each.status) for each in judged]
+    answer = next((name for name in ("stable", "undecided", "unstable") if name in names), "impossible")
+    lines = [f"balanced motion at {speed_text(found.scene.drive.speed)}: {answer}", textwrap.fill(found.message, 80)]
+    for k, share in enumerate(found.share):
+        plane = f" in plane {k + 1}" if len(found.share) > 1 else ""
+        lines.append(f"imbalance{plane}: {100.0 * share:.4g} % of the unbalance of all loads{' there' if plane else ''}")
+    rows = [
+        [str(k + 1), name, f"{each.growth:.4g}", " ".join(f"{degrees(float(a)):.4g}" for a in angles)]
+        for k, (name, each, angles) in enumerate(zip(names, judged, found.angles, strict=True))
+    ]
+    if rows:
+        head = ["arrangement", "", "growth, 1/s", "angles of the loads in the rotor, degrees"]
+        lines.append(table("arrangements (growth below 0: disturbances decay)", head, rows))
+    if stable:
+        spans = [[str(k + 1), *(f"{scale * end:.6g}" for end in span)] for k, each in enumerate(stable) for span in each]
+        lines.append(
+            table("rotor speeds at which an arrangement is stable", ["arrangement", f"from, {unit}", f"to, {unit}"], spans)
+            if spans
+            else "stable at none of the speeds between these two"
+        )
+    return "\n".join(lines)

@@ -372,7 +372,8 @@ def require_one_point(scene: Scene) -> None:
 
 def _stations_differ() -> InputError:
     problem = (
-        "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, or simulate"
+        "differ; this function needs loads that run at one point of the machine: use phase_jams for their jams, "
+        "balanced_states for their balance (jaxvib balance), or simulate"
     )
     return InputError("machine.stations", problem)
 

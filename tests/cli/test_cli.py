@@ -80,6 +80,35 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
 
 
+def test_balance_lists_arrangements_and_their_stability(typed, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(jv.BalancedStates, "intervals", lambda _, *a, **options: asked.append((a, options)) or [[50.0, a[1]]])
+    machine = jv.planar_rotor(mass=20.0, stiffness="40 N/mm", damping="3 %")
+    loads = jv.balls(count=2, mass="50 g", radius=0.08, drag=1.0)
+    rotor = jv.Scene(machine, loads, jv.ConstantSpeed("900 rpm"), (jv.Gravity(), jv.StaticImbalance("4 g m")))
+    jv.save_scene(rotor, tmp_path / "rotor.toml")
+    code, _, err = typed("balance", "rotor.toml")
+    assert code == 2 and err.endswith(
+        "effects.gravity disturbs the balanced motion; leave it out, or simulate (--without gravity)\n"
+    )
+    words = ("balance", "rotor.toml", "--without", "gravity")
+    ends = ("--between", "300 rpm", "900 rpm", "--points", "16")
+    code, out, err = typed(*words, *ends, "--json", "--out", "o")
+    document = json.loads(out)
+    assert (code, err) == (0, "") and (tmp_path / "o" / "balance.png").stat().st_size > 10_000
+    assert document["rotor_speed"] == pytest.approx(30.0 * np.pi) and document["share"] == pytest.approx([0.5])
+    for each in document["arrangements"]:
+        left = np.sum(0.05 * 0.08 * np.exp(1j * np.array(each["angles"]))) + 0.004
+        assert abs(left) < 1e-12 and each["stable"] and each["growth"] < 0.0
+        assert each["stable_between"] == [[50.0, pytest.approx(30.0 * np.pi)]]
+    range_ = (pytest.approx(10.0 * np.pi), pytest.approx(30.0 * np.pi))
+    assert asked == [(range_, {"arrangement": k, "points": 16}) for k in (0, 1)]
+    code, out, _ = typed(*words)
+    assert code == 0 and out.startswith("balanced motion at 900 rpm: stable\n") and max(map(len, out.splitlines())) <= 80
+    assert "imbalance: 50 % of the unbalance of all loads" in out and "to, rpm" not in out
+    assert typed(*words, "--speed", "300 rpm")[1].startswith("balanced motion at 300 rpm: unstable\n")
+
+
 def test_exact_modes_json_has_the_promised_keys(typed):
     code, out, err = typed("modes", "machine.toml", "--exact", "--json")
     document = json.loads(out)

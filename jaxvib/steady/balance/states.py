@@ -17,8 +17,8 @@ from jaxvib.display import Axes, Drawn, Onto
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import natural_frequencies, turning_loads
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.effects.base import terms_of
-from jaxvib.machine.effects.terms import RotorImbalance
+from jaxvib.machine.effects.base import has_term, terms_of
+from jaxvib.machine.effects.terms import GravityField, LoadInteraction, RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -112,6 +112,13 @@ class BalancedStates(Result):
         """
         return balanced_intervals(self.scene, low, high, self._angles_of(arrangement), points=points, steps=steps)
 
+    @property
+    def share(self) -> np.ndarray:
+        """Imbalance of the rotor in each plane of the loads, divided by the sum of m_j R_j there, (planes,): 0 for a balanced
+        rotor, above 1 if the loads cannot cancel it. Planes ascend along the axis."""
+        sides = _sides(turning_loads(self.scene))
+        return np.array([abs(plane.imbalance) / np.sum(sides[plane.loads]) for plane in _planes(self.scene)])
+
     def _angles_of(self, arrangement: int) -> np.ndarray:
         """Return the angles of an arrangement. **Raises** `ComputationError` if there is no arrangement."""
         if not len(self.angles):
@@ -188,7 +195,8 @@ def balanced_states(scene: Scene) -> BalancedStates:
     """
     scene = validate_scene(scene)
     sides, planes = _sides(turning_loads(scene)), _planes(scene)
-    found = [_arrangements(sides[plane.loads], plane.imbalance) for plane in planes]
+    ordered = has_term(scene.all_effects, LoadInteraction)
+    found = [_arrangements(sides[plane.loads], plane.imbalance, ordered=ordered) for plane in planes]
     n, failed = sides.size, [each.status for each in found if not len(each.angles)]
     if failed:
         return BalancedStates(_status(failed), np.zeros((0, n)), 0, [], (), scene)
@@ -224,8 +232,9 @@ class _Arrangements(NamedTuple):
     names: tuple[str, ...]
 
 
-def _arrangements(loads: np.ndarray, imbalance: complex) -> _Arrangements:
-    """Return the arrangements of loads (N,) kg m that cancel each other and an imbalance, kg m, in their plane."""
+def _arrangements(loads: np.ndarray, imbalance: complex, *, ordered: bool) -> _Arrangements:
+    """Return the arrangements of loads (N,) kg m that cancel each other and an imbalance, kg m, in their plane; if the loads
+    cannot pass each other (`ordered`), only those in which their angles ascend within a turn."""
     n, free = loads.size, imbalance == 0.0
     sides = loads if free else np.append(loads, abs(imbalance))
     largest = sides.max()
@@ -240,6 +249,9 @@ def _arrangements(loads: np.ndarray, imbalance: complex) -> _Arrangements:
         one = _inscribed_polygon(sides) * np.array([[1.0], [-1.0]])
     fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
     angles = np.mod(one - one[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
+    if ordered:
+        angles = angles[:, :1] + np.cumsum(np.mod(np.diff(angles, axis=1, prepend=angles[:, :1]), 2.0 * np.pi), axis=1)
+        angles = angles[angles[:, -1] - angles[:, 0] < 2.0 * np.pi]
     neutral = [_neutral(loads, row, turns=free) for row in angles]
     turn = ("turn of all loads",) if free else ()
     names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
@@ -507,7 +519,12 @@ def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: in
 
 def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
     if float(_disturbance(scene, angles)) > _rounding() * float(scene.drive.speed) ** 2:
-        raise InputError("effects", "disturb the balanced motion (gravity does); leave them out, or simulate")
+        reasons = {GravityField: "disturbs the balanced motion", LoadInteraction: "pushes loads out of this arrangement"}
+        for kind, reason in reasons.items():
+            for effect in scene.all_effects:
+                if has_term([effect], kind):
+                    raise InputError(f"effects.{effect.kind}", f"{reason}; leave it out, or simulate")
+        raise InputError("effects", "disturb the balanced motion; leave them out, or simulate")
 
 
 @cached

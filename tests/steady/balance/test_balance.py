@@ -93,7 +93,7 @@ def test_loads_that_cannot_cancel_are_named(mass, status, sentence):
 def test_motion_that_is_not_balanced_is_refused():
     with pytest.raises(jv.InputError, match="angles leave an unbalance"):
         balanced_stability(loaded(), np.array([0.0, 3.0]))
-    with pytest.raises(jv.InputError, match="effects disturb"):
+    with pytest.raises(jv.InputError, match=r"effects.gravity disturbs the balanced motion; leave it out"):
         balanced_stability(loaded(effects=(jv.Gravity(),)))
     with pytest.raises(jv.InputError, match="low is 5"):
         balanced_intervals(loaded(), 5.0, 3.0)
@@ -104,6 +104,23 @@ def test_motion_that_is_not_balanced_is_refused():
         states.stability(1)
     with pytest.raises(jv.InputError, match=r"points is 0; it must be a whole number, at least 2"):
         states.intervals(20.0, 40.0, points=0)
+
+
+def test_loads_in_contact_balance_in_their_order():
+    def with_balls(size, *effects):
+        balls = jv.balls(count=3, mass=0.25, radius=0.1, drag=1.0, ball_radius=size)
+        imbalance = jv.StaticImbalance(0.03, angle=1.0)
+        return jv.balanced_states(jv.Scene(machines()["one_mass"], balls, jv.ConstantSpeed(60.0), (imbalance, *effects)))
+
+    contact = jv.LoadContact(stiffness=1e5)
+    free, ordered = with_balls(0.01), with_balls(0.01, contact)
+    assert (len(free.angles), len(ordered.angles)) == (2, 1)
+    assert np.all(np.diff(ordered.angles[0]) > 0.0) and np.ptp(ordered.angles[0]) < 2.0 * np.pi
+    np.testing.assert_allclose(np.exp(1j * ordered.angles[0]), np.exp(1j * free.angles[0]), atol=1e-12)
+    np.testing.assert_allclose(ordered.share, [0.03 / 0.075], rtol=1e-12)
+    states._require_undisturbed(ordered.scene, ordered.angles[0])
+    with pytest.raises(jv.InputError, match=r"effects.load_contact pushes loads out of this arrangement"):
+        with_balls(0.075, contact).stability()
 
 
 def flat_field(s):
