@@ -61,7 +61,7 @@ def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[
 def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
     """Return the design task for an antiphase machine of two masses: least foundation force per relative amplitude.
 
-    The frequency of the jam and the stiffness budget of the supports (the sum of k_i/M_i over the platforms) keep their values.
+    The frequency of the jam and the sum of the squared support frequencies (k_i/M_i over the platforms) keep their values.
     Each spring may be changed by a factor of up to `range_`.
 
     **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.

@@ -36,7 +36,7 @@ _MIN_LIMIT_CHANGE = 1e-6
 class SynthesisStatus(eqx.Enumeration):
     """Outcomes of a search. The value of each member is the message shown to the user."""
 
-    done = "the search converged: no change of a free parameter improves the objective"
+    done = "the search converged: no small change of the free parameters improves the objective"
     not_converged = "the search has not converged: allow more polishing or more iterations"
     contradictory = "no design in the bounds meets all demands"
     interrupted = "the search was interrupted: this is its best design"

@@ -1,4 +1,4 @@
-"""Quantities of the machine itself: stiffness budgets, sums and products, weight, sag, cost."""
+"""Quantities of the machine itself: support frequencies, sums and products, weight, sag, cost."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def _make_quantity(name: str, unit: str, function: Callable[..., Array], text: s
 
 
 def support_frequency_squared() -> Quantity:
-    """Return the stiffness budget of the supports, (rad/s)^2: sum_i k_i/M_i over the platforms, n_1^2 + n_2^2 in the source.
+    """Return the sum of the squared support frequencies, (rad/s)^2: sum_i k_i/M_i over the platforms.
 
-    M_i includes the mass of the loads.
+    It is n_1^2 + n_2^2 in the source. M_i includes the mass of the loads.
 
     **Returns** `Quantity`; typical: 100 to 10,000. A machine without platforms raises `InputError` when the quantity is
     computed.
@@ -44,11 +44,11 @@ def support_frequency_squared() -> Quantity:
 
     Source: the antiphase paper, section 5.1.
     """
-    return _make_quantity("support_frequency_squared", "rad^2/s^2", _budget, "stiffness budget of the supports, sum of k/M")
+    return _make_quantity("support_frequency_squared", "rad^2/s^2", _frequencies, "sum of squared support frequencies k/M")
 
 
-def _budget(evaluation: Evaluation, tier: Tier) -> Array:
-    machine = require_platforms(evaluation.scene, "the budget")
+def _frequencies(evaluation: Evaluation, tier: Tier) -> Array:
+    machine = require_platforms(evaluation.scene, "support_frequency_squared")
     return jnp.sum(machine.stiffness / jnp.diagonal(evaluation.model.mass))
 
 
