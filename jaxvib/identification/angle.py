@@ -142,7 +142,7 @@ def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
         raise InputError(
             run.source,
             f"has the {channels[0].kind} of one rotor, but the scene has {len(scene.exciters)} exciters; "
-            "identify needs a scene with one exciter for such a channel, or drives of prescribed speed without it",
+            "identify needs a scene with one exciter for such a channel; otherwise remove the channel and prescribe the speeds",
         )
     if channels:
         return [_measured(run, min(channels, key=lambda each: ("pulses", "angle", "speed").index(each.kind)))]
@@ -164,7 +164,8 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     time, value = time[np.isfinite(value)], value[np.isfinite(value)]
     where = f"{run.source}: channel {channel.name!r}"
     if time.size < _MIN_PULSES:
-        raise InputError(where, f"has {time.size} {channel.kind}; at least {_MIN_PULSES} are needed, record more turns")
+        what = "pulses" if channel.kind == "pulses" else "readings"
+        raise InputError(where, f"has {time.size} {what}; at least {_MIN_PULSES} are needed, record more turns")
     time = time - channel.delay
     notes: list[str] = []
     if channel.kind == "speed":
@@ -247,8 +248,8 @@ class _KnotsFit(NamedTuple):
     """Fit of a spline with given `knots`.
 
     **Attributes**: `found` coefficients (k,); Bayesian information `criterion`; `variance` of the values; diagonals `band` of
-    the normal equations, their solution `answers` (k, o) for the products of splines and offsets, and the inverse `schur`
-    (o, o) of those of the offsets.
+    the normal equations of the coefficients; `answers` (k, o): their solutions for the o products of splines and offsets;
+    `schur` (o, o): inverse of the matrix that remains for the offsets without the coefficients.
     """
 
     knots: np.ndarray

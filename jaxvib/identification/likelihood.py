@@ -1,4 +1,4 @@
-"""Profile likelihood: intervals of numbers about which the cost of a fit is not quadratic.
+"""Profile likelihood: intervals of numbers in which the cost of a fit is not quadratic.
 
 A number is held at a distance from its fitted value while all other unknowns are fitted again. The rise of the cost is
 compared with the quadratic form, (distance/error)^2. If they differ by more than 10 % at two standard errors, the ends of the
@@ -37,8 +37,9 @@ _MAX_DISTANCE = 20.0
 class _Profile:
     """Profile of one number of a fit.
 
-    **Attributes**: the `fitted` problem; `index` of the number in x, or of an exciter if `is_unbalance`; its `center` and
-    standard error `spread` in its coordinate; `slopes` (p,): change of x with the number; `floor`: the least cost.
+    **Attributes**: the `fitted` problem; `index` of the number in x, or of an exciter if `is_unbalance`; `center` and standard
+    error `spread` of its coordinate (its entry of x, or the logarithm of the unbalance); `slopes` (p,): change of x with the
+    number; `floor`: the least cost.
     """
 
     fitted: Fitted
@@ -75,7 +76,8 @@ class _Profile:
     def end(self, side: float) -> float:
         """Return the end of the interval on one side, in standard errors from the center; infinite without an end.
 
-        The root of the rise is nearly proportional to the distance, and the secant method finds its end in a few steps.
+        The square root of the rise is nearly proportional to the distance. The secant method therefore finds the end in a few
+        steps.
         """
         last, root, distance = 0.0, 0.0, _COMPARED_DISTANCE
         for _ in range(8):
@@ -91,8 +93,8 @@ class _Profile:
 
 
 def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[float, float]]:
-    """Return the ends of the intervals, in the coordinates of the numbers relative to their values, by the names of the numbers
-    whose cost is not quadratic.
+    """Return the distances of the ends of the intervals from the fitted values, by the names of the numbers in which the cost
+    is not quadratic. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
 
     **Arguments**: `fitted`, and what is `known` about its numbers. Undetermined numbers are left out.
     """

@@ -129,7 +129,7 @@ def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
 
 
 class IntegrationPlan(NamedTuple):
-    """Static choices of one time integration: method, steps, and stored states.
+    """Choices for one time integration: method, steps, and stored states.
 
     **Attributes**: `solver` of diffrax, None for the method of order 8 in its fastest form; `control` of the steps; `adjoint`
     of diffrax, None for step replay; `samples`: number of stored states of the whole run, 0 for none; `turns`: length of the
@@ -151,7 +151,10 @@ class IntegrationPlan(NamedTuple):
 def integrate(
     scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
-    """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured`."""
+    """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end.
+
+    **Arguments**: `is_measured`: False to skip the measurement; None to measure always, without a branch in the program.
+    """
     # An initial state that does not exist (a jam mode that is absent in one run of a batch) must not slow down the other runs.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
@@ -293,7 +296,7 @@ def whole_turns(scene: Scene, stretch: float) -> float:
     if not speeds:
         return stretch
     if len(speeds) > 1:
-        problem = f"turn unbalances at {speeds} rad/s and have no common period; simulate, or use motors"
+        problem = f"turn unbalances at {speeds} rad/s and have no common period; use simulate, or motors"
         raise InputError("exciters", problem)
     turn = 2.0 * math.pi / speeds[0]
     turns = stretch / turn

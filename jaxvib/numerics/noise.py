@@ -1,8 +1,9 @@
 """Noise of measured samples: its autoregressive models, outliers, bounds, and uncertainties of fits under coloured noise.
 
-Outliers and bounds enter a least-squares fit by other residuals. With the score psi of a residual e (derivative of its
-logarithmic probability), a fit of the residuals psi(e)/mean(psi') with the standard deviation sqrt(mean(psi^2))/mean(psi') has
-the minimum of the largest probability, and the covariance of a fit with this score (Huber 1981).
+A least-squares fit takes account of outliers and bounds by modified residuals. Let psi(e) be the score of a residual e: the
+negative derivative of the logarithm of its probability density. A fit of the residuals psi(e)/mean(psi') with the standard
+deviation sqrt(mean(psi^2))/mean(psi') has its minimum where the probability of the readings is greatest, and the covariance of
+a fit with this score (Huber 1981).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _EXPECTATIONS = 40
 """Number of iterations of expectation and maximization for the distribution of outliers."""
 
 _MAX_COMPARED = 100_000
-"""Largest number of residuals whose distribution is compared."""
+"""Largest number of residuals from which the distribution of outliers is estimated."""
 
 _OUTLIER_DISTANCE = 6.0
 """Distance of an outlier from the samples around it, in standard deviations."""
@@ -73,7 +74,7 @@ def is_outlier(residual: np.ndarray) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> float:
-    """Return the standard deviation that normal values with this median of their sizes have."""
+    """Return the standard deviation of normally distributed values, from the median of their absolute values."""
     return 1.4826 * float(np.median(np.abs(values)))
 
 
@@ -139,6 +140,9 @@ def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals (n,) and weights (n,) of readings that are known to lie above a bound.
 
         psi = phi(z)/Phi(z),      -psi' = psi (psi + z),      z = -excess
+
+    phi and Phi are the density and the distribution function of the standard normal distribution. The residuals are
+    psi/(-psi') and the weights sqrt(-psi'); psi' is here the derivative with respect to z.
 
     **Arguments**: `excess` of the bound over the model, in standard deviations of the normal noise.
 

@@ -135,12 +135,12 @@ RUN_MEASURES = {
     )
 }
 """Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
-foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time,
-with a resolution of 1/64 of the run, after which each load speed differs from its final value by less than 1 % of the rotor
-speed. The slip is the largest difference between the angles through which two loads, or rotors without loads, turn in the
-measuring window. Regime, jam mode, ripple and rotor speed need a scene with one exciter and loads. The measures from stroke
-to conveying speed are those of `VibrationMeasures`, for the centre of mass as the point. The support load is the sum of the
-static and the vertical dynamic load."""
+foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time after
+which each load speed differs from its final value by less than 1 % of the rotor speed, with a resolution of 1/64 of the time
+before the measuring window; it is the end of the run if the loads do not settle. The slip is the largest difference between the
+angles through which two loads, or rotors without loads, turn in the measuring window. Regime, jam mode, ripple and rotor speed
+need a scene with one exciter and loads. The measures from stroke to conveying speed are those of `VibrationMeasures`, for the
+centre of mass as the point. The support load is the sum of the static and the vertical dynamic load."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

@@ -37,9 +37,9 @@ def peak_force(*, until: Number, spin_up: Number) -> Quantity:
 
     >>> from optimize import peak_force
     >>> (peak_force(until="20 s", spin_up="5 s") < "2 kN").words
-    'largest foundation force during spin-up at most 2 kN'
+    'largest foundation force of a run from rest at most 2 kN'
     """
-    text = "largest foundation force during spin-up"
+    text = "largest foundation force of a run from rest"
     return BuiltinQuantity("peak_force", "N", _peak, tier="time", tiers=("time",), text=text, settings=_times(until, spin_up))
 
 
@@ -51,9 +51,10 @@ def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float) -> A
 
 @validated
 def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: int = 1) -> Quantity:
-    """Return the time, s, after which the amplitude of a platform stays near its final value, if the rotor starts from rest.
+    """Return the time, s, from the start at rest until the amplitude of a platform stays near its final value.
 
-    The full equations are integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), with w the load speed at the end.
+    The full equations are integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), with w the load speed at the end; the
+    final value is its mean over the last twentieth of the run.
 
     **Arguments**
 
@@ -61,8 +62,8 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
     - `within`: the largest relative deviation from the final amplitude; typical: 0.02 to 0.1 (default 0.05)
     - `of`: the platform (default: 1)
 
-    **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 2 to 20 s after the end of the spin-up. It is
-    `until` if the motion has not settled by then.
+    **Returns** `Quantity`; its derivatives exist in forward mode only; typical: the duration of the spin-up plus 2 to
+    20 s. A value close to `until` shows that the motion has not settled.
 
     **Raises** `InputError` for a `within` that is not between 0 and 1.
 

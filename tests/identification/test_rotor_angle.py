@@ -84,6 +84,7 @@ def test_noise_of_an_angle_becomes_its_error():
     assert np.mean([each.error for each in found]) == pytest.approx(real, rel=0.25)
 
 
-def test_too_few_pulses_are_refused():
-    with pytest.raises(jv.InputError, match=r"has 3 pulses; at least .* are needed, record more turns"):
-        measured("pulses", np.array([0.0, 1.0, 2.0]), np.arange(3.0))
+@pytest.mark.parametrize(("kind", "what"), [("pulses", "pulses"), ("speed", "readings"), ("angle", "readings")])
+def test_too_few_readings_are_refused(kind, what):
+    with pytest.raises(jv.InputError, match=f"has 3 {what}; at least .* are needed, record more turns"):
+        measured(kind, np.array([0.0, 1.0, 2.0]), np.arange(3.0))

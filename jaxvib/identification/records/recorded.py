@@ -1,4 +1,4 @@
-"""Channels as recorders store them, and the selection of those that a run describes."""
+"""Channels as recorders store them, and the selection of those that the description of a run names."""
 
 from __future__ import annotations
 
@@ -54,9 +54,12 @@ def recorded_from_sep005(timeseries: Sequence[Mapping[str, Any]], source: str) -
 def described_channels(
     recorded: Sequence[Recorded], channels: Sequence[Channel], source: str, low: float = -math.inf, high: float = math.inf
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the times (s, from `low` to `high`) and values of channels; values of channels without a unit are in SI.
+    """Return the times (s, from `low` to `high`) and the values of channels.
 
-    **Raises** `InputError` for a channel that was not recorded, a wrong unit, and times and values of different length.
+    The values are in SI, or as in the file if the channel has its own `unit`.
+
+    **Raises** `InputError` for a channel that was not recorded or not once only, a wrong unit, and times and values of
+    different length.
     """
     times, values = {}, {}
     for channel in channels:
@@ -85,13 +88,15 @@ def _find(recorded: Sequence[Recorded], channel: Channel, where: str) -> Recorde
     """Return the channel of the file with a name, which may include its unit; upper and lower case are not distinguished."""
     wanted = channel.name.strip().lower()
     for name_of in (
-        lambda each: each.name,
+        lambda each: wanted if each.name == channel.name else None,
         lambda each: each.name.strip().lower(),
         lambda each: f"{each.name} ({each.unit})".lower(),
         lambda each: split_head(each.name, UNITS[channel.kind])[0].lower(),
     ):
-        found = [each for each in recorded if name_of(each) in (channel.name, wanted)]
-        if len(found) == 1:
+        found = [each for each in recorded if name_of(each) == wanted]
+        if len(found) > 1:
+            raise InputError(where, f"is the name of {len(found)} channels of the file; give them different names")
+        if found:
             return found[0]
     names = ", ".join(quoted(each.name) for each in recorded[:20])
     raise InputError(where, f"is not in the file; its channels are {names}")

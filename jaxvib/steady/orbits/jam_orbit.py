@@ -61,7 +61,7 @@ def jam_orbit(
     points: int | None = None,
     throw: bool = True,
 ) -> Orbit:
-    """Return the exact motion in which coincident loads of any mass jam.
+    """Return the exact motion in which loads of any mass jam.
 
         I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n, a) - S e'(phi) . a,      a = B q''
         D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
@@ -73,7 +73,7 @@ def jam_orbit(
     - Loads that have equal parameters are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
       arcsin(r/R)) / (r/R); if their mean contact force over a period would be tensile, the status is `would_separate`)
     - Loads that differ have a psi_j each: they lie next to each other in the order that their torques require
-    - The torque is that of drag, gravity and dry friction, whose normal force depends on the acceleration a of the port. If
+    - The torque is that of drag, gravity and dry friction, whose normal force depends on the acceleration a of the mount. If
       friction can hold the loads on the rotor, they stick and slip. No number of harmonics resolves this motion, and the
       status shows it
 
@@ -86,10 +86,10 @@ def jam_orbit(
     - `near`: load speed, rad/s or text, from which a motion at the scene's rotor speed is searched for
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-9 (the default; in
       single precision 1e-3). A smaller value costs little, because the error falls exponentially with the number of harmonics
-    - `points`: a fixed number of collocation points (on half a period without gravity, otherwise on a whole period) in place of
-      an accuracy; typical: 12 to 32. The time grows at least with the square of this number. Under `jit` and `vmap` the values
-      that decide on this number are not known; the default is then 16 on half a period and 33 on a whole period, and the
-      status shows if it is too small
+    - `points`: a fixed number of collocation points (on half a period if the scene has half-turn symmetry, which gravity
+      breaks, otherwise on a whole period) in place of an accuracy; typical: 12 to 32. The time grows at least with the square
+      of this number. Under `jit` and `vmap` the values that decide on this number are not known; the default is then 16 on half
+      a period and 33 on a whole period, and the status shows if it is too small
     - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
     **Returns** `Orbit`; its fields have derivatives with respect to every parameter of the scene (implicit function theorem,
@@ -127,9 +127,9 @@ class JamProblem(NamedTuple):
     """Problem whose solution is one exact jam.
 
     **Attributes**: the `scene`; `given`: the name of the prescribed speed; its `value`, and the `start` of the other speed,
-    rad/s; `exists`: true if the mode exists in leading order; `direction`: the sign of dn/dOmega that the mode needs, or None;
-    relative `accuracy`; `implicit`: true for implicit integration of the multipliers; `is_settled_first`: true if Newton's
-    method starts from the motion at the load speed `start`, for a start near the solution.
+    rad/s; `exists`: true if the mode exists, in leading order or in the search of the exact branch; `direction`: the sign of
+    dn/dOmega that the mode needs, or None; relative `accuracy`; `implicit`: true for implicit integration of the multipliers;
+    `is_settled_first`: true if Newton's method starts from the motion at the load speed `start`, for a start near the solution.
     """
 
     scene: Scene

@@ -222,7 +222,8 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
 
 def _first_number(scene: Scene) -> int:
-    """Return the number of the first rotating mass in figures: unbalances have the numbers of their exciters, from 0."""
+    """Return the number of the first rotating mass in figures: 1 if there are loads; unbalances have the numbers of their
+    exciters, from 0."""
     return int(any(exciter.loads is not None for exciter in scene.exciters))
 
 

@@ -101,6 +101,17 @@ def test_unusable_channels_are_refused(name, kind, says):
         described_channels(RECORDED, [jv.Channel(name, kind)], "run")
 
 
+def test_channels_with_similar_names():
+    same = [
+        Recorded(name, "N", T, factor * WAVE) for name, factor in (("Pull", 1.0), ("pull", 2.0), ("push", 3.0), ("push", 4.0))
+    ]
+    for name, factor in (("Pull", 1.0), ("pull", 2.0)):
+        np.testing.assert_array_equal(described_channels(same, [jv.Channel(name, "force")], "run")[1][name], factor * WAVE)
+    for name in ("PULL", "push", "push (N)"):
+        with pytest.raises(jv.InputError, match="is the name of 2 channels of the file; give them different names"):
+            described_channels(same, [jv.Channel(name, "force")], "run")
+
+
 def test_runs_go_through_dictionaries_and_back():
     """A channel that begins at 0 s has its rate only, one that begins later its times as well."""
     channels = [jv.Channel("frame", "acceleration", at=1), jv.Channel("late", "speed"), jv.Channel("tacho", "pulses")]
