@@ -20,7 +20,7 @@ from jaxvib.machine.structures.rotor import planar_rotor, rotor
 
 # Loads
 from jaxvib.machine.drag import drag_of
-from jaxvib.machine.loads import Loads, balls, pendulums, rollers
+from jaxvib.machine.loads import Loads, ball_mass, balls, pendulums, rollers
 from jaxvib.machine.torus import torus_balls
 
 # Drives
@@ -194,6 +194,7 @@ __all__ = [
     # Loads
     "drag_of",
     "Loads",
+    "ball_mass",
     "balls",
     "rollers",
     "pendulums",

@@ -18,7 +18,7 @@ _START_HELP = "Initial state: rest (machine at rest, drive at its speed), jam (w
 
 _SCREENS = ("linear-screen", "circular-screen", "feeder")
 _FILES = ("design", *(f"{kind}-design" for kind in _SCREENS), "identification", "measurement", "sweep")
-_MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus", *_SCREENS)
+_MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "ball-balancer", "torus", *_SCREENS)
 """Names of `TEMPLATES` and `SCREENS` in `jaxvib.machine`, repeated here because their import is slow."""
 
 
@@ -28,9 +28,13 @@ _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "r
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep`, `identify` or `plan`.
 
-    KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus, linear-screen, circular-screen or feeder for a
-    machine; design, linear-screen-design, circular-screen-design or feeder-design for `optimize`; sweep (a study) for `sweep`;
-    identification (recorded runs of a machine) for `identify` and `plan`; measurement (a recorded swing) for `identify`."""
+    \b
+    Machines: one-mass, two-mass, three-mass, network, planar-rotor, rotor,
+      ball-balancer, torus, linear-screen, circular-screen, feeder.
+    For `optimize`: design, linear-screen-design, circular-screen-design,
+      feeder-design.
+    For `sweep`: sweep (a study). For `identify` and `plan`: identification
+      (recorded runs of a machine). For `identify`: measurement (a swing)."""
     from jaxvib.exchange.recordings.fit_file import TEMPLATE as IDENTIFICATION
     from jaxvib.machine.files import SCREENS, TEMPLATES
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT

@@ -21,7 +21,7 @@ from jaxvib.machine.drives.drive import ConstantSpeed, DCMotor, Drive, Induction
 from jaxvib.machine.drives.electrical import DCMotorElectrical, InductionMotorCircuit, InductionMotorElectrical, NamePlateMotor
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.registry import EFFECTS
-from jaxvib.machine.loads import balls, pendulums, rollers
+from jaxvib.machine.loads import ball_mass, balls, pendulums, rollers
 from jaxvib.machine.scene import Exciter, Scene, unbalance
 from jaxvib.machine.structures.plane_body import body, plane_body, plane_network, support
 from jaxvib.machine.structures.platforms import network, one_mass, three_mass, two_mass
@@ -331,6 +331,10 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     if isinstance(drag := values.get("drag"), Mapping):
         with within(f"{prefix}drag."):
             entries["drag"] = build_part(drag_of, drag, "")
+    if build in (balls, torus_balls) and isinstance(mass := values.get("mass"), Mapping):
+        with within(f"{prefix}mass."):
+            size = {name: values[name] for name in ("ball_radius",) if name in values}
+            entries["mass"] = build_part(ball_mass, {**size, **mass}, "")
     for name in ("motor", "reference"):  # drives within a drive
         if isinstance(values.get(name), Mapping):
             entries[name] = _built(values[name], prefix + name, DRIVES)
@@ -463,7 +467,9 @@ _FOLDER = Path(__file__).with_name("templates")
 _PLATFORMS = {name: (name, "platforms_end") for name in ("one_mass", "two_mass", "three_mass", "network")}
 _ROTORS = {name: (name, "rotors_end") for name in ("planar_rotor", "rotor")}
 
-TEMPLATES = Templates(_FOLDER, {**_PLATFORMS, **_ROTORS, "torus": ("torus",)}, one_mass="600 rpm")
+TEMPLATES = Templates(
+    _FOLDER, {**_PLATFORMS, **_ROTORS, "ball_balancer": ("ball_balancer",), "torus": ("torus",)}, one_mass="600 rpm"
+)
 """Scene files with comments for every kind of platforms and rotors, and for a rotor with balls in a torus."""
 
 SCREENS = Templates(_FOLDER, {name: (name,) for name in ("linear_screen", "circular_screen", "feeder")})

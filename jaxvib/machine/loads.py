@@ -12,9 +12,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, quoted
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.numbers import Part, read_numbers, unit
-from jaxvib.units import Number, Numbers, count
+from jaxvib.units import Number, Numbers, count, number
 from jaxvib.units.known import when_known
 
 MASS = unit("kg", low=0.0, open_low=True, each="load")
@@ -323,6 +324,34 @@ def require_side_by_side(count: int, radius: float, ball_radius: float) -> None:
     if not ball_radius < most:
         problem = f"{count} side by side on a circle of {radius:.6g} m need a ball_radius below {most:.6g} m"
         raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m; {problem}")
+
+
+DENSITIES = {"steel": 7850.0, "silicon nitride": 3200.0, "tungsten carbide": 14900.0}
+"""Densities of materials of balls, kg/m^3."""
+
+
+@validated
+def ball_mass(ball_radius: Number, material: str = "steel") -> Array:
+    """Return the mass of a solid ball, m = (4/3) pi r^3 rho, kg.
+
+    **Arguments**
+
+    - `ball_radius` r, m, or a string with a unit; typical: 0.005 to 0.03
+    - `material`: "steel" (7850 kg/m^3), "silicon nitride" (3200 kg/m^3) or "tungsten carbide" (14900 kg/m^3)
+
+    In scene files `mass = { material = "steel" }` of balls computes the mass with their `ball_radius`.
+
+    **Returns** an array with one number, with derivatives. **Raises** `InputError` for another material, and for a radius that
+    is not positive.
+
+    >>> import jaxvib as jv
+    >>> round(1e3 * float(jv.ball_mass("12.5 mm")), 1)     # g
+    64.2
+
+    Source: volume of a sphere; densities from data sheets of balls for bearings.
+    """
+    require_one_of(material, tuple(DENSITIES), "material")
+    return 4.0 / 3.0 * jnp.pi * number(ball_radius, "m", "ball_radius", low=0.0, open_low=True) ** 3 * DENSITIES[material]
 
 
 def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:

@@ -19,9 +19,11 @@ from jaxvib.machine.validation import implausible_numbers
 def test_new_prints_a_scene_file_that_loads(typed, kind):
     code, out, _ = typed("new", kind)
     assert code == 0 and f" {kind.replace('_', '-')}" in typed("new", "--help")[1]
-    assert jv.scene_from_toml(out).machine.kind == {"torus": "planar_rotor", **dict.fromkeys(SCREENS, "plane_body")}.get(
-        kind, kind
-    )
+    assert jv.scene_from_toml(out).machine.kind == {
+        "torus": "planar_rotor",
+        "ball_balancer": "planar_rotor",
+        **dict.fromkeys(SCREENS, "plane_body"),
+    }.get(kind, kind)
     assert "#" in out and "kg" in out
 
 

@@ -1,5 +1,7 @@
 """Scene files, and what is said about wrong ones."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,7 +51,7 @@ def test_template_of_a_torus_holds_what_it_calls_for():
     same(jv.scene_from_toml(jv.scene_to_toml(s)), s)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in TEMPLATES if kind != "torus"])
+@pytest.mark.parametrize("kind", [kind for kind in TEMPLATES if kind not in ("torus", "ball_balancer")])
 def test_template_loads_and_jams(kind):
     s = jv.scene_from_toml(TEMPLATES[kind])
     assert s.machine.kind == kind
@@ -59,6 +61,23 @@ def test_template_loads_and_jams(kind):
     else:
         assert s.loads.count == 3 and s.all_effects == ()
         np.testing.assert_allclose(s.loads.mass, 0.8)
+
+
+def test_balls_of_a_material_have_its_mass():
+    s = jv.scene_from_toml(TEMPLATES["ball_balancer"])
+    volume = 4.0 / 3.0 * np.pi * 0.011**3
+    np.testing.assert_allclose(s.loads.mass, 7850.0 * volume, rtol=1e-6)
+    ceramic = TEMPLATES["ball_balancer"].replace('"steel" }', '"silicon nitride", ball_radius = "22 mm" }')
+    np.testing.assert_allclose(jv.scene_from_toml(ceramic).loads.mass, 3200.0 * 8.0 * volume, rtol=1e-6)
+    slope = jax.grad(lambda r: jv.ball_mass(r))(0.011)
+    np.testing.assert_allclose(slope, 7850.0 * 4.0 * np.pi * 0.011**2, rtol=1e-6)
+    for old, new, says in (
+        ('"steel"', '"stel"', "loads.mass.material is 'stel'; allowed: steel, silicon nitride"),
+        ('ball_radius = "11 mm"\n', "", "loads.mass.ball_radius is missing"),
+        ('kind = "ball"', 'kind = "roller"', "loads.mass is"),
+    ):
+        with pytest.raises(jv.InputError, match=re.escape(says)):
+            jv.scene_from_toml(TEMPLATES["ball_balancer"].replace(old, new, 1))
 
 
 EVERY_EFFECT = (
