@@ -113,7 +113,7 @@ class RotorAngle(NamedTuple):
     notes: tuple[str, ...]
 
     @property
-    def errors(self) -> int:
+    def error_count(self) -> int:
         """Number m of errors."""
         return self.drive.table.shape[2] - 1 if isinstance(self.drive, RecordedDrive) else 0
 
@@ -206,13 +206,13 @@ def _recorded_drive(spline: Any) -> RecordedDrive:
     return RecordedDrive(speed, jnp.asarray(table), begin, width, last)
 
 
-def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None, spread: np.ndarray | None = None) -> Any:
+def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None, rates: np.ndarray | None = None) -> Any:
     """Return a spline of degree 5 through noisy values, with 1 + m columns: the values, and m errors of them.
 
     The errors are principal components of the covariance of the coefficients, in the order of their size.
 
     **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): the number of a value's mark, each with an unknown
-    offset (0 on average); `spread` (n,): rates of values whose errors are those of their times. A common delay of all times is
+    offset (0 on average); `rates` (n,): rates of values whose errors are those of their times. A common delay of all times is
     then one of the errors.
 
     >>> t = np.linspace(0.0, 2.0, 200)
@@ -222,7 +222,7 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
     """
     from scipy.interpolate import BSpline  # slow to import
 
-    weights = np.ones(time.size) if spread is None else np.mean(spread) / spread
+    weights = np.ones(time.size) if rates is None else np.mean(rates) / rates
     offsets = np.zeros((time.size, 0))
     if marks is not None:
         kinds = np.eye(int(np.max(marks)) + 1)[marks]
@@ -234,8 +234,8 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
         intervals = max(intervals + 1, int(1.4 * intervals))
     best = min(tried, key=lambda each: each.criterion)
     covariance = best.covariance()
-    if spread is not None:
-        late = _derivative(best) * math.sqrt(best.variance) / np.mean(spread)
+    if rates is not None:
+        late = _derivative(best) * math.sqrt(best.variance) / np.mean(rates)
         covariance += np.outer(late, late)
     sizes, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(sizes, 0.0))

@@ -69,16 +69,16 @@ def information_of(fitted: Fitted) -> Information:
     """Return the information of a fit about the numbers of its scene; see `Information`."""
     problem = fitted.problem
     unknowns, p = problem.unknowns, fitted.x.size
-    moved = len(unknowns.numbers)
+    number_count = len(unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
     free = free_unbalances(problem)
-    own = np.array([*range(moved), *(p + 2 * k for k in free)], int)
+    own = np.array([*range(number_count), *(p + 2 * k for k in free)], int)
     names = (*(number.name for number in unknowns.numbers), *(f"exciters[{k}].unbalance" for k in free))
     values = np.concatenate([np.asarray(unknowns.values(fitted.x)), sizes[free]])
     logarithmic = np.concatenate([np.asarray(unknowns.positive), np.ones(len(free), bool)])
-    scale = np.concatenate([np.where(unknowns.positive, values[:moved], unknowns.scale), sizes[free]])
+    scale = np.concatenate([np.where(unknowns.positive, values[:number_count], unknowns.scale), sizes[free]])
     without_gains = prior.copy()
-    gains = np.arange(moved, moved + len(unknowns.gains))
+    gains = np.arange(number_count, number_count + len(unknowns.gains))
     without_gains[gains, gains] = 0.0
 
     whole, loose = (eliminate(data + known, own) for known in (prior, without_gains))
@@ -119,8 +119,8 @@ def combined_information(fitted: Fitted) -> np.ndarray:
     """
     problem, p = fitted.problem, fitted.x.size
     data, prior, _ = in_polar_unbalances(fitted)
-    moved, gains = len(problem.unknowns.numbers), len(problem.unknowns.gains)
-    own = [*range(moved), *(p + 2 * k for k in free_unbalances(problem)), *range(moved, moved + gains)]
+    number_count, gains = len(problem.unknowns.numbers), len(problem.unknowns.gains)
+    own = [*range(number_count), *(p + 2 * k for k in free_unbalances(problem)), *range(number_count, number_count + gains)]
     if problem.marked:
         return eliminate(data + prior, np.array([*own, p + 1], int))
     return np.pad(eliminate(data + prior, np.array(own, int)), (0, 1))

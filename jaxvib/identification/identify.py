@@ -239,12 +239,12 @@ def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted
     first = [float(np.asarray(scene.exciters[k].unbalance, float)) for k in free_unbalances(problem)]
     for _ in range(_RETURNS):
         known = information_of(fitted)
-        axes, moved = known.undetermined, len(problem.unknowns.numbers)
+        axes, number_count = known.undetermined, len(problem.unknowns.numbers)
         if not axes.size or not fitted.converged:
             break
-        away = np.concatenate([fitted.x[:moved], np.log(known.values[moved:] / first)])
+        away = np.concatenate([fitted.x[:number_count], np.log(known.values[number_count:] / first)])
         start = fitted.x[: problem.unknowns.count].copy()
-        start[:moved] -= (axes @ (axes.T @ away))[:moved]
+        start[:number_count] -= (axes @ (axes.T @ away))[:number_count]
         back = fit_from(problem, [start])
         if not back.converged:
             break
@@ -326,8 +326,8 @@ def _with_ends(estimate: Estimate, scale: float, logarithmic: bool, low: float, 
 
 def _gains(fitted: Fitted) -> tuple[Estimate, ...]:
     unknowns = fitted.problem.unknowns
-    moved = len(unknowns.numbers)
-    own = np.arange(moved, moved + len(unknowns.gains))
+    number_count = len(unknowns.numbers)
+    own = np.arange(number_count, number_count + len(unknowns.gains))
     data, prior, _ = in_polar_unbalances(fitted)
     covariance = np.linalg.inv(eliminate(data + prior, own))
     pairs = zip(fitted.x[own], np.sqrt(np.diagonal(covariance)), strict=True)

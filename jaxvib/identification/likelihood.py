@@ -98,7 +98,7 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
 
     **Arguments**: `fitted`, and what is `known` about its numbers. Undetermined numbers are left out.
     """
-    problem, p, moved = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
+    problem, p, number_count = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
     free = free_unbalances(problem)
     own = np.array([*range(p), *(p + 2 * k for k in free)], int)
@@ -107,9 +107,9 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     for i, name in enumerate(known.names):
         if not known.determined[i]:
             continue
-        is_unbalance = i >= moved
-        place = p + i - moved if is_unbalance else i
-        index = free[i - moved] if is_unbalance else i
+        is_unbalance = i >= number_count
+        place = p + i - number_count if is_unbalance else i
+        index = free[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
         slopes = covariance[:p, place] / covariance[place, place]
         profile = _Profile(fitted, index, is_unbalance, center, math.sqrt(covariance[place, place]), slopes, floor)

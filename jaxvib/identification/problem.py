@@ -289,7 +289,7 @@ def with_angle_errors(problem: Problem, runs: Sequence[bool]) -> Problem:
     count = 0
     for k, (of_run, rotors, is_marked) in enumerate(zip(problem.runs, problem.rotors, runs, strict=True)):
         if is_marked:
-            place, errors = first + count, max(rotor.errors for rotor in rotors)
+            place, errors = first + count, max(rotor.error_count for rotor in rotors)
             drives = tuple(rotor.drive for rotor in rotors)
             samples[k] = dataclasses.replace(of_run, drives=drives, errors=(place, errors))
             left_out[k], count = max(rotor.left_out for rotor in rotors), count + errors
@@ -335,9 +335,9 @@ def _samples(
                 f"{run.source}: channel {channel.name!r}",
                 f"is not sampled on the even grid of the others ({1.0 / step:.6g} Hz); resample it to this grid",
             )
-        counts = np.isfinite(values) & (index >= 0) & (index < count)
-        raw[index[counts], k], mask[index[counts], k] = values[counts], ~clipped[counts]
-        bounded_by = index[counts & clipped]
+        used = np.isfinite(values) & (index >= 0) & (index < count)
+        raw[index[used], k], mask[index[used], k] = values[used], ~clipped[used]
+        bounded_by = index[used & clipped]
         bounds[bounded_by, k] = np.sign(raw[bounded_by, k] - np.median(raw[:, k]))
     numbers, actions, amounts = _changes(scene, run)
     samples = Samples(

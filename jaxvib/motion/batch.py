@@ -17,7 +17,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured, Trajectory, measure, trajectory, turning_angles
 from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.integrate import is_finite, wrap_angles
+from jaxvib.motion.integrate import angle_wrapping, is_finite
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as IntegratorState
@@ -60,7 +60,7 @@ def advance(
     return jax.tree.map(lambda leaf: leaf[-1], solution.ys), solution.stats["num_steps"]
 
 
-def stretches(
+def divide_run(
     motion: PackedSystem, packed: IntegratorState, length: Array, step: Array, number: int, *, implicit: bool
 ) -> tuple[IntegratorState, Array, Array]:
     """Return the first state of the integrator, and the start times and lengths, s, of `number` parts of the same `length`.
@@ -82,12 +82,12 @@ def stretches(
 
 
 def pack_batch(
-    field: Callable[[Array, State], State], state: State, single: bool, has_common_turns: bool, *, implicit: bool
+    field: Callable[[Array, State], State], state: State, wrapped: bool, has_common_turns: bool, *, implicit: bool
 ) -> PackedSystem:
     """Return the equations of a batch of runs; for an implicit method the state of each run is one vector."""
     if implicit:
         return PackedSystem(field, state, solver=Rodas4())
-    return PackedSystem(field, state, wrapped=single, has_common_turns=has_common_turns, batch=True)
+    return PackedSystem(field, state, wrapped=wrapped, has_common_turns=has_common_turns, batch=True)
 
 
 def batch_size() -> int:
@@ -140,10 +140,10 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     Under `vmap` all runs take the same steps. No run waits for another, and no result depends on the other runs.
     """
     dtype = state.displacement.dtype
-    single, has_common_turns = wrap_angles(scene, dtype)
+    wrapped, has_common_turns = angle_wrapping(scene, dtype)
     model = assemble(scene)
     field = dynamics_of(model)
-    motion = pack_batch(field, state, single, has_common_turns, implicit=plan.implicit)
+    motion = pack_batch(field, state, wrapped, has_common_turns, implicit=plan.implicit)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS_OF_RUN
     spacing = plan.window / (plan.samples - 1)
 
@@ -158,7 +158,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
 
     first = motion.pack(state)
     sizes = jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype)
-    packed, begins, lengths = stretches(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
+    packed, begins, lengths = divide_run(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
     packed, parts = jax.lax.scan(part, packed, (begins, lengths))
     _, later = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
     before = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)

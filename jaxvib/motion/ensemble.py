@@ -23,8 +23,8 @@ from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import turning_angles, turning_directions
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
-from jaxvib.motion.batch import advance, batch_size, pack_batch, stretches
-from jaxvib.motion.integrate import is_finite, wrap_angles
+from jaxvib.motion.batch import advance, batch_size, divide_run, pack_batch
+from jaxvib.motion.integrate import angle_wrapping, is_finite
 from jaxvib.motion.plan import ENSEMBLE_PARTS, EqualSteps, plan_ensemble
 from jaxvib.motion.stiffness import is_unresolved
 from jaxvib.ode.types import Y
@@ -261,13 +261,13 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     state from that with the last count, True if the motion stayed finite, True for loads that lost contact with their track,
     and the number of steps.
     """
-    single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
+    wrapped, has_common_turns = angle_wrapping(scene, state.displacement.dtype)
     watched = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
     field, start = field_of(equations, scene), state
     if watched:
         pulls = [jnp.zeros_like(own.angle[0]) if own.angle else jnp.zeros(1) for own in state.exciters]
         field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _concatenate(pulls))
-    motion = pack_batch(field, start, single, has_common_turns, implicit=implicit)
+    motion = pack_batch(field, start, wrapped, has_common_turns, implicit=implicit)
     length = end / ENSEMBLE_PARTS
 
     def part(held: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
@@ -275,7 +275,9 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
         return held, (held, taken)
 
     def whole(steps: Array) -> tuple[Y, Array]:
-        held, begins, lengths = stretches(motion, motion.pack(start), length, length / steps, ENSEMBLE_PARTS, implicit=implicit)
+        held, begins, lengths = divide_run(
+            motion, motion.pack(start), length, length / steps, ENSEMBLE_PARTS, implicit=implicit
+        )
         _, (helds, taken) = jax.lax.scan(lambda held, at: part(held, at, length / steps), held, (begins, lengths))
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 

@@ -17,7 +17,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, with_nearest_turns
-from jaxvib.motion.integrate import whole_turns, wrap_angles
+from jaxvib.motion.integrate import angle_wrapping, whole_turns
 from jaxvib.motion.plan import Tolerance, plan_stretch, with_settled_drives
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import last_state, run_planned, simulate
@@ -175,7 +175,7 @@ def growth(
         first, second = run_on(state), run_on(other)
         scale = error_scale(first.window.state, unit)
         ours, theirs = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
-        if wrap_angles(scene, ours.displacement.dtype)[0]:
+        if angle_wrapping(scene, ours.displacement.dtype)[0]:
             theirs = with_nearest_turns(theirs, ours)
         rates.append(math.log(max(_distance(ours, theirs, scale), 1e-300) / separation) / stretch)
         state, gone = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, theirs)

@@ -122,7 +122,7 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
     return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 
-def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
+def angle_wrapping(scene: Scene, dtype: Any) -> tuple[bool, bool]:
     """Return two flags: True if angles are kept within one turn (single precision); True if the same number of turns is
     subtracted from the angles of all loads (loads in contact)."""
     return jnp.dtype(dtype).itemsize < 8, has_term(scene.all_effects, LoadInteraction)
@@ -132,7 +132,7 @@ class IntegrationPlan(NamedTuple):
     """Choices for one time integration: method, steps, and stored states.
 
     **Attributes**: `solver` of diffrax, None for the method of order 8 in its fastest form; `control` of the steps; `adjoint`
-    of diffrax, None for step replay; `samples`: number of stored states of the whole run, 0 for none; `turns`: length of the
+    of diffrax, None for step replay; `samples`: number of stored states of the whole run, 0 for none; `periods`: length of the
     measuring window in periods of the slowest motion; `bounds`, see `frequency_bounds`; `max_steps`; `progress_meter` of
     diffrax.
     """
@@ -141,7 +141,7 @@ class IntegrationPlan(NamedTuple):
     control: diffrax.AbstractStepSizeController | StepControl
     adjoint: diffrax.AbstractAdjoint | None
     samples: int
-    turns: Array | np.ndarray
+    periods: Array | np.ndarray
     bounds: tuple[Array | np.ndarray, Array | np.ndarray]
     max_steps: int
     progress_meter: diffrax.AbstractProgressMeter | None = None
@@ -160,11 +160,11 @@ def integrate(
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     unit = natural_units(scene)
     saves = _saves(scene, end, plan)
-    single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
+    wrapped, has_common_turns = angle_wrapping(scene, state.displacement.dtype)
     model = assemble(scene)
     field = dynamics_of(model)
     motion = PackedSystem(
-        field, state, wrapped=single and plan.solver is None, has_common_turns=has_common_turns, solver=plan.solver
+        field, state, wrapped=wrapped and plan.solver is None, has_common_turns=has_common_turns, solver=plan.solver
     )
     solver = motion.method(plan.adjoint) if plan.solver is None else plan.solver
     first_step, controller = _steps(motion, state, unit, plan, end)
@@ -217,7 +217,7 @@ def integrate(
 def _saves(scene: Scene, end: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:
     """Return the times of stored states: the measuring window, the end, and evenly spaced times over the whole run."""
     longest = 2.0 * jnp.pi * WINDOW_SAMPLES / (MIN_SAMPLES_PER_TURN * jax.lax.stop_gradient(scene.top_speed))
-    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.turns / plan.bounds[1], longest), end / 2.0)
+    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.periods / plan.bounds[1], longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW_SAMPLES)), diffrax.SubSaveAt(t1=True)]
     if plan.samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, plan.samples)))

@@ -20,7 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, with_nearest_turns
-from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate, whole_turns, wrap_angles
+from jaxvib.motion.integrate import IntegrationPlan, StepControl, angle_wrapping, integrate, whole_turns
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, StepChoice, plan_run
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
 from jaxvib.motion.start import Start
@@ -324,7 +324,7 @@ def _estimate_error(
     if control.steps is not None:
         found = found & (control.steps != coarser.steps)
     ours = window.state
-    theirs = with_nearest_turns(theirs, ours) if wrap_angles(scene, window.time.dtype)[0] else theirs
+    theirs = with_nearest_turns(theirs, ours) if angle_wrapping(scene, window.time.dtype)[0] else theirs
     difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
     error = estimated_error(difference, _error_share(control, coarser), scene, steps, fastest * window.time[-1])
     return jnp.where(found & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
@@ -333,7 +333,7 @@ def _estimate_error(
 def last_state(scene: Scene, run: Run) -> State:
     """Return the last state of a run, from which it can continue, with angles within one turn so that no digits are lost."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
-    _, has_common_turns = wrap_angles(scene, last.displacement.dtype)
+    _, has_common_turns = angle_wrapping(scene, last.displacement.dtype)
 
     def inside(own: ExciterState) -> ExciterState:
         first = np.ravel(own.angle[0])[0] if own.angle else 0.0

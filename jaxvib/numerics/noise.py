@@ -115,14 +115,14 @@ def _outlying(relative: np.ndarray, share: float, width: float) -> np.ndarray:
     return 1.0 / (1.0 + (1.0 - share) / max(share, 1e-300) * width * np.exp(-np.minimum(exponent, 700.0)))
 
 
-def limited(relative: np.ndarray, counts: np.ndarray, share: float, width: float) -> tuple[np.ndarray, float]:
+def limited(relative: np.ndarray, used: np.ndarray, share: float, width: float) -> tuple[np.ndarray, float]:
     """Return residuals (n,) for a least-squares fit in which outliers have little influence, and their standard deviation.
 
         psi(e) = e (1 - c P(e)),      c = 1 - 1/width^2
 
     P(e) is the probability that a residual is an outlier.
 
-    **Arguments**: `relative` e, residuals relative to the standard deviation of those that are no outliers; `counts` (n,):
+    **Arguments**: `relative` e, residuals relative to the standard deviation of those that are no outliers; `used` (n,):
     False for samples to leave out; `share` and `width` of the outliers, see `outliers_of`.
 
     >>> moved, deviation = limited(np.array([-1.0, 0.1, 1.0, 50.0]), np.ones(4, bool), 0.02, 20.0)
@@ -132,8 +132,8 @@ def limited(relative: np.ndarray, counts: np.ndarray, share: float, width: float
     outlying, factor = _outlying(relative, share, width), 1.0 - 1.0 / width**2
     score = relative * (1.0 - factor * outlying)
     slope = 1.0 - factor * outlying - (factor * relative) ** 2 * outlying * (1.0 - outlying)
-    mean = float(np.mean(slope[counts]))
-    return score / mean, math.sqrt(float(np.mean(score[counts] ** 2))) / mean
+    mean = float(np.mean(slope[used]))
+    return score / mean, math.sqrt(float(np.mean(score[used] ** 2))) / mean
 
 
 def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,14 +158,14 @@ def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 1.0 / sum_of, np.sqrt(ratio * sum_of)
 
 
-def autoregression(residual: np.ndarray, counts: np.ndarray | None = None, most: int = _MAX_ORDER) -> tuple[np.ndarray, float]:
+def autoregression(residual: np.ndarray, used: np.ndarray | None = None, most: int = _MAX_ORDER) -> tuple[np.ndarray, float]:
     """Return the filter that turns noise into white noise, and the standard deviation of the white noise.
 
         e_k = r_k + a_1 r_{k-1} + ... + a_p r_{k-p}
 
     The coefficients solve the Yule-Walker equations; the order p has the smallest Bayesian information criterion.
 
-    **Arguments**: `residual` r (n,); `counts` (n,): False for samples to leave out; `most`: largest order.
+    **Arguments**: `residual` r (n,); `used` (n,): False for samples to leave out; `most`: largest order.
 
     **Returns** (1, a_1, ..., a_p) and the standard deviation of e.
 
@@ -178,12 +178,12 @@ def autoregression(residual: np.ndarray, counts: np.ndarray | None = None, most:
     >>> bool(abs(taps[1] + 0.8) < 0.02), bool(abs(deviation - 1.0) < 0.02), autoregression(white)[0].tolist()
     (True, True, [1.0])
     """
-    counts = np.isfinite(residual) if counts is None else counts & np.isfinite(residual)
-    n = int(np.count_nonzero(counts))
+    used = np.isfinite(residual) if used is None else used & np.isfinite(residual)
+    n = int(np.count_nonzero(used))
     most = max(min(most, n // 20), 0)
-    r = np.where(counts, residual, 0.0)
+    r = np.where(used, residual, 0.0)
     size = 2 ** int(np.ceil(np.log2(2 * r.size + 1)))
-    spectra = [np.fft.rfft(each, size) for each in (r, counts.astype(float))]
+    spectra = [np.fft.rfft(each, size) for each in (r, used.astype(float))]
     product, pairs = (np.fft.irfft(np.abs(each) ** 2, size)[: most + 1] for each in spectra)
     covariance = product / np.maximum(pairs, 1.0)
     if covariance[0] <= 0.0:

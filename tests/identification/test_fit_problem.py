@@ -291,7 +291,7 @@ def test_outliers_of_coloured_noise_are_filtered():
 def test_angle_errors_become_unknowns():
     unknowns = Unknowns((), np.zeros(2), np.ones(2), np.zeros(2, bool), ("a",), 1)
     problem = build_problem(scene_of(), [run_with({"a": np.sin(T)})] * 3, ["machine.stiffness"], {})
-    rotors = tuple((SimpleNamespace(errors=m, drive=f"drive {m}", left_out=0.1 * m),) for m in (8, 16, 24))
+    rotors = tuple((SimpleNamespace(error_count=m, drive=f"drive {m}", left_out=0.1 * m),) for m in (8, 16, 24))
     blank = Problem(*[None] * len(Problem._fields))._replace(
         unknowns=unknowns, runs=problem.runs, rotors=rotors, means=np.arange(4.0), precisions=np.arange(4.0),
         angle_errors=(9.0, 9.0, 9.0),

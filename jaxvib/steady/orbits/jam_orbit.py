@@ -129,7 +129,7 @@ class JamProblem(NamedTuple):
     **Attributes**: the `scene`; `given`: the name of the prescribed speed; its `value`, and the `start` of the other speed,
     rad/s; `exists`: true if the mode exists, in leading order or in the search of the exact branch; `direction`: the sign of
     dn/dOmega that the mode needs, or None; relative `accuracy`; `implicit`: true for implicit integration of the multipliers;
-    `is_settled_first`: true if Newton's method starts from the motion at the load speed `start`, for a start near the solution.
+    `is_start_solved`: true if Newton's method starts from the motion that is first solved at the load speed `start`.
     """
 
     scene: Scene
@@ -140,7 +140,7 @@ class JamProblem(NamedTuple):
     direction: Array | np.ndarray | None
     accuracy: float
     implicit: bool
-    is_settled_first: bool = False
+    is_start_solved: bool = False
 
 
 class OrbitPlan(NamedTuple):
@@ -240,7 +240,7 @@ def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
     found, start = exact_mode_speeds(plan.problem.scene).get(mode), plan.problem.start
     start = start if found is None else jnp.asarray(found, dtype=start.dtype)
     return plan._replace(
-        problem=plan.problem._replace(exists=jnp.asarray(found is not None), start=start, is_settled_first=True)
+        problem=plan.problem._replace(exists=jnp.asarray(found is not None), start=start, is_start_solved=True)
     )
 
 
@@ -257,9 +257,9 @@ def _solve_program(problem: JamProblem, points: int, max_steps: int | None) -> O
 
     **Arguments**: `max_steps`: limit of the steps for the multipliers, with which they have reverse derivatives.
     """
-    scene, given, value, start, exists, direction, accuracy, implicit, settle = problem
+    scene, given, value, start, exists, direction, accuracy, implicit, is_start_solved = problem
     model, deviation = coincident_model(jammed_model(scene)), None
-    if settle:
+    if is_start_solved:
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
     speeds = (value, start) if given == "omega" else (start, value)

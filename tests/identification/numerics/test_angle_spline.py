@@ -113,10 +113,10 @@ def test_errors_are_taken_in_groups():
     for errors, columns in ((0, 1), (1, 9), (8, 9), (9, 17), (70, 65)):
         assert drive_of(errors)[1].table.shape[2] == columns
     angle = RotorAngle(drive_of(3)[1], drive_of(3)[0], (0.0, 1.0), True, 0.0, 0.0, ())
-    assert angle.errors == 8 and angle.without_errors().table.shape == (8, 6, 1)
+    assert angle.error_count == 8 and angle.without_errors().table.shape == (8, 6, 1)
     np.testing.assert_allclose(angle.at(np.array([0.6, 1.2])), drive_of(3)[0](np.array([0.6, 1.2]))[:, 0])
     plain = RotorAngle(jv.RunUp(60.0, acceleration=2.0), None, (0.0, 1.0), False, 0.0, 0.0, ())
-    assert plain.errors == 0 and plain.without_errors() is plain.drive
+    assert plain.error_count == 0 and plain.without_errors() is plain.drive
     np.testing.assert_allclose(plain.at(np.array([1.0, 3.0])), [1.0, 9.0])
 
 
@@ -183,7 +183,7 @@ def test_error_of_many_unknowns_is_left_out():
     grid = found.spline(np.linspace(t[0], t[-1], 4 * found.spline.c.shape[0]))[:, 1:]
     sizes = np.sqrt(np.mean(grid**2, axis=0))
     assert found.spline.c.shape[0] > 80
-    assert found.error == pytest.approx(np.sqrt(np.sum(sizes**2))) and found.errors == 64
+    assert found.error == pytest.approx(np.sqrt(np.sum(sizes**2))) and found.error_count == 64
     assert found.left_out == pytest.approx(np.sqrt(np.sum(sizes[64:] ** 2))) and 0.0 < found.left_out < found.error
 
 
