@@ -17,8 +17,8 @@ that turn with theta. The averaged equation keeps the slow part of this product 
     I_j w_j' = D_j (n - w_j) - (S_j/2) Im(e^{-i psi_j} a_j),     psi_j' = w_j - Omega,     a_j = e^H B_j A
 
 Only a_j, the forward circular part of the acceleration at the load, drives the load; the backward part averages to zero. All
-loads at one port have the same a. For loads at different stations s_j, B_j = B + s_j T and a_j = a_1 + s_j a_2. A contains w_j'
-(the reaction of the loads); therefore a, or (a_1, a_2), is the solution of a linear system. With the levers g_j = 1 or
+loads at one point have the same a. For loads at different stations s_j, B_j = B + s_j T and a_j = a_1 + s_j a_2. A contains
+w_j' (the reaction of the loads); therefore a, or (a_1, a_2), is the solution of a linear system. With the levers g_j = 1 or
 (1, s_j), P = e^H B M^-1 B^T e (with stations a 2 x 2 matrix, from B and T), h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j,
 the system is
 
@@ -226,7 +226,7 @@ class Averaged(eqx.Module):
         return jnp.where(turning, self.unbalance * size / (8.0 * self.inertia * jnp.where(turning, omega, 1.0)), 0.0)
 
     def _circle(self) -> Array:
-        """Return e, a row for each direction of the port."""
+        """Return e, a row for each direction of the mount."""
         if set(self.directions) == {1}:
             return jnp.asarray([_CIRCLE[axis] for axis in self.axes])[None, :, None]
         ways = [self.directions[owner] for owner in self.owners]

@@ -37,7 +37,7 @@ class CoincidentModel(eqx.Module):
     - `half_turn`: True if phi -> phi + pi, q -> -q leaves the equations unchanged, see `has_half_turn_symmetry` of effects
 
     In the methods, `rate` is the angular velocity of the bodies or loads and `speed` that of the rotor, rad/s; M is the number
-    of samples and np the number of directions of the port.
+    of samples and np the number of directions of the mount.
     """
 
     linear: JammedModel
@@ -50,7 +50,7 @@ class CoincidentModel(eqx.Module):
     half_turn: bool = eqx.field(static=True)
 
     def circle(self, phi: Points) -> tuple[Array, Array]:
-        """Return e(phi) and de/dphi (np, ...): a point of the unit circle in the port's directions, and its derivative."""
+        """Return e(phi) and de/dphi (np, ...): a point of the unit circle in the mount's directions, and its derivative."""
         cos, sin = jnp.cos(phi), jnp.sin(phi)
         axes = self.linear.mount.axes
         return jnp.stack([(cos, sin)[axis] for axis in axes]), jnp.stack([(-sin, cos)[axis] for axis in axes])
@@ -62,7 +62,7 @@ class CoincidentModel(eqx.Module):
     def rotor_torque(self, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
         """Return the torque of the rotor on loads at the angles `phi`, N m: viscous resistance and dry friction.
 
-        `a` (np, ...) is the acceleration of the port, m/s^2.
+        `a` (np, ...) is the acceleration of the mount, m/s^2.
         """
         loads, u, rates = self.loads, (jnp.asarray(phi),), (rate,)
         at = dict(zip(self.linear.mount.axes, a, strict=True))
@@ -94,7 +94,7 @@ class CoincidentModel(eqx.Module):
     def torque_slopes(self, phi: Points, rate: Array, speed: Array, a: Array) -> tuple[Array, Array, Array | None]:
         """Return the derivatives of `torque` with respect to angle and rate of each body (G, M) and to `a` (np, G, M).
 
-        The last one is None without friction, because no other torque depends on the acceleration `a` of the port.
+        The last one is None without friction, because no other torque depends on the acceleration `a` of the mount.
         """
         angle = jnp.asarray(phi)
         by_angle = jax.jvp(lambda p: self.torque(p, rate, speed, a), (angle,), (jnp.ones_like(angle),))[1]

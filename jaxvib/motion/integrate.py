@@ -286,7 +286,7 @@ def whole_turns(scene: Scene, stretch: float) -> float:
     """Return the longest time within `stretch`, s, that is a whole number of turns of all rotors, but at least one turn.
 
     The rotors of motors are ignored, because their angles are part of the state. If there are several rotors, only those with
-    an imbalance are considered. **Raises** `InputError` for rotors with an imbalance at different speeds.
+    an unbalance are considered. **Raises** `InputError` for rotors with an unbalance at different speeds.
     """
     one = len(scene.exciters) == 1
     counted = [

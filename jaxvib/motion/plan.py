@@ -134,7 +134,7 @@ class RunPlan:
 
     - `given_scene`: the scene of the call; `scene`: the scene of the run, with a spin-up drive for the start "spin_up"
     - `end`, s; `state` at the start
-    - `integration`: the static choices of one integration; `stretches`: the number of consecutive integrations
+    - `integration`: the choices for one integration; `stretches`: the number of consecutive integrations
     - `is_known`: True if scene, end and state have values
     - `is_estimated`: True if a second run with larger steps estimates the error; `accuracy`: the error that repeated runs must
       reach, or None

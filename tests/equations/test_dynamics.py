@@ -201,7 +201,7 @@ def test_published_numbers_build_the_published_machine():
 
 
 class Planar(jv.Machine):
-    """A body that moves across and up and also tilts, its port away from the tilt's axis: two-directional, gyroscopic."""
+    """A body that moves across and up and also tilts, its mount away from the tilt's axis: two-directional, gyroscopic."""
 
     matrices: tuple
     kind: str = eqx.field(static=True)

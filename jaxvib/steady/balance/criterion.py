@@ -103,8 +103,8 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
         f(S, w) = (S^2 w^2 / 2) Re(e^H A(w) e)
 
     S is the common unbalance of the loads, r the displacement of the exciter's axis that it causes, A the receptance of the
-    port and e the rotating direction of the force. For a port with two directions e^H A e is the trace of A plus a term of the
-    gyroscopic coupling. If f < 0, the axis moves away from the loads and they spread until they balance; if f > 0, they
+    mount and e the rotating direction of the force. For a mount with two directions e^H A e is the trace of A plus a term of
+    the gyroscopic coupling. If f < 0, the axis moves away from the loads and they spread until they balance; if f > 0, they
     gather. The paper states this for two or more loads, as an approximation; see `balanced_stability` for the exact result.
 
     **Arguments**: `unbalance` S kg m; default: that of all loads at one point.
@@ -139,7 +139,7 @@ CRITERION_TERMS = (
 def criterion(scene: Scene) -> Criterion:
     """Return the ranges of rotor speed in which loads balance a machine, and those in which they gather.
 
-        f(q) = (s^2 q^2 / 2) Re of the port receptance averaged over a revolution;    f < 0: balancing,    f > 0: gathering
+        f(q) = (s^2 q^2 / 2) Re of the mount's receptance averaged over a turn;    f < 0: balancing,    f > 0: gathering
 
     The functional f of `criterion_functional` changes sign only at the characteristic speeds: from + to - at a resonance, and
     from - to + at an additional speed. These speeds are therefore the ends of the intervals.

@@ -35,18 +35,18 @@ class CriterionStatus(eqx.Enumeration):
 
 
 class CharacteristicSpeeds(Result):
-    """Speeds at which the real part of the port's receptance changes sign, ascending, rad/s; NaN for a speed that does not
+    """Speeds at which the real part of the mount's receptance changes sign, ascending, rad/s; NaN for a speed that does not
     exist.
 
     **Attributes** (nd coordinates)
 
     - `resonances` (nd,): poles of the receptance without damping, at which loads change from gathering to balancing
-    - `additional` (nd - 1,): its zeros, at which they change back; these are the resonances of the machine with its port fixed
+    - `additional` (nd - 1,): its zeros, at which they change back; these are the resonances of the machine with its mount fixed
     - `shapes` (nd, nd): the mode shapes of the resonances, one column each, with unit modal mass and an arbitrary sign
     - `damped_resonances` (nd,) and `damped_additional` (nd - 1,): the same changes of sign with the machine's damping
     - `coordinates`: the names of the rows of `shapes`
 
-    If a mode does not move the port, its resonance is also one of the additional speeds, and no sign changes there.
+    If a mode does not move the mount, its resonance is also one of the additional speeds, and no sign changes there.
     """
 
     resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
@@ -102,15 +102,15 @@ class CharacteristicSpeeds(Result):
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:
-    """Return the receptance of the exciter's port at speed `omega` (scalar, rad/s), m/N.
+    """Return the receptance of the exciter's mount at speed `omega` (scalar, rad/s), m/N.
 
         A(w) = B [K - w^2 (M + sum m_j B^T B) + i w (C + w G)]^-1 B^T,     displacement = Re(A F exp(i w t))
 
-    The masses of the loads move with the port; a gyroscopic matrix G is taken at the rotor speed w.
+    The masses of the loads move with the mount; a gyroscopic matrix G is taken at the rotor speed w.
 
     **Arguments**: `scene`; `omega`.
 
-    **Returns** a complex array (p, p) for a port with p directions. Its values are not finite at an undamped resonance.
+    **Returns** a complex array (p, p) for a mount with p directions. Its values are not finite at an undamped resonance.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
@@ -130,14 +130,14 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     """Return resonances and additional speeds of a scene's machine with its loads, without and with damping.
 
-    Coincident loads exert the force S w^2 Re(e exp(i w t)) on the port; e is its rotating direction (a scalar for a port with
+    Coincident loads exert the force S w^2 Re(e exp(i w t)) on the mount; e is its rotating direction (a scalar for a mount with
     one direction, (1, -i) for two). The criterion is the mean of force times displacement, with b = B^T e:
 
         Re(e^H A(w) e) = Re(b^H [K - w^2 (M_S - i G) + i w C]^-1 b)
 
     M_S = M + sum m_j B^T B is the mass matrix with the loads. Without the gyroscopic matrix G the mean is the real part of the
     trace of A. Without damping, its poles are the eigenvalues of K y = w^2 (M_S - i G) y, and its zeros are those of the same
-    problem on b^H y = 0 (the port fixed); poles and zeros interlace. With damping, its sign changes are bracketed on a grid
+    problem on b^H y = 0 (the mount fixed); poles and zeros interlace. With damping, its sign changes are bracketed on a grid
     between the lowest and the highest undamped resonance: outside this range damping cannot change the sign, because
     Re(b^H D^-1 b) = y^H (K - w^2 M_S) y, where D is the matrix in brackets and y = D^-1 b. A damper between the exciter's
     platform and the foundation changes none of these speeds, because it adds only to the imaginary part of 1/A.
@@ -147,7 +147,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes evaluates many
     machines.
 
-    **Raises** `InputError` if no coordinate moves the port, a spring is too stiff for the precision compared with the
+    **Raises** `InputError` if no coordinate moves the mount, a spring is too stiff for the precision compared with the
     others, a gyroscopic carrier has a motion without a spring, or loads have different stations.
 
     >>> import jaxvib as jv
@@ -164,14 +164,14 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     scene = validate_scene(scene)
     require_one_point(scene)
     found, *parts = _characteristic_speeds(scene)
-    when_known(partial(_require_port_that_moves, scene), *parts)
+    when_known(partial(_require_mount_that_moves, scene), *parts)
     allowed = allowed_unknowns(scene)
     return found if allowed is None else jax.tree.map(lambda x: jnp.where(allowed, x, jnp.nan), found)
 
 
 @cached
 def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, Array, Array]:
-    """Return the characteristic speeds, and the port, stiffness and mass of the carrier with its loads."""
+    """Return the characteristic speeds, and the mount, stiffness and mass of the carrier with its loads."""
     model = linear_model(scene)
     carrier, direction = model.carrier, _direction(model)
     gyroscopic = model.mount.gyroscopic
@@ -193,16 +193,16 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
 
 
 def _direction(model: LinearModel) -> Array:
-    """Return the force direction b = B^T e (nd,); real for a port with one direction, whose phase has no effect."""
+    """Return the force direction b = B^T e (nd,); real for a mount with one direction, whose phase has no effect."""
     return model.mount.rows[0][0] if len(model.mount.axes) == 1 else model.direction
 
 
-def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
-    """**Raises** `InputError` if no coordinate moves the port, a rotor has a motion without a spring, or a resonance is lost in
-    rounding errors."""
+def _require_mount_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
+    """**Raises** `InputError` if no coordinate moves the mount, a rotor has a motion without a spring, or a resonance is lost
+    in rounding errors."""
     if not np.any(port):
         problem = "does not move with any coordinate, and its loads have no effect; put the exciter at a point that can move"
-        raise InputError("machine.port", problem)
+        raise InputError("machine.mount", problem)
     if scene.mounting.gyroscopic is not None:
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; every motion needs one")
@@ -237,7 +237,7 @@ def _free_and_fixed_modes(square: Array, c: Array) -> tuple[Array, Array, Array]
     length = jnp.sum((mirror * mirror.conj()).real)
     reflect = jnp.eye(c.shape[0], dtype=c.dtype) - 2.0 * jnp.outer(mirror, mirror.conj()) / length
     fixed = (reflect @ square @ reflect).at[0, :].set(0.0).at[:, 0].set(0.0)
-    # One call for both problems; the direction of the port gets an eigenvalue above all others.
+    # One call for both problems; the direction of the mount gets an eigenvalue above all others.
     fixed = fixed.at[0, 0].set(2.0 * jnp.sqrt(jnp.sum(jnp.abs(jax.lax.stop_gradient(square)) ** 2)))
     values, vectors = hermitian_modes(jnp.stack([square.astype(fixed.dtype), fixed]))
     return values[0], vectors[0], values[1, :-1]
@@ -255,7 +255,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     smooth = smoothing * jnp.outer(b, b.conj())
 
     def functional(m: LinearModel, w: Array) -> Array:
-        # A small damping is added, because a mode without damping that never moves the port gives 0/0 at its resonance.
+        # A small damping is added, because a mode without damping that never moves the mount gives 0/0 at its resonance.
         matrix = m.dynamic_stiffness(w) + 2j * w * tiny_damping * frozen.mass + smooth
         return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
 

@@ -130,8 +130,8 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
         T_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H L_j D(w)^-1 L_k^T e],     S = m R
         D(w) = K - w^2 (M + sum_j m_j L_j^T L_j) + i w (C + n G)
 
-    L_j (directions of the port, nd) maps the carrier's coordinates to the displacement of the port at the station of load j; n
-    is the rotor speed.
+    L_j (directions of the mount, nd) maps the carrier's coordinates to the displacement of the mount at the station of load j;
+    n is the rotor speed.
 
     **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a prescribed
     speed, and effects that this function does not include.

@@ -34,7 +34,7 @@ def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, order
 
 
 def _port_response(model: CoincidentModel, grid: Grid, omega: Array, speed: Array) -> Array:
-    """Return the response A_k (K, p, p) of the port with p directions to unbalance: k-th harmonic of its acceleration per k-th
+    """Return the response A_k (K, p, p) of the mount with p directions to unbalance: k-th harmonic of its acceleration per k-th
     harmonic of sum_g S_g e(phi_g)."""
     return _port_response_from(model, grid, omega, unbalance_response(model, omega, speed, grid.orders))
 
@@ -46,7 +46,7 @@ def _port_response_from(model: CoincidentModel, grid: Grid, omega: Array, respon
 
 
 def _feedback(grid: Grid, port_response: Array) -> Array:
-    """Return the matrix (p, p, M, M), with p directions of the port, from sum_g S_g e(phi_g) to the acceleration of the port,
+    """Return the matrix (p, p, M, M), with p directions of the mount, from sum_g S_g e(phi_g) to the acceleration of the mount,
     both at the points."""
     by_distance = jnp.einsum("kab,dk->abd", port_response.real, grid.cosine) - jnp.einsum(
         "kab,dk->abd", port_response.imag, grid.sine
@@ -130,7 +130,7 @@ def periodic_motion(
         a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T k^2 Omega^2 sum_g S_g (e(phi_g))_k
         D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
-    at the M points of `grid`, with the index k for harmonics, a the acceleration of the port, e the position of a load on the
+    at the M points of `grid`, with the index k for harmonics, a the acceleration of the mount, e the position of a load on the
     unit circle. The unknowns are psi at the points and one of Omega and n; the other one is `given`.
 
     **Arguments**
@@ -233,8 +233,8 @@ class BranchTangent(NamedTuple):
 
     **Attributes**: `slope` dn/dOmega; `residual` of the torque balance at the points, relative to its torques; `speed_error`:
     estimated relative error of the rotor speed at this load speed, due to the number of points; `deviation_error`: that of psi,
-    rad; `response` (K, nd, p): `unbalance_response` of the carrier at the orders of the grid; `acceleration` (p, M) of the port
-    with p directions at the points, m/s^2."""
+    rad; `response` (K, nd, p): `unbalance_response` of the carrier at the orders of the grid; `acceleration` (p, M) of the
+    mount with p directions at the points, m/s^2."""
 
     slope: Array
     residual: Array
@@ -301,7 +301,7 @@ def _bordered(by_deviation: Array, by_unknown: Array) -> Array:
 
 class Harmonics(NamedTuple):
     """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `deviation` (G, J) rad; `displacement` (nd, K)
-    m of the carrier, `acceleration` (directions, K) m/s^2 of the port, `force` (directions, K) N on the foundation."""
+    m of the carrier, `acceleration` (directions, K) m/s^2 of the mount, `force` (directions, K) N on the foundation."""
 
     deviation: Array
     displacement: Array

@@ -121,7 +121,7 @@ class _Disturbances(NamedTuple):
     """Linear equations of small disturbances about periodic motions, see `floquet`; displacements in units of `length`.
 
     **Attributes**: M^-1 K, M^-1 C and M^-1 G as `stiffness`, `damping` and `gyroscopic`; `shift` M^-1 B^T sum_g S_g, `port` B,
-    `accelerance` of the port; `share` of each body of loads in the `total` unbalance; `lever` total/I of each;
+    `accelerance` of the mount; `share` of each body of loads in the `total` unbalance; `lever` total/I of each;
     `omega` (P,) of the loads and `speed` (P,) of the rotor; `w` and `n`: the same numbers with the shape (1, 1, P).
     """
 
@@ -209,7 +209,7 @@ class _Disturbances(NamedTuple):
         q2 = -self.damped(below1) - _times(self.stiffness, below) / self.w**2
         driven = _times(self.port, q2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
         torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
-        # Acceleration of the port including the motion of the bodies: one equation for each direction.
+        # Acceleration of the mount including the motion of the bodies: one equation for each direction.
         responses = self.lever * c.coupling[:, :, None]
         weight = jnp.sum(t[:, None] * responses[None], axis=2)
         factor = _times(self.accelerance, weight)
@@ -254,7 +254,7 @@ def floquet(
         Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
         I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
 
-    T is the torque on the body. With dry friction it also depends on the acceleration of the port, a = Omega^2 B q''.
+    T is the torque on the body. With dry friction it also depends on the acceleration of the mount, a = Omega^2 B q''.
     Loads of one body that separate (sum d_j = 0) leave the carrier at rest: they obey the second equation without its last
     term. Loads that lie side by side are pressed together and do not separate.
 

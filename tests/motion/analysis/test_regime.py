@@ -175,7 +175,7 @@ def test_regime_under_jit_and_vmap():
 
 
 def test_remaining_moment_is_relative_to_the_radius_of_gyration():
-    """Loads at the port have no levers of their own: J_t = 0.479 kg m^2 of 37 kg, four times 0.05 kg."""
+    """Loads at the mount have no levers of their own: J_t = 0.479 kg m^2 of 37 kg, four times 0.05 kg."""
     s, motion = made([0.0, np.pi, np.pi, 0.0], 460.0)
     machine = eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(0.0))
     found = jv.regime(jv.Scene(machine, s.loads, s.drive, (jv.MomentImbalance(2e-5),)), motion)

@@ -36,7 +36,7 @@ def run_out(drag, until=5.0):
 
 @pytest.mark.parametrize(("drag", "damping", "count"), [(1.0, 0.0, 1), (1e4, 0.0, 3), (1.0, 1e6, 2)])
 def test_fastest_decay_is_that_of_the_dense_damping_matrix(drag, damping, count):
-    """The port reduces the inertia of a load most if the load moves along it."""
+    """The mount reduces the inertia of a load most if the load moves along it."""
     scene = dragged(drag, damping, count)
     p = reference_model(scene)
     along = [p.forces(0.0, np.r_[np.zeros(2), np.full(count, a), np.zeros(count)])[0] for a in np.linspace(0.0, np.pi, 9)]

@@ -352,7 +352,7 @@ def test_exciter_that_cannot_move_is_refused():
             return jv.Mount((jnp.zeros((1, 2)),), axes=(1,))
 
     s = jv.Scene(Fixed(kind="fixed"), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
-    with pytest.raises(jv.InputError, match=r"machine\.port does not move with any"):
+    with pytest.raises(jv.InputError, match=r"machine\.mount does not move with any"):
         jv.criterion(s)
     with pytest.raises(jv.InputError, match=r"machine\.stiffness.* is inf"):
         jv.one_mass(mass=1.0, stiffness=float("inf"), damping=0.0)

@@ -22,7 +22,7 @@ from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 
 class Shaker(jv.Machine):
-    """One platform that moves across and up, on unequal supports, the two directions coupled: a port of two directions."""
+    """One platform that moves across and up, on unequal supports, the two directions coupled: a mount of two directions."""
 
     stiffness: jax.Array
     kind: str = eqx.field(static=True)
