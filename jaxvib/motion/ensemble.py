@@ -129,7 +129,7 @@ class Ensemble(Result):
         if not np.any(finite):
             return head
         speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
-        worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
+        worst = "error not estimated" if np.all(np.isnan(error)) else f"error of the end states up to {np.nanmax(error):.1e}"
         lines = [head, f"  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"]
         if np.any(np.asarray(self.slip) > 0.0):
             lines.append(f"  all masses of a run turn at one speed: {self.synchronous_share.text}")

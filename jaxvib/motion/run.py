@@ -148,7 +148,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
         **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
         """
-        error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
+        error = f"estimated error of the end state with its phase {float(self.error):.1e}"
+        error = "error not estimated" if np.isnan(self.error) else error
         rotors = [w[-1] for w in self.window.rotor_speeds]
         rotor = "rotor" if len(rotors) == 1 else "rotors"
         state = "settled" if bool(self.settled) else "not settled: run longer"

@@ -30,6 +30,9 @@ _ROWS = 9
 
 _BINS = 60
 
+_MAX_PANELS = 4
+"""Maximum number of measures in the figure of a study with one axis."""
+
 _SPEED = "drive.speed"
 
 
@@ -45,7 +48,7 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
 
     - two axes or more: a map, of regimes if they were measured
     - random samples as the only axis: the distribution of the first measure
-    - one axis: the first measure as points; with samples, the shares of regimes if they were measured
+    - one axis: up to four measures as points; with samples, the shares of regimes if they were measured
     """
     opened = Store(Path(store))
     dims = opened.dims
@@ -55,17 +58,36 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
         return plot_distribution(store, ax=ax)
     if SAMPLE in dims and _has_labels(opened):
         return plot_shares(store, ax=ax)
+    return _plot_line(opened, ax)
+
+
+def _plot_line(store: Store, ax: Axes | None) -> Drawn:
+    """Plot the measures of a study with one axis as points, each in its own panel; onto `ax` only the first one with
+    numbers."""
+    from jaxvib.draw.style import panels
     from jaxvib.draw.sweeps import points_over
 
-    name = _measure(opened, None)
-    x, step = _thinned(opened, dims[0])
-    values = _values(opened, name, tuple(slice(None, None, step if d == dims[0] else 1) for d in dims))
-    log = _is_log(opened, dims[0])
-    label = _axis_label(opened, dims[0])
-    (_, scale), (_, factor) = _display_unit(opened, dims[0]), _display_unit(opened, name)
-    return points_over(
-        scale * x, factor * values.reshape(x.size, -1), x_label=label, y_label=_measure_label(opened, name), log=log, ax=ax
-    )
+    axis = store.dims[0]
+    x, step = _thinned(store, axis)
+    region = tuple(slice(None, None, step if dim == axis else 1) for dim in store.dims)
+    named = [name for name in store.names if not (name == "mode" and "regime" in store.names)][:_MAX_PANELS]
+    named = [_measure(store, None)] if ax is not None else named
+    figure, axes = panels(len(named), size=(7.0, 3.6 if len(named) == 1 else 2.2), share_x=True, ax=ax)
+    log = _is_log(store, axis)
+    scale = display_unit(store, axis)[1]
+    for drawn, name in zip(axes, named, strict=True):
+        shared = {"log": log, "x_label": axis_label(store, axis) if drawn is axes[-1] else ""}
+        if is_label(store, name):
+            codes, words = case_labels(store, region)
+            kept = sorted(set(codes[codes >= 0].ravel().tolist()))
+            places = np.array([[kept.index(k) if k >= 0 else np.nan for k in row] for row in codes.reshape(x.size, -1)])
+            points_over(scale * x, places, y_label="", ax=drawn, **shared)
+            drawn.set_yticks(range(len(kept)), [words[k].replace("_", " ") for k in kept])
+            drawn.set_ylim(-0.6, len(kept) - 0.4)
+            continue
+        values = display_unit(store, name)[1] * _values(store, name, region)
+        points_over(scale * x, values.reshape(x.size, -1), y_label=measure_label(store, name), ax=drawn, **shared)
+    return figure if ax is None else ax
 
 
 def figures(
@@ -85,7 +107,7 @@ def figures(
         raise InputError("--over", f"selects a map, which needs two axes; this study has: {', '.join(grid) or 'none'}")
     if grid and _has_labels(opened):
         yield "shares", plot_shares(store, x)
-    if measure is not None or any(not _is_label(opened, name) for name in opened.names):
+    if measure is not None or any(not is_label(opened, name) for name in opened.names):
         yield "distribution", plot_distribution(store, measure)
         yield "tornado", plot_tornado(store, measure)
 
@@ -131,19 +153,19 @@ def plot_map(
     region = tuple(steps.get(d, slice(n // 2, n // 2 + 1)) for d, n in zip(dims, opened.shape, strict=True))
     order = sorted(range(len(dims)), key=lambda k: (dims[k] in (y_name, x_name), dims[k] == x_name))
     shape = (ys.size, xs.size)
-    labels: Look = {"x_label": _axis_label(opened, x_name), "y_label": _axis_label(opened, y_name)}
+    labels: Look = {"x_label": axis_label(opened, x_name), "y_label": axis_label(opened, y_name)}
     labels["log"] = (_is_log(opened, x_name), _is_log(opened, y_name))
-    (_, scale_x), (_, scale_y) = _display_unit(opened, x_name), _display_unit(opened, y_name)
+    (_, scale_x), (_, scale_y) = display_unit(opened, x_name), display_unit(opened, y_name)
     if measure in (None, "regime", "mode") and _has_labels(opened):
-        table = _labels(opened, region)
+        table = case_labels(opened, region)
         lines = _theory(opened, x_name, y_name, xs, ys) if theory else {}
         codes = np.transpose(table.codes, order).reshape(shape)
         lines = {kind: [(scale_x * a, scale_y * b) for a, b in parts] for kind, parts in lines.items()}
         return label_map(scale_x * xs, scale_y * ys, codes, table.names, lines=lines, **labels, ax=ax)
     name = _measure(opened, measure)
     values = np.transpose(_values(opened, name, region), order).reshape(shape)
-    _, factor = _display_unit(opened, name)
-    return value_map(scale_x * xs, scale_y * ys, factor * values, label=_measure_label(opened, name), **labels, ax=ax)
+    _, factor = display_unit(opened, name)
+    return value_map(scale_x * xs, scale_y * ys, factor * values, label=measure_label(opened, name), **labels, ax=ax)
 
 
 def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -166,7 +188,7 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     place = dims.index(over)
     hits: dict[str, np.ndarray] = {}
     for rows in opened.pieces():
-        table = _labels(opened, rows)
+        table = case_labels(opened, rows)
         codes = np.moveaxis(table.codes, place, 0).reshape(table.codes.shape[place], -1)
         at = rows if place == 0 else slice(None)
         for k, name in [(-1, "no result"), *enumerate(table.names)]:
@@ -174,8 +196,8 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     total = np.sum(list(hits.values()), axis=0)
     shares = {name: (n / total, *wilson(n, total)) for name, n in hits.items() if np.any(n > 0)}
     log = _is_log(opened, over)
-    _, scale = _display_unit(opened, over)
-    return shares_chart(scale * opened.read(over), shares, x_label=_axis_label(opened, over), log=log, ax=ax)
+    _, scale = display_unit(opened, over)
+    return shares_chart(scale * opened.read(over), shares, x_label=axis_label(opened, over), log=log, ax=ax)
 
 
 def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -196,8 +218,8 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
         )
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
-    _, factor = _display_unit(opened, name)
-    return distribution_chart(factor * edges, np.asarray(counts), x_label=_measure_label(opened, name), ax=ax)
+    _, factor = display_unit(opened, name)
+    return distribution_chart(factor * edges, np.asarray(counts), x_label=measure_label(opened, name), ax=ax)
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
@@ -231,8 +253,8 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
         )
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
-    label = f"mean over all cases: {_measure_label(opened, name)}"
-    _, factor = _display_unit(opened, name)
+    label = f"mean over all cases: {measure_label(opened, name)}"
+    _, factor = display_unit(opened, name)
     words = [_axis_words(opened, axis) for axis in axes]
     return tornado_chart(words, *(factor * m for m in (*means.T, found[0] / found[1])), x_label=label, ax=ax)
 
@@ -259,14 +281,17 @@ _USUAL_SIZES = {"m": 0.01, "N/m": 1e5, "N": 100.0}
 """Usual values, SI, by which the display unit of a whole figure is chosen."""
 
 
-def _display_unit(store: Store, name: str) -> tuple[str, float]:
+def display_unit(store: Store, name: str) -> tuple[str, float]:
     """Return the display unit of an axis or a measure, and the factor that converts SI values to it."""
     unit = str(store.group[name].attrs.get("units", ""))
+    if unit == "m or rad":  # of coordinates
+        kinds = set(scene_from_toml(store.record["scene"]).machine.structure().units)
+        unit = kinds.pop() if len(kinds) == 1 else unit
     return shown_unit(unit, _USUAL_SIZES.get(unit, 1.0))
 
 
-def _axis_label(store: Store, axis: str) -> str:
-    unit, _ = _display_unit(store, axis)
+def axis_label(store: Store, axis: str) -> str:
+    unit, _ = display_unit(store, axis)
     words = _axis_words(store, axis)
     return f"{words}, {unit}" if unit else words
 
@@ -286,16 +311,16 @@ def _axis_words(store: Store, axis: str) -> str:
 
 def _measure(store: Store, name: str | None) -> str:
     """Return the name of a measure; default: the first one with numbers."""
-    plain = [n for n in store.names if not _is_label(store, n)]
+    plain = [n for n in store.names if not is_label(store, n)]
     found = name or next(iter(plain or store.names))
     if found not in store.names:
         raise InputError("measure", f"is {quoted(found)}; {suggest_name(found, list(store.names))}")
     return found
 
 
-def _measure_label(store: Store, name: str) -> str:
+def measure_label(store: Store, name: str) -> str:
     attributes = store.group[name].attrs
-    words, (unit, _) = str(attributes.get("long_name", name)), _display_unit(store, name)
+    words, (unit, _) = str(attributes.get("long_name", name)), display_unit(store, name)
     return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # otherwise matplotlib typesets a formula
 
 
@@ -309,11 +334,11 @@ def _has_labels(store: Store) -> bool:
     return "regime" in store.names or "mode" in store.names
 
 
-def _is_label(store: Store, name: str) -> bool:
+def is_label(store: Store, name: str) -> bool:
     return name == "mode" or "flag_meanings" in store.group[name].attrs
 
 
-def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
+def case_labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
     """Return the labels of the cases of a region: the name of the regime, and the jam mode of jammed loads."""
     words: list[str] = str(store.group["regime"].attrs["flag_meanings"]).split() if "regime" in store.names else ["not jammed"]
     first = len(words)

@@ -206,6 +206,7 @@ def sweep(
     >>> found.data.jam_frequency.sel({"drive.speed": 60.0}).round(1).values.tolist()
     [25.9, 27.0, 27.4]
     """
+    optional_module("zarr", "sweep")
     new_study = study(
         scene,
         axes,

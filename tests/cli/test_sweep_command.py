@@ -47,6 +47,8 @@ def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
     assert code == 0 and document["computed"] == 0 and document["counts"] == [{"status": "done", "cases": 10}]
     code, out, _ = typed("show", "study.zarr", "--out", "figures", "--no-theory")
     assert code == 0 and all((tmp_path / "figures" / f"{n}.png").exists() for n in ("map", "distribution", "tornado"))
+    last = [" ".join(line.strip("│ ").replace("│", " ").split()) for line in out.splitlines() if line.startswith("│")][-1]
+    assert "results of the cases" in out and last == "900 1 4712"  # 50 kg at 900 rpm
     code, out, _ = typed("show", "study.zarr", "--json")
     assert json.loads(out)["cases"] == 10
 

@@ -9,6 +9,7 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib.draw.sweeps import label_map
 from jaxvib.sweeps.figures import plot_distribution, plot_map, plot_shares, plot_tornado
+from jaxvib.sweeps.results import results_table
 from jaxvib.sweeps.study import study
 from jaxvib.sweeps.sweep import run_study
 from optimize import Quantity
@@ -97,6 +98,24 @@ def test_the_figure_that_fits(sampled, tmp_path):
     assert sampled.plot().axes[0].get_ylabel() == "cases"
     line = jv.sweep(SCENE, {"drive.speed": [40.0, 50.0]}, [Quantity("weighted", "N", weighted)], tmp_path / "s.zarr")
     assert isinstance(line.plot(), Figure) and line.plot().axes[0].get_ylabel() == "weighted, N"
+    given = {"mode": Quantity("mode", "", number), "weighted": Quantity("weighted", "N", weighted)}
+    both = jv.sweep(SCENE, {"drive.speed": [30.0, 50.0, 90.0]}, given, tmp_path / "both.zarr")
+    modes, values = both.plot().axes
+    assert [text.get_text() for text in modes.get_yticklabels()] == ["not jammed", "jammed, mode 1", "jammed, mode 2"]
+    np.testing.assert_allclose(values.lines[0].get_ydata(), both.data["weighted"].values, rtol=1e-12)
+    assert results_table(both.store)[1:] == (
+        ["rotor speed, rpm", "mode", "weighted, N"],
+        [["286.48", "not jammed", "4.8"], ["477.46", "jammed, mode 1", "5"], ["859.44", "jammed, mode 2", "5.4"]],
+    )
+
+
+def test_a_table_of_many_cases_has_their_range(grid, sampled):
+    _, heads, ((name, *weights), (mode, *shares)) = results_table(grid.store)
+    values = grid.data["weighted"].values
+    assert heads == ["measure", "least", "median", "largest"] and (name, mode) == ("weighted, N", "mode")
+    assert weights == [f"{x:.4g}" for x in (values.min(), np.median(values), values.max())]
+    assert shares == ["", "jammed, mode 1 45.5 %, not jammed 27.3 %, jammed, mode 2 27.3 %", ""]
+    assert results_table(sampled.store)[0] == "results of 3000 cases"
 
 
 @pytest.mark.parametrize(

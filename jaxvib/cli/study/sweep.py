@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, optional_module, quoted
 
 if TYPE_CHECKING:
     from jaxvib.sweeps.sweep import Progress, Sweep
@@ -40,6 +40,7 @@ def sweep(
     from jaxvib.sweeps.study import load_study  # slow imports, which --help does not need
     from jaxvib.sweeps.sweep import run_study
 
+    optional_module("zarr", "sweep")  # before the study, whose preparation takes seconds
     path = store or study.with_suffix(".zarr")
     if not resume and path.exists():
         raise InputError("--no-resume", f"is given, but {quoted(str(path))} exists already; give another folder with --store")
@@ -80,10 +81,16 @@ def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory:
 def _print_result(found: Sweep, output: Output, name: str) -> None:
     if name == "sweep":
         output.picture("sweep.png", found.plot)
+    from jaxvib.sweeps.results import results_table  # slow import, which --help does not need
+
     rows = [[status, str(cases), f"{100.0 * cases / found.cases:.3g} %"] for status, cases in found.counts]
-    output.done(
-        found.as_dict(), lambda: f"{table(found.store, ['status', 'cases', 'share'], rows)}\n{found.summary()}", name, found
-    )
+
+    def text() -> str:
+        counted = table(found.store, ["status", "cases", "share"], rows)
+        title, heads, results = results_table(found.store)
+        return "\n".join([counted, found.summary(), *([table(title, heads, results)] if results else [])])
+
+    output.done(found.as_dict(), text, name, found)
 
 
 class _Lines:
