@@ -373,7 +373,7 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
     - In jams and in the criterion gathered balls lie side by side, with the unbalance m R sin(N arcsin(r/R)) / (r/R) instead of
       N m R
     - In time integration only the effect `LoadContact` uses the `ball_radius`. Without this effect loads pass through each
-      other
+      other, and a run in which they end inside each other has the status `overlapping`
 
     **Returns** `CircularLoads`.
 

@@ -20,9 +20,10 @@ from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.equations.model import assemble
 from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Mount
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction, RotorImbalance
-from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run, RunStatus
@@ -196,6 +197,7 @@ def integrate(
     ended = solution.result == diffrax.RESULTS.successful
     bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
+    stations = [_stations(mount, e) for mount, e in zip(model.mounts, scene.exciters, strict=True) if e.loads is not None]
     unknown = jnp.full_like(end, jnp.nan)
     return Run(
         status=RunStatus.where(exists, _status(solution.result, bounded), RunStatus.no_start),
@@ -208,8 +210,8 @@ def integrate(
         evaluations=steps * _stages(solver),
         seconds=unknown,
         scene=scene,
-        coincident=_is_coincident([own.angle[0][None] for own in state.exciters if own.angle])
-        & _is_coincident([own.angle[0] for own in states.exciters if own.angle]),
+        coincident=_is_coincident([own.angle[0][None] for own in state.exciters if own.angle], stations)
+        & _is_coincident([own.angle[0] for own in states.exciters if own.angle], stations),
         engine="scalar" if motion.is_scalarized else "array",
     )
 
@@ -240,14 +242,24 @@ def _steps(
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
 
 
-def _is_coincident(angles: list[Array]) -> Array:
-    """Return True if several loads of an exciter have the same angle at all times (..., count), except for rounding errors."""
+def _stations(mount: Mount, exciter: Exciter) -> Array | None:
+    """Return the stations (count,) of the loads, m; None if they share a track."""
+    return None if mount.at_one_point or exciter.loads is None else mount.distances(exciter.loads.count)
 
-    def one_angle(angle: Array) -> Array:
-        spread = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
-        return (angle.shape[1] > 1) & (spread < jnp.finfo(angle.dtype).eps ** 0.4)
 
-    return functools.reduce(jnp.logical_or, map(one_angle, angles)) if angles else jnp.zeros((), bool)
+def _is_coincident(angles: list[Array], stations: list[Array | None]) -> Array:
+    """Return True if several loads of a track have the same angle at all times (..., count), except for rounding errors."""
+
+    def one_angle(angle: Array, stations: Array | None) -> Array:
+        limit = jnp.finfo(angle.dtype).eps ** 0.4
+        if stations is None:
+            return (angle.shape[1] > 1) & (jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1)) < limit)
+        same = stations[:, None] == stations[None, :]
+        spread = jnp.max(jnp.abs(angle[:, :, None] - angle[:, None, :]), axis=0)
+        return jnp.any((jnp.sum(same, axis=1) > 1) & jnp.all(~same | (spread < limit), axis=1))
+
+    found = list(map(one_angle, angles, stations))
+    return functools.reduce(jnp.logical_or, found) if found else jnp.zeros((), bool)
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:

@@ -24,7 +24,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory
 from jaxvib.motion.analysis.points import PointMotion, fit_harmonic, motion_of_point, vibration_of
 from jaxvib.motion.analysis.regime import Regime, regime
-from jaxvib.motion.analysis.separation import would_separate
+from jaxvib.motion.analysis.separation import overlap, would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -44,6 +44,9 @@ def _detached(scene: Scene, kept: Trajectory) -> Array:
     return jnp.where(jnp.isfinite(first), first, jnp.nan)
 
 
+_CONTACT = "add load_contact = { stiffness = 1e5, restitution = 0.6 } to [effects], or LoadContact(1e5, restitution=0.6)"
+
+
 class RunStatus(eqx.Enumeration):
     """Outcomes of a run. The value of each member is the message shown to the user."""
 
@@ -59,12 +62,14 @@ class RunStatus(eqx.Enumeration):
         "remaining vibration changes slowly"
     )
     would_separate = (
-        "all loads are at nearly one angle, and this motion is unstable: slightly separated loads move away from it"
+        "loads of one track are at nearly one angle, and this motion is unstable: slightly separated loads move away from it "
+        "(balls that cannot pass each other need ball_radius and load_contact)"
     )
     refused = REFUSED
+    overlapping = f"loads are inside each other, because they pass through each other without load_contact; {_CONTACT}"
 
 
-ENDS = ("done", "beating", "creeping", "would_separate")
+ENDS = ("done", "beating", "creeping", "would_separate", "overlapping")
 """Statuses of runs that reached their end."""
 
 SETTLED_DRIFT = 1e-3
@@ -92,7 +97,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
     - `scene` of the run
     - `coincident`: True if several loads started at one angle and stayed at one angle. Loads with the same parameters do so
       even if this motion is unstable. If such a motion settles, its stability is tested by the linearized equations; if
-      slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`
+      slightly separated loads would leave it, the status is `would_separate`, and the run is not `settled`. Loads with a
+      `ball_radius` that end inside each other have the status `overlapping`, which the effect `LoadContact` prevents
     - `engine` of the integration: "scalar" if the equations are computed on scalars, which takes 2.5 to 50 times less time, or
       "array", for states of more than 32 entries and for 4 loads and more
     - `evaluations` of the vector field (0 if the method does not count them), and `seconds` of the computation. Both include
@@ -121,8 +127,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def settled(self) -> Array:
-        """True if amplitudes and speed no longer change, and slightly separated loads do not leave the motion."""
-        return (self.drift < SETTLED_DRIFT) & (self.status != RunStatus.would_separate)
+        """True if amplitudes and speed no longer change, slightly separated loads do not leave the motion, and none overlap."""
+        is_real = (self.status != RunStatus.would_separate) & (self.status != RunStatus.overlapping)
+        return (self.drift < SETTLED_DRIFT) & is_real
 
     @property
     def finished(self) -> Array:
@@ -157,7 +164,11 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
         unstable, first = bool(self.status == RunStatus.would_separate), []
         if unstable:
-            first, state = [f"not settled: {self.message}"], "periodic only while the loads are at one angle"
+            state = "periodic only while the loads are at one angle"
+        elif bool(self.status == RunStatus.overlapping):
+            unstable, state = True, "a motion of loads that pass through each other"
+        if unstable:
+            first = [f"not settled: {self.message}"]
         end = RunStatus[RunStatus.done] if unstable else self.message
         one_angle = "  all loads stayed at their common initial angle: slightly separated loads may move differently"
         return "\n".join(
@@ -173,9 +184,15 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
                 *([] if self.trajectory is None else [f"  {self._on_the_way()}"]),
                 *([f"  {self.regime.summary()}"] if self.scene.is_plain else []),
                 *([one_angle] if self.coincident and not (unstable or self.settled) else []),
+                *([] if unstable else self._passages()),
                 *self._detachment(),
             ]
         )
+
+    def _passages(self) -> list[str]:
+        if not overlap(self.scene, self._whole):
+            return []
+        return [f"  loads passed through each other on the way, which may change the result; {_CONTACT}"]
 
     def _measures_text(self, measures: VibrationMeasures | None) -> list[str]:
         if not self.has_vibration:
@@ -341,8 +358,12 @@ def _require_turns(time: np.ndarray, speed: float) -> None:
 
 
 def with_separation_status(run: Run) -> Run:
-    """Return the run with the status `would_separate` if its loads stay at nearly one angle although this motion is
-    unstable."""
-    if not (status_name(run.status) in ENDS and would_separate(run.scene, run.window)):
+    """Return the run with the status `overlapping` if loads with a size are inside each other at its end, or with
+    `would_separate` if loads stay at nearly one angle although this motion is unstable."""
+    if status_name(run.status) not in ENDS:
         return run
-    return dataclasses.replace(run, status=member(RunStatus, "would_separate"))
+    if overlap(run.scene, run.window):
+        return dataclasses.replace(run, status=member(RunStatus, "overlapping"))
+    if would_separate(run.scene, run.window):
+        return dataclasses.replace(run, status=member(RunStatus, "would_separate"))
+    return run

@@ -17,7 +17,7 @@ from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
-from jaxvib.motion.analysis.separation import prepare_separation
+from jaxvib.motion.analysis.separation import prepare_separation, would_separate
 from jaxvib.motion.integrate import WINDOW_SAMPLES, frequency_bounds, whole_turns
 from jaxvib.motion.plan import RunPlan, StepChoice, Tolerance, plan_stretch, with_settled_drives
 from jaxvib.motion.run import SETTLED_DRIFT, Run, RunStatus, with_separation_status
@@ -196,8 +196,8 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
         drifts.append(float(run.drift))
         if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
             judged = _with_final_status(run, "done")
-            # Loads that are not at exactly one angle need no test: they have already left a motion that is unstable.
-            if is_coincident or status_name(judged.status) == "done":
+            # Loads that are not at exactly one angle go on until they have left a motion that is unstable.
+            if is_coincident or status_name(judged.status) == "done" or not would_separate(run.scene, run.window):
                 return judged, True
         if plan.mean_stretches is not None:
             measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
@@ -210,7 +210,7 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
                     return _with_final_status(run, "creeping"), True
         if len(drifts) == plan.stretches:
             last = _with_final_status(run, "done") if drifts[-1] < SETTLED_DRIFT else run
-            return last, status_name(last.status) == "would_separate"
+            return last, status_name(last.status) in ("would_separate", "overlapping")
         state = last_state(plan.first.scene, run)
 
 

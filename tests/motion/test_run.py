@@ -72,8 +72,10 @@ def test_loads_run_together_that_have_one_angle_all_the_time():
     """Several of them, but for what rounding may have grown to: with any two apart at one instant they are not together."""
     once = np.linspace(0.0, 100.0, 5)[:, None] + np.zeros(3)
     parted = once + np.eye(5, 3) * 1e-3
-    assert bool(_is_coincident([once])) and bool(_is_coincident([once + np.eye(5, 3) * 1e-9]))
-    assert not bool(_is_coincident([parted])) and not bool(_is_coincident([once[:, :1]]))
+    assert bool(_is_coincident([once], [None])) and bool(_is_coincident([once + np.eye(5, 3) * 1e-9], [None]))
+    assert not bool(_is_coincident([parted], [None])) and not bool(_is_coincident([once[:, :1]], [None]))
+    turned, stations = once + np.array([0.0, 1.0, 0.0]), np.array([0.1, -0.1, 0.1])
+    assert bool(_is_coincident([turned], [stations])) and not bool(_is_coincident([turned], [np.sort(stations)]))
 
 
 def test_the_summary_names_the_loads_that_left_their_track(run):

@@ -206,7 +206,7 @@ def test_members_of_enumerations_have_names():
     status = jv.RunStatus.where(jnp.asarray(True), jv.RunStatus.no_step, jv.RunStatus.done)
     assert status._enumeration is jv.RunStatus and compat.enumeration_of(status) is jv.RunStatus
     names = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start", "beating", "creeping")
-    names += ("would_separate", "refused")
+    names += ("would_separate", "refused", "overlapping")
     assert tuple(jv.RunStatus._name_to_item) == names and compat.enumeration_names(jv.RunStatus) == names
 
     class Bare:

@@ -118,7 +118,7 @@ class LoadContact(Effect):
         wide = 2.0 * np.asarray(ball_radius(loads)).reshape(-1, 1, 1)
         apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
         apart = np.where(np.eye(loads.count, dtype=bool), np.inf, apart)
-        if np.min(apart) < _MIN_START_DISTANCE:
+        if np.min(apart) < MIN_DISTANCE:
             run, i, j = np.unravel_index(np.argmin(apart), apart.shape)
             size = float(np.broadcast_to(wide, (apart.shape[0], 1, 1))[run, 0, 0])
             problem = f"puts loads {i + 1} and {j + 1} inside each other, {round(apart[run, i, j], 6) * size:.4g} m apart"
@@ -173,8 +173,8 @@ class LoadContact(Effect):
         return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (ball_radius(loads) / loads.arm()[0]) ** 2)
 
 
-_MIN_START_DISTANCE = 0.9
-"""Smallest distance between loads at a start, in diameters.
+MIN_DISTANCE = 0.9
+"""Smallest distance between loads that are not inside each other, in diameters.
 
 It is below 1 because a run may start from a state of another run in which loads press on each other.
 """

@@ -37,7 +37,7 @@ from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import MIN_CHANGE_SCALE, Measured, turning_directions
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, is_nearly_one_angle
+from jaxvib.motion.analysis.separation import MIN_SEPARATION_GROWTH, nearly_coincident_pairs
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.plan import Tolerance, require
@@ -235,7 +235,7 @@ def _with_separation_status(run: Envelope) -> Envelope:
     phase, time, rate = (np.asarray(x) for x in (run.window.phase, run.window.time, run.window.load_speed))
     plain = run.scene.is_plain
     has_one_speed = phase.shape[1] > 1 and bool(np.max(np.ptp(phase, axis=0)) < SETTLED_DRIFT and np.all(rate != 0.0))
-    if not (is_nearly_one_angle(phase) if plain else has_one_speed):
+    if not (nearly_coincident_pairs(run.scene, 0, phase) if plain else has_one_speed):
         return run
     last = (np.asarray(x[-1]) for x in map(np.asarray, (run.window.omega, run.window.phase, run.window.displacement)))
     growth = float(_growth_at_end(at_constant_speed(run.scene), *last))

@@ -32,7 +32,8 @@ class EnvelopeStatus(eqx.Enumeration):
     no_start = "the initial state does not exist or is not finite"
     unstable = "the exciters turn at one speed, but this motion is unstable: even the smallest disturbance ends it"
     would_separate = (
-        "all loads are at nearly one angle, and this motion is unstable: slightly separated loads move away from it"
+        "loads of one track are at nearly one angle, and this motion is unstable: slightly separated loads move away from it "
+        "(averaging omits the contact of balls that cannot pass each other: use simulate with ball_radius and load_contact)"
     )
     refused = REFUSED
     not_turning = (

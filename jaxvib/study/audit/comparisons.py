@@ -15,6 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis import measure
 from jaxvib.motion.analysis.scaled_error import natural_units
+from jaxvib.motion.analysis.separation import smallest_distance
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
@@ -49,7 +50,7 @@ class MotionValues(NamedTuple):
     - `omega` of the loads, rad/s; `amplitude` of each coordinate, m (rad for tilts); `foundation_force` N
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
     - `uncertainty`: relative uncertainty of these values
-    - `closest`: smallest distance of two loads in units of their diameter, NaN for points and for coincident loads
+    - `closest`: smallest distance of two loads in units of their diameter, not finite for points and for coincident loads
     - `magnified`: factor on amplitudes and force for relative changes, above 1 if the machine is almost at rest, see
       `MIN_AMPLITUDE_SHARE`
     """
@@ -241,16 +242,6 @@ def _read(scene: Scene, run: Run, fold: float) -> MotionValues:
         float(run.foundation_force),
         fold,
         max(drift, _MIN_UNCERTAINTY) if np.isfinite(drift) else math.nan,
-        _closest(scene, run),
+        smallest_distance(scene, run.window),
         magnified,
     )
-
-
-def _closest(scene: Scene, run: Run) -> float:
-    own, n = getattr(scene.loads, "ball_radius", None), scene.loads.count
-    if own is None or n < 2:
-        return math.nan
-    place = [np.asarray(x) for x in scene.loads.position(*run.window.state.angle)]
-    first, second = np.triu_indices(n, 1)
-    distance = np.sqrt(sum((x[:, first] - x[:, second]) ** 2 for x in place))
-    return float(np.min(distance) / (2.0 * float(own)))

@@ -7,7 +7,13 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.motion.analysis.separation import separation_rate, would_separate
+from jaxvib.motion.analysis.separation import (
+    nearly_coincident_pairs,
+    overlap,
+    separation_rate,
+    smallest_distance,
+    would_separate,
+)
 from optimize.quantities.evaluation import Evaluation
 
 
@@ -25,12 +31,91 @@ def two_balls(drag, speed, mass=0.5):
 
 
 def test_three_balls_balance_a_rotor_unless_at_one_angle():
-    s = three_balls(ball_radius=0.011)
+    s = three_balls()
     separated, one_angle = (jv.simulate(s, 10.0, separation=a, save="window", estimate=False) for a in (None, 0.0))
     assert separated.regime.label == "balanced" and float(separated.foundation_force) < 1.0
     assert one_angle.status_name == "would_separate" and not bool(one_angle.settled) and bool(one_angle.finished)
-    assert one_angle.summary().startswith("not settled: all loads are at nearly one angle, and this motion is unstable")
+    assert one_angle.summary().startswith("not settled: loads of one track are at nearly one angle, and")
+    assert "need ball_radius and load_contact" in one_angle.message
     np.testing.assert_allclose(one_angle.foundation_force, 215.5, rtol=1e-3)
+
+
+def test_sized_loads_inside_each_other_need_contact():
+    """The same loads as a point, and in contact."""
+    s = three_balls(ball_radius=0.011)
+    run = jv.simulate(s, 10.0, separation=0.0, estimate=False)
+    assert run.status_name == "overlapping" and not bool(run.settled) and bool(run.finished)
+    assert run.summary().startswith("not settled: loads are inside each other, because they pass through each other")
+    assert "add load_contact = { stiffness = 1e5, restitution = 0.6 } to [effects]" in run.message
+    assert "on the way" not in "".join(line for line in run.summary().splitlines() if "passed through" in line)
+    assert bool(jv.settle(at_speed(s), separation=0.0).status == jv.RunStatus.overlapping)
+
+
+def test_loads_that_passed_each_other_are_in_the_summary():
+    angle = np.zeros((3, 3)) + np.array([[0.0, 1.0, 2.0], [0.0, 2.0, 1.9], [2.0 * np.pi, 2.0, 1.0]])
+    s = three_balls(ball_radius=0.011)
+    run = jv.simulate(s, 0.2, separation=1.0, estimate=False, samples=3)
+    assert run.status_name == "done" and "passed through" not in run.summary()
+    crossed = eqx.tree_at(lambda r: r.trajectory.state.angle[0], run, jnp.asarray(angle))
+    np.testing.assert_allclose(smallest_distance(s, crossed.trajectory), 0.2 * np.sin(0.05) / 0.022, rtol=1e-9)
+    assert "loads passed through each other on the way" in crossed.summary() and "load_contact" in crossed.summary()
+    touching = s.replace(effects=(*s.all_effects, jv.LoadContact(1e5)))
+    assert not overlap(touching, crossed.trajectory) and not overlap(three_balls(), crossed.trajectory)
+
+
+def at_speed(s):
+    return s.replace(drive=jv.ConstantSpeed(s.drive.speed))
+
+
+def two_planes(stations=(0.15, 0.15, -0.15, -0.15)):
+    """A balancer with two balls in each of two planes, above its critical speeds."""
+    machine = jv.rotor(
+        mass=9.5,
+        transverse_inertia=0.5,
+        polar_inertia=0.15,
+        stiffness=(9e3, 9e3),
+        damping=(40.0, 40.0),
+        position=(0.2, -0.2),
+        stations=stations,
+    )
+    loads = jv.balls(count=4, mass=0.1, radius=0.26, drag=1.0)
+    return jv.Scene(machine, loads, jv.ConstantSpeed(120.0), (jv.StaticImbalance(moment=0.02),))
+
+
+def test_coincident_loads_are_found_at_each_station():
+    s = two_planes()
+    run = jv.simulate(s, 1.0, start=turning(s, [0.0, 0.0, 2.0, 2.0]), save="window", estimate=False)
+    assert bool(run.coincident) and would_separate(s, run.window)
+    assert sorted(nearly_coincident_pairs(s, 0, np.asarray(run.window.state.angle[0]))) == [(0, 1), (2, 3)]
+    other = jv.simulate(s, 1.0, start=turning(s, [0.0, 2.0, 0.0, 2.0]), save="window", estimate=False)
+    assert not bool(other.coincident) and not would_separate(s, other.window)
+
+
+def turning(s, angles):
+    zero = jnp.zeros(s.machine.structure().mass.shape[0])
+    return jv.State(zero, zero, (jnp.asarray(angles),), (jnp.full(len(angles), s.drive.speed),))
+
+
+@pytest.mark.parametrize(
+    ("angle", "pairs"),
+    [
+        ([0.0, 0.1, -0.05], [(0, 1)]),
+        ([0.0, 2.0 * np.pi + 0.1, -0.05], [(0, 1)]),
+        ([0.0, 2.0 * np.pi + 1e-4, 1.0], [(0, 1)]),
+        ([1.0, -1e-4, 2.0 * np.pi], [(1, 2)]),
+        ([0.0, 0.01, 1.0], []),
+    ],
+)
+def test_groups_of_loads_are_found_modulo_turns(angle, pairs):
+    assert nearly_coincident_pairs(three_balls(), 0, np.asarray([angle, angle])) == pairs
+
+
+def test_some_of_the_loads_at_one_angle_would_separate():
+    """Three of five equal loads as a point, which the two others cannot balance."""
+    machine = jv.planar_rotor(mass=25.0, stiffness=5e5, damping=300.0)
+    s = jv.Scene(machine, jv.balls(count=5, mass=0.04, radius=0.1, drag=2.0), jv.ConstantSpeed(300.0))
+    run = jv.simulate(s, 3.0, start=turning(s, [0.0, 0.0, 0.0, 3.0, 3.3]), save="window", estimate=False)
+    assert run.status_name == "would_separate" and not bool(run.coincident)
 
 
 @pytest.mark.parametrize(
