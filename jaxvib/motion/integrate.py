@@ -17,13 +17,12 @@ from jax import Array
 
 from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.linear import estimated_frequencies
-from jaxvib.equations.model import assemble
+from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.state import ExciterState, Spin, State
 from jaxvib.errors import InputError
-from jaxvib.machine.carrier import Mount
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction, RotorImbalance
-from jaxvib.machine.scene import Exciter, Scene
+from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run, RunStatus
@@ -197,7 +196,6 @@ def integrate(
     ended = solution.result == diffrax.RESULTS.successful
     bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
-    stations = [_stations(mount, e) for mount, e in zip(model.mounts, scene.exciters, strict=True) if e.loads is not None]
     unknown = jnp.full_like(end, jnp.nan)
     return Run(
         status=RunStatus.where(exists, _status(solution.result, bounded), RunStatus.no_start),
@@ -210,8 +208,7 @@ def integrate(
         evaluations=steps * _stages(solver),
         seconds=unknown,
         scene=scene,
-        coincident=_is_coincident([own.angle[0][None] for own in state.exciters if own.angle], stations)
-        & _is_coincident([own.angle[0] for own in states.exciters if own.angle], stations),
+        coincident=_stay_coincident(model, state, states),
         engine="scalar" if motion.is_scalarized else "array",
     )
 
@@ -242,9 +239,15 @@ def _steps(
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
 
 
-def _stations(mount: Mount, exciter: Exciter) -> Array | None:
-    """Return the stations (count,) of the loads, m; None if they share a track."""
-    return None if mount.at_one_point or exciter.loads is None else mount.distances(exciter.loads.count)
+def _stay_coincident(model: Model, start: State, states: State) -> Array:
+    """Return True if several loads of a track have one angle at the `start` and in all `states`."""
+    stations = [
+        None if mount.at_one_point else mount.distances(exciter.loads.count)
+        for mount, exciter in zip(model.mounts, model.scene.exciters, strict=True)
+        if exciter.loads is not None
+    ]
+    first, later = ([own.angle[0] for own in each.exciters if own.angle] for each in (start, states))
+    return _is_coincident([angle[None] for angle in first], stations) & _is_coincident(later, stations)
 
 
 def _is_coincident(angles: list[Array], stations: list[Array | None]) -> Array:
