@@ -59,3 +59,17 @@ def run_alone(block):
 def test_links_of_the_readme_lead_to_files():
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", README.read_text(encoding="utf-8")):
         assert target.startswith("http") or (ROOT / target).exists(), target
+
+
+def test_files_named_in_texts_exist():
+    named = re.compile(
+        r"(?<![\w/.])((?:benchmarks|tests|notebooks|docs|jaxvib|optimize)/[\w/]+\.(?:py|md|ipynb|toml|json|png|csv))"
+    )
+    folders = [ROOT / name for name in ("docs", "jaxvib", "optimize", "tests", "benchmarks", "notebooks")]
+    files = [
+        *ROOT.glob("*.md"),
+        *(path for folder in folders for end in ("md", "py", "ipynb") for path in folder.rglob(f"*.{end}")),
+    ]
+    texts = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in files}
+    missing = [(path, name) for path, text in texts.items() for name in named.findall(text) if not (ROOT / name).exists()]
+    assert missing == []
