@@ -111,13 +111,11 @@ class Reach:
         self.out.mkdir(exist_ok=True)
         self.locks = collections.defaultdict(threading.Lock)
 
-    def tests_of(self, mutant: Mutant, file: str) -> tuple[list[str] | None, float]:
-        """The tests of a file to run for a mutant, and their seconds; none if none reaches its line, None for all.
+    def tests_of(self, mutant: Mutant, file: str) -> tuple[list[str], float]:
+        """The tests of a file to run for a mutant, and their seconds; none if none reaches its line.
 
         Those that reach the line come before the others, which may use a program that the first ones traced.
         """
-        if not self.measures:
-            return None, 600.0
         with self.locks[file]:
             kept = self.out / f"{file.replace('/', '-')}.json"
             if not kept.exists():
@@ -193,19 +191,22 @@ _seconds: collections.Counter = collections.Counter()
 
 def fate_of(mutant: Mutant, copy_of: pathlib.Path, reach: Reach, files: int) -> dict:
     """The mutant's fate: "killed", "slow" (too slow, killed), "died" (the process did), "survived", "not reached"."""
-    fate, by, began = "not reached", "", time.perf_counter()
-    for file in nearest(mutant.file, files):
+    fate, by, began, chosen = "not reached", "", time.perf_counter(), nearest(mutant.file, files)
+    if not reach.measures:
+        fate, by = _run(mutant, copy_of, chosen, None, 100.0)
+        chosen = []
+    for file in chosen:
         tests, seconds = reach.tests_of(mutant, file)
         if tests != []:
-            found, by = _run(mutant, copy_of, file, tests, seconds)
+            found, by = _run(mutant, copy_of, [file], tests, seconds)
             fate = fate if found == "not reached" else found
             if fate not in ALIVE:
                 break
     return {"fate": fate, "by": by, "seconds": round(time.perf_counter() - began, 1)}
 
 
-def _run(mutant: Mutant, copy_of: pathlib.Path, file: str, tests: list[str] | None, seconds: float) -> tuple[str, str]:
-    """The mutant's fate by tests of one file, and the line about the test that failed."""
+def _run(mutant: Mutant, copy_of: pathlib.Path, chosen: list[str], tests: list[str] | None, seconds: float) -> tuple[str, str]:
+    """The mutant's fate by tests of files, and the line about the test that failed."""
     path = copy_of / mutant.file
     whole = path.read_bytes()
     home = str(copy_of.with_suffix(".cache"))  # a mutant's traced programs are of no use to others
@@ -213,7 +214,7 @@ def _run(mutant: Mutant, copy_of: pathlib.Path, file: str, tests: list[str] | No
     try:
         path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
         result = subprocess.run(
-            [sys.executable, *PYTEST, "-x", file],
+            [sys.executable, *PYTEST, "-x", *chosen],
             cwd=copy_of,
             env={**os.environ, **environment},
             capture_output=True,
