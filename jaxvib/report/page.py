@@ -136,7 +136,7 @@ def _section(title: str, body: str) -> str:
 
 def _figure(name: str, figure: Figure) -> str:
     data = io.BytesIO()
-    figure.savefig(data, format="png", metadata={"Software": None})
+    figure.savefig(data, format="png")
     text = base64.b64encode(data.getvalue()).decode("ascii")
     picture = f'<img alt="{escaped(name)}" src="data:image/png;base64,{text}">'
     return f"<figure>{picture}<figcaption>{escaped(name)}</figcaption></figure>"

@@ -135,10 +135,7 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
         return jnp.full((), jnp.inf, balance.unbalance.dtype)
     frozen, one = jax.lax.stop_gradient(balance).decomposed(), jnp.ones((), x.dtype)
     start = jax.lax.stop_gradient(x)
-    omega = motion_of(frozen, start)[0]
     free = np.flatnonzero(~frozen.is_prescribed)
-    differences = frozen.total_driving_torque(omega, one + 1.0) - frozen.driving_torque(omega)
-    has_differences = jnp.any(jnp.abs(differences) > 1e-9 * vibration_scale(frozen, omega), where=~frozen.is_prescribed)
     tolerance = jnp.finfo(x.dtype).eps ** 0.5
 
     def size(x: Array, factor: Array) -> Array:
@@ -164,7 +161,7 @@ def margin_of(balance: TorqueBalance, x: Array) -> Array:
     fold, there, slopes = _fold_near(frozen, at, factor)
     polished = (jnp.abs(there - factor) < 1e-2 * factor) & (jnp.max(jnp.abs(fold - at)) < _LONGEST_STEP)
     at, factor = jnp.where(polished, fold, at), jnp.where(polished, there, factor)
-    ends = has_differences & (factor < _LARGEST_FACTOR)
+    ends = factor < _LARGEST_FACTOR
     # Without a fold the values below are not used; finite ones leave no NaN in derivatives.
     at, factor = jnp.where(ends, at, start), jnp.where(ends, factor, one)
     # At the fold the left null vector times the residuals is 0 to first order for any unknowns.
