@@ -78,7 +78,7 @@ def distinct_regimes(
     """
     turn = np.exp(1j * phases)
     orders, shifts = (np.array(parts) for parts in zip(*exchanges, strict=True))
-    places = np.argsort(orders, axis=1)
+    places = np.argsort(orders)
     kept: list[int] = []
     for k in np.argsort(-speed, kind="stable"):
         # All exchanged forms of this regime, (exchanges, count).

@@ -180,6 +180,15 @@ def test_envelope_of_a_state_has_signed_speeds():
     np.testing.assert_array_equal(found.phase, [0.1, 0.2, -0.3])
 
 
+@pytest.mark.parametrize("ways", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+def test_clockwise_speeds_are_negative(ways):
+    exciters = [
+        jv.Exciter(drive=motor(), unbalance=0.4, at=(x, 0.3), direction=way) for x, way in zip((-0.5, 0.5), ways, strict=True)
+    ]
+    found = module._anticlockwise(jv.Scene(body(), exciters=exciters), jnp.array([90.0, 70.0]))
+    np.testing.assert_array_equal(found, [90.0 * ways[0], 70.0 * ways[1]])
+
+
 def test_measured_speeds_are_positive_in_each_direction():
     late = np.arange(8) >= 4
     speed = np.stack([np.full(8, -90.0), np.where(late, 71.0, 69.0), np.full(8, 50.0)], axis=1)

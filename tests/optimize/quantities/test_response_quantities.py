@@ -1,5 +1,7 @@
 """Quantities of the response to unbalances: dense scans, closed forms, derivatives, design files, bad input."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ from optimize import (
     response_torque,
     response_transmissibility,
 )
+from optimize.quantities import response
 from optimize.quantities.evaluation import Evaluation
 
 RANGE = ("100 rpm", "1400 rpm")
@@ -58,6 +61,38 @@ def test_values_at_a_speed_and_the_largest_are_those_of_a_scan(table):
     working = jv.response(table).operating
     last = int(np.flatnonzero(np.asarray(working.exists))[-1])
     np.testing.assert_allclose(response_force()(table), working.foundation_force[last], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("width", "top"),
+    [*((10.0, top) for top in (1.0, 2.0, 3.3, 5.0, 5.02, 7.7, 9.0, 10.0)), *((0.01, top) for top in (1.0, 5.0, 5.02, 10.0))],
+)
+def test_speed_of_the_largest_value_lies_in_its_range(width, top):
+    """Peaks anywhere from 2 to 9 for a resonance at 5; a narrow one lies near the resonance or beyond the range."""
+
+    def value(w):
+        return 1.0 / (1.0 + ((w - top) / width) ** 2)
+
+    found = float(response._speed_of_largest(value, jnp.asarray(2.0), jnp.asarray(5.0), jnp.asarray(9.0)))
+    np.testing.assert_allclose(found, np.clip(top, 2.0, 9.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("working", "folds", "distance"),
+    [
+        ((120.0, 90.0), (-119.0, 144.0, 80.0), 0.2),
+        ((-200.0, 60.0), (-61.0, -144.0, 30.0), 0.5),
+        ((120.0, 90.0), (-119.0, -90.0, -80.0), 1.0),
+        ((-120.0, -90.0), (119.0, 144.0, 80.0), np.nan),
+    ],
+)
+def test_nearest_fold_counts_from_the_highest_working_speed(table, monkeypatch, working, folds, distance):
+    """Speeds with a minus do not exist."""
+    found = [
+        SimpleNamespace(exists=jnp.asarray(speeds) > 0.0, speed=jnp.abs(jnp.asarray(speeds))) for speeds in (working, folds)
+    ]
+    monkeypatch.setattr(response, "operation_of", lambda model: found)
+    np.testing.assert_allclose(fold_distance().read(Evaluation(table)), distance, rtol=1e-14)
 
 
 @pytest.mark.slow
