@@ -15,6 +15,7 @@ unknowns include its error.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -90,6 +91,22 @@ class RecordedDrive(IdealDrive):
         return eqx.tree_at(lambda own: own.table, self, jnp.concatenate([moved, self.table[:, :, 1:]], axis=2))
 
 
+class RotorSamples(NamedTuple):
+    """Samples of a rotor.
+
+    **Attributes**: `kind` of the channel; `time` (n,), s; `value` (n,), rad or rad/s; `marks` (n,): number of the mark of each
+    pulse, otherwise 0; `spread` (n,): relative sizes of the errors; `scatter`: standard deviation about a smooth curve, in
+    these sizes (for pulses in s).
+    """
+
+    kind: str
+    time: np.ndarray
+    value: np.ndarray
+    marks: np.ndarray
+    spread: np.ndarray
+    scatter: float
+
+
 class RotorAngle(NamedTuple):
     """Angle of a rotor over time.
 
@@ -102,6 +119,7 @@ class RotorAngle(NamedTuple):
     - `error`, rad: root mean square of the standard error of the angle in the span
     - `left_out`, rad: part of `error` that the m errors do not contain
     - `notes`: sentences for the reader
+    - `samples` from which the angle follows; None if it follows from the drive of the scene
     """
 
     drive: Drive
@@ -111,6 +129,7 @@ class RotorAngle(NamedTuple):
     error: float
     left_out: float
     notes: tuple[str, ...]
+    samples: RotorSamples | None = None
 
     @property
     def error_count(self) -> int:
@@ -168,16 +187,20 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
         raise InputError(where, f"has {time.size} {what}; at least {_MIN_PULSES} are needed, record more turns")
     time = time - channel.delay
     notes: list[str] = []
+    marks, spread = np.zeros(time.size, int), np.ones(time.size)
     if channel.kind == "speed":
-        spline = fit_spline(time, np.abs(value)).antiderivative()
+        value = np.abs(value)
+        speed, scatter = fit_spline(time, value)
+        spline = speed.antiderivative()
     elif channel.kind == "angle":
-        spline = fit_spline(time, value * np.sign(value[-1] - value[0]))
+        value = value * np.sign(value[-1] - value[0])
+        spline, scatter = fit_spline(time, value)
     else:
-        angle = 2.0 * np.pi * value / channel.per_turn
-        marks = value.astype(int) % channel.per_turn if channel.per_turn > 1 else None
-        rough = np.convolve(np.pad(np.gradient(angle, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
-        # The errors of pulses are errors of their times.
-        spline = fit_spline(time, angle, marks, np.maximum(rough, _MIN_SPEED * np.max(rough)))
+        marks = value.astype(int) % channel.per_turn
+        value = 2.0 * np.pi * value / channel.per_turn
+        rough = np.convolve(np.pad(np.gradient(value, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
+        spread = np.maximum(rough, _MIN_SPEED * np.max(rough))  # the errors of pulses are errors of their times
+        spline, scatter = fit_spline(time, value, marks, spread)
         speed = spline(0.5 * (time[1:] + time[:-1]), 1)[:, 0]
         fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite nothing
         change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=fast, initial=0.0))
@@ -190,24 +213,34 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     sizes = np.sqrt(np.mean(grid**2, axis=0))
     error, left_out = float(np.linalg.norm(sizes)), float(np.linalg.norm(sizes[MAX_ERRORS:]))
     span = float(time[0]), float(time[-1])
-    return RotorAngle(_recorded_drive(spline), spline, span, channel.kind != "speed", error, left_out, tuple(notes))
+    knots, samples = np.unique(spline.t), RotorSamples(channel.kind, time, value, marks, spread, scatter)
+    drive = recorded_drive(knots, [spline(knots, order) for order in range(3)])
+    return RotorAngle(drive, spline, span, channel.kind != "speed", error, left_out, tuple(notes), samples)
 
 
-def _recorded_drive(spline: Any) -> RecordedDrive:
-    """Return the drive that follows a spline of an angle and its errors."""
-    knots, count = np.unique(spline.t), min(1 + MAX_ERRORS, spline.c.shape[1])
-    intervals, width = knots.size - 1, (knots[-1] - knots[0]) / (knots.size - 1)
-    rows, columns = 2 ** math.ceil(math.log2(intervals)), 1 - (1 - count) // _ERRORS_TOGETHER * _ERRORS_TOGETHER
-    table = np.zeros((rows, spline.k + 1, columns))
-    for p in range(spline.k + 1):
-        table[:intervals, p, :count] = spline(knots[:-1], p)[:, :count] * width**p / math.factorial(p)
-    speed = np.max(np.abs(spline(knots, 1)[:, 0]))
-    speed, begin, width, last = (jnp.asarray(float(each)) for each in (speed, knots[0], width, intervals - 1))
+def recorded_drive(time: np.ndarray, columns: Sequence[np.ndarray]) -> RecordedDrive:
+    """Return the drive with an angle and its errors at evenly spaced times (n,): `columns` (n, 1 + m) of them, and of their
+    first and second derivatives. They are interpolated by polynomials of degree 5."""
+    count, intervals, width = min(1 + MAX_ERRORS, columns[0].shape[1]), time.size - 1, (time[-1] - time[0]) / (time.size - 1)
+    value, slope, bend = (each[:, :count] * width**order for order, each in enumerate(columns))
+    table = np.zeros(
+        (2 ** math.ceil(math.log2(intervals)), _DEGREE + 1, 1 - (1 - count) // _ERRORS_TOGETHER * _ERRORS_TOGETHER)
+    )
+    low = np.stack([value[:-1], slope[:-1], 0.5 * bend[:-1]], axis=1)
+    ends = np.stack([value[1:] - low.sum(axis=1), slope[1:] - low[:, 1] - 2.0 * low[:, 2], bend[1:] - 2.0 * low[:, 2]], axis=1)
+    table[:intervals, :3, :count] = low
+    table[:intervals, 3:, :count] = np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]) @ ends
+    speed = np.max(np.abs(columns[1][:, 0]))
+    speed, begin, width, last = (jnp.asarray(float(each)) for each in (speed, time[0], width, intervals - 1))
     return RecordedDrive(speed, jnp.asarray(table), begin, width, last)
 
 
-def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None, rates: np.ndarray | None = None) -> Any:
+def fit_spline(
+    time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None, rates: np.ndarray | None = None
+) -> tuple[Any, float]:
     """Return a spline of degree 5 through noisy values, with 1 + m columns: the values, and m errors of them.
+
+    Returns also the standard deviation of the values about the spline, relative to their `rates` if these are given.
 
     The errors are principal components of the covariance of the coefficients, in the order of their size.
 
@@ -216,7 +249,7 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
     then one of the errors.
 
     >>> t = np.linspace(0.0, 2.0, 200)
-    >>> spline = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
+    >>> spline, _ = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
     >>> bool(abs(spline(1.0, 2)[0] - 60.0) < 0.1), bool(5e-5 < np.linalg.norm(spline(1.0)[1:]) < 5e-4)
     (True, True)
     """
@@ -233,15 +266,15 @@ def fit_spline(time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = N
         tried.append(_fit_knots(time, value * weights, weights, offsets, intervals))
         intervals = max(intervals + 1, int(1.4 * intervals))
     best = min(tried, key=lambda each: each.criterion)
-    covariance = best.covariance()
+    covariance, scatter = best.covariance(), math.sqrt(best.variance) / (1.0 if rates is None else float(np.mean(rates)))
     if rates is not None:
-        late = _derivative(best) * math.sqrt(best.variance) / np.mean(rates)
+        late = scatter * _derivative(best)
         covariance += np.outer(late, late)
     sizes, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(sizes, 0.0))
     grid = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * len(best.found)), best.knots, _DEGREE)
     errors = root @ np.linalg.svd(grid @ root, full_matrices=False)[2].T
-    return BSpline(best.knots, np.concatenate([best.found[:, None], errors], axis=1), _DEGREE)
+    return BSpline(best.knots, np.concatenate([best.found[:, None], errors], axis=1), _DEGREE), scatter
 
 
 class _KnotsFit(NamedTuple):

@@ -12,6 +12,7 @@ import numpy as np
 from jaxvib.identification.directions import Information, eliminate, elimination, polar_unbalances
 from jaxvib.identification.fit import Fitted, angle_shares, prior_equations, run_equations
 from jaxvib.identification.records.orders import foreign_vibration
+from jaxvib.identification.torque import MISFIT
 
 CHANCE = 1e-5
 """Share of records with pure noise about the fit that get the status `patterned`."""
@@ -75,6 +76,13 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
                 "end in a wrong minimum: use more pulses per turn, or sample them faster"
             )
     is_inaccurate, has_fit = False, resembles(fitted)
+    for k, misfit in enumerate(fitted.misfits):
+        if misfit > MISFIT:
+            is_inaccurate = True
+            notes.append(
+                f"the rotor in run {k + 1} deviates from the torque balance of its motor by {misfit:.3g} times the scatter of "
+                "its angle: the torque of the motor has another form, or a torque is missing"
+            )
     foreign = list(_foreign_vibrations(fitted, has_fit))
     notes += foreign
     shares = angle_shares(fitted)

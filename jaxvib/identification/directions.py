@@ -227,8 +227,8 @@ def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect:
 
 
 def _in_common_factor(name: str) -> bool:
-    """Return True for numbers in units of mass or force: masses, inertias, stiffnesses, dampings, unbalances."""
-    return any(word in name for word in ("mass", "inertia", "stiffness", "damping", "unbalance"))
+    """Return True for numbers in units of mass or force: masses, inertias, stiffnesses, dampings, unbalances, torques."""
+    return any(word in name for word in ("mass", "inertia", "stiffness", "damping", "unbalance", "torque"))
 
 
 def _kinds(names: tuple[str, ...]) -> str:
@@ -238,6 +238,7 @@ def _kinds(names: tuple[str, ...]) -> str:
         "stiffness": "stiffnesses",
         "damping": "dampings",
         "unbalance": "unbalances",
+        "torque": "torques",
     }
     there = [plural for word, plural in words.items() if any(word in name.rpartition(".")[2] for name in names)]
     return there[0] if len(there) == 1 else ", ".join(there[:-1]) + " and " + there[-1]

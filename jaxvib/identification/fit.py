@@ -8,8 +8,8 @@ rotor's angle is not small beside the noise, the angle is fitted with the machin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +45,10 @@ _RIDGE = 1e-13
 """Relative addition to the diagonal of normal equations, which keeps undetermined combinations of unknowns in place."""
 
 
+Equations = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Information of the data and of known values, and the gradient."""
+
+
 class Fitted(NamedTuple):
     """Result of a fit.
 
@@ -56,6 +60,8 @@ class Fitted(NamedTuple):
     - `noise` (C,) of each run: standard deviation of the residuals
     - `outliers` (C,) of each run: share of the residuals that are outliers
     - `converged`
+    - `misfits` of each run: deviation of the rotor from its torque balance, relative to that from a smooth curve; empty if no
+      number of a motor is unknown
     """
 
     x: np.ndarray
@@ -67,6 +73,7 @@ class Fitted(NamedTuple):
     noise: tuple[np.ndarray, ...]
     outliers: tuple[np.ndarray, ...]
     converged: bool
+    misfits: tuple[float, ...] = ()
 
     @property
     def residuals(self) -> tuple[np.ndarray, ...]:
@@ -105,7 +112,7 @@ def unknown_count(problem: Problem) -> int:
     return problem.unknowns.count + _linear_count(problem)
 
 
-def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solution of scaled normal equations."""
     size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
     scaled = matrix / np.outer(size, size) + _RIDGE * np.eye(len(size))
@@ -135,12 +142,12 @@ def project(problem: Problem, x: np.ndarray) -> _Trial:
     matrix, right, square = total[:-1, :-1], total[:-1, -1], total[-1, -1]
     if not np.all(np.isfinite(total)):
         return _Trial(x, np.zeros(len(right)), np.inf)
-    linear = _solve(matrix, right)
+    linear = solved(matrix, right)
     prior_cost = 0.0
     if any(problem.unbalances):
         for _ in range(8):  # the right side of each step depends on the directions of the last unbalances, not on their sizes
             information, gradient, prior_cost = unbalance_prior(problem, linear)
-            linear = linear + _solve(matrix + information, right - matrix @ linear + gradient)
+            linear = linear + solved(matrix + information, right - matrix @ linear + gradient)
         prior_cost = unbalance_prior(problem, linear)[2]
     data = square - 2.0 * linear @ right + linear @ matrix @ linear
     away = float(np.sum(problem.precisions * (x - problem.means) ** 2))
@@ -162,7 +169,7 @@ def linear_at(problem: Problem, x: np.ndarray, unbalance: np.ndarray | None) -> 
     if unbalance is None:
         return project(problem, x).linear
     total, n = _linear_equations(problem, x), unbalance.size
-    return np.concatenate([unbalance, _solve(total[n:-1, n:-1], total[n:-1, -1] - total[n:-1, :n] @ unbalance)])
+    return np.concatenate([unbalance, solved(total[n:-1, n:-1], total[n:-1, -1] - total[n:-1, :n] @ unbalance)])
 
 
 def run_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[np.ndarray]:
@@ -188,63 +195,80 @@ def prior_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> tupl
     return prior, gradient
 
 
-def _equations(problem: Problem, trial: _Trial) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def joint_equations(problem: Problem, x: np.ndarray, linear: np.ndarray) -> Equations:
     """Return the information of the data, that of known values, both (p + L, p + L), and the gradient (p + L,)."""
-    total = np.sum(run_equations(problem, trial.x, trial.linear), axis=0)
-    prior, gradient = prior_equations(problem, trial.x, trial.linear)
+    total = np.sum(run_equations(problem, x, linear), axis=0)
+    prior, gradient = prior_equations(problem, x, linear)
     return total[:-1, :-1], prior, total[:-1, -1] + gradient
 
 
 def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.ndarray, bool]:
     """Return the minimum near `x`, the information of data and of known values there, and True if it was reached."""
-    best, damping = project(problem, x), 1e-2
+
+    def equations(trial: _Trial) -> Equations:
+        return joint_equations(problem, trial.x, trial.linear)
+
+    def moved(trial: _Trial, step: np.ndarray) -> _Trial:
+        return project(problem, trial.x + limited_step(problem, step)[: x.size])
+
+    best, (information, prior, _), converged = descend(project(problem, x), equations, moved, x.size)
+    return best, information, prior, converged
+
+
+def descend(
+    best: Any, equations: Callable[[Any], Equations], moved: Callable[[Any, np.ndarray], Any], damped_count: int
+) -> tuple[Any, Equations, bool]:
+    """Return the minimum near a trial, its equations, and True if it was reached.
+
+    **Arguments**: the first trial `best`, with its `cost`; `equations` of a trial; `moved`: the trial after a step;
+    `damped_count`: number of the first unknowns, whose steps are damped.
+    """
+    damping, places = 1e-2, np.arange(damped_count)
     for _ in range(_MAX_ITERATIONS):
-        information, prior, gradient = _equations(problem, best)
-        matrix, p = information + prior, best.x.size
+        information, prior, gradient = found = equations(best)
+        matrix = information + prior
         if not np.all(np.isfinite(matrix)):
-            return best, information, prior, False
+            return best, found, False
         undamped = _undamped(matrix, gradient)
         if gradient @ undamped < _CONVERGED**2:
-            return best, information, prior, True
+            return best, found, True
         if gradient @ undamped < _NEAR_REDUCTION * best.cost:
-            trial = _follow_valley(problem, best.x + _limited(problem, undamped))
+            trial = _follow_valley(moved(best, undamped), equations, moved)
             if trial.cost < best.cost:
                 best = trial
                 continue
         while True:
-            damped = matrix.copy()
-            damped[np.arange(p), np.arange(p)] += damping * (np.diagonal(matrix)[:p] + 1e-12 * np.max(np.diagonal(matrix)[:p]))
-            trial = project(problem, best.x + _limited(problem, _solve(damped, gradient)))
+            damped, size = matrix.copy(), np.diagonal(matrix)[places]
+            damped[places, places] += damping * (size + 1e-12 * np.max(size))
+            trial = moved(best, solved(damped, gradient))
             if trial.cost < best.cost:
                 best, damping = trial, max(0.1 * damping, 1e-9)
                 break
             damping *= 8.0
             if damping > 1e6:
-                return best, information, prior, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
-    return best, *_equations(problem, best)[:2], False
+                return best, found, bool(gradient @ undamped < 100.0 * _CONVERGED**2)
+    return best, equations(best), False
 
 
 def _undamped(matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    return _solve(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
+    return solved(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
 
 
-def _limited(problem: Problem, step: np.ndarray) -> np.ndarray:
-    """Return the step of x of at most the longest length; errors of rotor angles do not count."""
-    step = step[: problem.unknowns.count]
-    longest = float(np.max(np.abs(step[: step.size - problem.unknowns.errors]), initial=0.0))
+def limited_step(problem: Problem, step: np.ndarray) -> np.ndarray:
+    """Return the step whose part of x is not longer than the longest one; errors of rotor angles do not count."""
+    longest = float(np.max(np.abs(step[: problem.unknowns.count - problem.unknowns.errors]), initial=0.0))
     return step * min(1.0, _LONGEST_STEP / max(longest, 1e-300))
 
 
-def _follow_valley(problem: Problem, x: np.ndarray) -> _Trial:
+def _follow_valley(trial: Any, equations: Callable[[Any], Equations], moved: Callable[[Any, np.ndarray], Any]) -> Any:
     """Return the values after some undamped steps. The cost may rise in between: this follows a curved valley of the cost,
     such as that of two dampings under hardly any noise, in a tenth of the steps of the damped method."""
-    trial = project(problem, x)
     for _ in range(_VALLEY_STEPS):
-        information, prior, gradient = _equations(problem, trial)
+        information, prior, gradient = equations(trial)
         step = _undamped(information + prior, gradient)
         if not np.all(np.isfinite(step)) or gradient @ step < _CONVERGED**2:
             break
-        trial = project(problem, trial.x + _limited(problem, step))
+        trial = moved(trial, step)
     return trial
 
 
@@ -364,5 +388,5 @@ def information_at(problem: Problem, unbalance: np.ndarray) -> Fitted:
     linear = np.zeros(_linear_count(problem))
     linear[: unbalance.size] = unbalance
     x = np.zeros(problem.unknowns.count)
-    information, prior, _ = _equations(problem, _Trial(x, linear, 0.0))
+    information, prior, _ = joint_equations(problem, x, linear)
     return Fitted(x, linear, problem, information, prior, (), (), (), True)

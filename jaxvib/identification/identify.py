@@ -23,11 +23,12 @@ from jaxvib.identification.directions import (
     in_polar_unbalances,
     information_of,
 )
-from jaxvib.identification.fit import Fitted, fit_from, unknown_count
+from jaxvib.identification.fit import Fitted, unknown_count
 from jaxvib.identification.likelihood import QUANTILE, profile_intervals
 from jaxvib.identification.problem import Problem, build_problem, natural
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.identification.start import track_orders
+from jaxvib.identification.torque import fit_with_torques
 from jaxvib.machine.numbers.named import find_number, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -172,6 +173,8 @@ def identify(
     - The noise of each channel may be coloured: residuals are filtered to white noise by an autoregressive model, and the
       intervals are those of the Fisher information with the noise found
     - The supports must be linear, and the exciters carry unbalances only
+    - Numbers of a motor, such as "drive.inertia" and "drive.stall_torque", can be unknown if a channel gives the angle or the
+      speed of its rotor: the torque balance with the torque of the vibration is fitted to it together with the readings
 
     For a `BearingPendulum`, see `jaxvib.study.bearing.identify.identify_bearing`:
 
@@ -223,7 +226,7 @@ def identify(
     free, readings = unknown_count(problem), sum(int(np.count_nonzero(mask)) for mask in problem.masks)
     if free >= readings:
         raise InputError("unknown", f"has {free} unknowns with those of the runs, for {readings} readings; record longer runs")
-    fitted = fit_from(problem, [np.zeros(problem.unknowns.count), track_orders(problem)])
+    fitted = fit_with_torques(problem, [np.zeros(problem.unknowns.count), track_orders(problem)])
     fitted = _near_first_values(scene, problem, fitted)
     found = _interpret(scene, fitted)
     if throw and not resembles(fitted):
@@ -245,7 +248,7 @@ def _near_first_values(scene: Scene, problem: Problem, fitted: Fitted) -> Fitted
         away = np.concatenate([fitted.x[:number_count], np.log(known.values[number_count:] / first)])
         start = fitted.x[: problem.unknowns.count].copy()
         start[:number_count] -= (axes @ (axes.T @ away))[:number_count]
-        back = fit_from(problem, [start])
+        back = fit_with_torques(problem, [start])
         if not back.converged:
             break
         fitted = back
@@ -263,7 +266,7 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
         fitted_to, known.names, known.covariance, known.undetermined, known.errors, lambda scene: np.concatenate(natural(scene))
     )
     estimates = list(map(_estimate, known.values, known.scale, known.logarithmic, _spreads(known), known.determined))
-    ends = profile_intervals(fitted, known) if resembles(fitted) else {}
+    ends = profile_intervals(fitted, known) if resembles(fitted) and not fitted.misfits else {}
     for name, (low, high) in ends.items():
         i = known.names.index(name)
         estimates[i] = _with_ends(estimates[i], known.scale[i], bool(known.logarithmic[i]), low, high)

@@ -16,6 +16,7 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
+from jaxvib.identification.records.agreement import ROTOR_KINDS
 from jaxvib.identification.records.decimation import MIN_LONG, decimated
 from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
@@ -142,11 +143,7 @@ def build_problem(scene: Scene, runs: Sequence[MeasuredRun], unknown: Sequence[s
     exact = {number.name for number, _ in fixed}
     free = {number.name: number for number in numbers if number.name not in exact}
     free |= {name: number for name, (number, each) in found.items() if each.error > 0.0}
-    for name, number in free.items():
-        if number.path[0] == "exciters" and "drive" in number.path:
-            raise InputError(
-                f"unknown.{name}", "is a number of the drive, which the recorded angle does not determine; leave it out"
-            )
+    _require_torque_balance(scene, free, runs)
     moved = [number for number in free.values() if number.path[-1] != "unbalance"]
     unbalances = tuple(_known_unbalance(scene, k, free, found) for k in range(len(scene.exciters)))
 
@@ -203,6 +200,26 @@ def _known_means(
             means[k] = math.log(each.value / values[k]) if positive[k] else (each.value - values[k]) / scale[k]
             errors[k] = each.error / each.value if positive[k] else each.error / scale[k]
     return means, errors
+
+
+def is_of_drive(number: NamedNumber) -> bool:
+    """Return True for a number of a drive."""
+    return number.path[0] == "exciters" and "drive" in number.path
+
+
+def _require_torque_balance(scene: Scene, free: Mapping[str, NamedNumber], runs: Sequence[MeasuredRun]) -> None:
+    """Raise if numbers of a drive are unknown that no record determines."""
+    drive, measured = scene.exciters[0].drive, all(run.of_kind(*ROTOR_KINDS) for run in runs)
+    if len(scene.exciters) == 1 and not drive.ideal and not drive.state_units() and measured:
+        return
+    for name, number in free.items():
+        if is_of_drive(number):
+            raise InputError(
+                f"unknown.{name}",
+                "is a number of the drive, which the recorded angle does not determine; leave it out. Only the numbers of the "
+                "motor of a scene with one exciter can be unknown, if the motor has no currents as states and each run has a "
+                "channel of pulses, angle or speed",
+            )
 
 
 def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:

@@ -73,23 +73,30 @@ def accelerations(times, cases, phase=0.4, turning=ramp):
     return np.moveaxis(slopes.reshape(4, len(cases), -1)[2:], 0, -1)
 
 
-def motor_run_up(times, case, stall=1.6, no_load=120.0, inertia=0.1, phase=0.4):
+def line_torque(t, speed):
+    """Return the torque of a motor, a straight line over the speed, N m."""
+    return 1.6 * (1.0 - speed / 120.0)
+
+
+def motor_run_up(times, case, torque=line_torque, inertia=0.1, phase=0.4):
     """Return accelerations (n, 2) of both masses, and the angle, speed and acceleration of the rotor as a function of time.
 
-    A motor with a straight line of torque over speed drives the rotor; its speed dips at the resonances.
+    The rotor is driven by `torque`, a function of time and speed; its speed dips at the resonances.
     """
-    m1, m2, k1, k2, c1, c2, k, c, s = case.values()
+    m1, m2, k1, k2, c1, c2, k, c, s = dict(case).values()
 
     def rates(t, y):
         x1, x2, theta, v1, v2, speed = y
         link = k * (x1 - x2) + c * (v1 - v2)
         cos, sin = s * np.cos(theta + phase), s * np.sin(theta + phase)
         # m2 a + cos theta'' = sin speed^2 - supports;  cos a + inertia theta'' = torque
-        right = speed**2 * sin - k2 * x2 - c2 * v2 + link, stall * (1.0 - speed / no_load)
+        right = speed**2 * sin - k2 * x2 - c2 * v2 + link, torque(t, speed)
         change = (m2 * right[1] - cos * right[0]) / (m2 * inertia - cos**2)
         return np.array([v1, v2, speed, (-k1 * x1 - c1 * v1 - link) / m1, (right[0] - cos * change) / m2, change])
 
-    run = solve_ivp(rates, (times[0], times[-1]), np.zeros(6), "DOP853", dense_output=True, rtol=1e-10, atol=1e-12)
+    span = times[0], times[-1]
+    run = solve_ivp(rates, span, np.zeros(6), "DOP853", dense_output=True, rtol=1e-10, atol=1e-12, max_step=0.05)
+    times = np.asarray(times)
     slopes = np.array([rates(t, y) for t, y in zip(times, run.sol(times).T, strict=True)])
 
     def turning(t):

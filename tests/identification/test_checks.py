@@ -157,7 +157,7 @@ def outcome(monkeypatch, **changes):
         "chances": (0.5, 0.3),
         "shares": (0.0, 0.0),
     }
-    given |= {"errors": (0.01, 0.02), "outliers": (0.0, 0.0), "undetermined": 0} | changes
+    given |= {"errors": (0.01, 0.02), "outliers": (0.0, 0.0), "undetermined": 0, "misfits": (1.9,)} | changes
     chances = iter(given["chances"])
     monkeypatch.setattr(checks, "_contradictions", lambda fitted: given["contradictions"])
     monkeypatch.setattr(checks, "_disagreements", lambda fitted: given["disagreements"])
@@ -175,7 +175,9 @@ def outcome(monkeypatch, **changes):
     runs = [SimpleNamespace(channels=(channel("a"), channel("b")), taps=two)]
     unknowns = SimpleNamespace(count=5, errors=2)
     problem = SimpleNamespace(unknowns=unknowns, rotors=rotors, runs=runs, angles=[np.array([[7.0, 8.0]])], angle_errors=[0.05])
-    fitted = SimpleNamespace(problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(5))
+    fitted = SimpleNamespace(
+        problem=problem, residuals=[two], outliers=[np.array(given["outliers"])], x=np.zeros(5), misfits=given["misfits"]
+    )
     status, least, notes = status_of(fitted, SimpleNamespace(undetermined=np.zeros((2, given["undetermined"]))))
     return status, least, notes
 
@@ -201,6 +203,7 @@ def outcome(monkeypatch, **changes):
             ["angle in run 1, 0.05 rad, is not in the intervals, and it is 12% of the"],
         ),
         ({"shares": (0.0, 0.09)}, "found", 0.3, []),
+        ({"misfits": (0.9, 2.1)}, "patterned", 0.3, ["run 2 deviates from the torque balance of its motor by 2.1"]),
         ({"outliers": (0.02, 0.0)}, "found", 0.3, ["2.0% of the readings of channel 'a' in run 1 are outliers"]),
     ],
 )

@@ -243,7 +243,6 @@ def test_interval_of_a_quantity_follows_from_the_numbers():
         ({"unknown": ["machine.stifness"]}, "did you mean 'machine.stiffness'"),
         ({"unknown": NAMES, "dry": True}, "dry is for a BearingPendulum"),
         ({"unknown": NAMES, "known": {"machine.mass[0]": "95 N"}}, "machine.mass"),
-        ({"unknown": ["drive.inertia"]}, "is a number of the drive"),
     ],
 )
 def test_wrong_arguments_end_in_one_sentence(arguments, words):

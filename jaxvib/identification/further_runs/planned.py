@@ -119,7 +119,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     if count > 1:
         raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
     scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(None, planned.drive))
-    problem = build_problem(scene, [run], fit.names, {})
+    problem = build_problem(scene, [run], vibrating(fit), {})
     root = math.sqrt(float(problem.runs[0].step))
     problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name]) / root) for c in moving]])
     problem = problem._replace(precisions=own_precisions(fit, problem))
@@ -127,6 +127,11 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     fitted = information_at(problem, size * np.array([np.cos(fit.phase[0]), np.sin(fit.phase[0])]))
     has_mark = any(channel.kind in ("pulses", "angle") for channel in planned.channels)
     return Expected(fitted, *shared_places(fit, problem, has_mark))
+
+
+def vibrating(fit: MachineFit) -> list[str]:
+    """Return the names of the numbers of a fit, without those of the motor, which the vibrations do not determine."""
+    return [name for name in fit.names if "drive." not in name]
 
 
 def own_precisions(fit: MachineFit, problem: Problem) -> np.ndarray:

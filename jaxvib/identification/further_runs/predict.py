@@ -13,7 +13,7 @@ from jaxvib.display import Drawn, Onto
 from jaxvib.identification.checks import CHANCE, Disagreement, disagreement, pseudoinverse, residual_chance
 from jaxvib.identification.directions import eliminate, elimination, polar_unbalances
 from jaxvib.identification.fit import differences_of, linear_at, run_equations
-from jaxvib.identification.further_runs.planned import own_precisions, shared_places
+from jaxvib.identification.further_runs.planned import own_precisions, shared_places, vibrating
 from jaxvib.identification.identify import MachineFit
 from jaxvib.identification.problem import EXACT, Known, Problem, build_problem, with_noise
 from jaxvib.identification.run import MeasuredRun
@@ -155,7 +155,7 @@ class _Predicted(NamedTuple):
 
 
 def _at_the_fit(fit: MachineFit, run: MeasuredRun) -> _Predicted:
-    problem = build_problem(fit.scene, [run], fit.names, {})
+    problem = build_problem(fit.scene, [run], vibrating(fit), {})
     sizes = np.array([float(np.asarray(exciter.unbalance, float)) for exciter in fit.scene.exciters])
     problem = problem._replace(unbalances=tuple(Known(size, EXACT * size) for size in sizes))
     has_mark = len(sizes) == 1 and problem.marked and bool(fit.information[-1, -1] > 0.0)

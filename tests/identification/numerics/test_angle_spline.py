@@ -11,8 +11,8 @@ from jaxvib.identification.angle import (
     RotorAngle,
     _fit_knots,
     _measured,
-    _recorded_drive,
     fit_spline,
+    recorded_drive,
     rotor_angles,
 )
 
@@ -49,7 +49,7 @@ def test_fit_is_the_weighted_least_squares(marks):
     assert fit.criterion == pytest.approx(n * np.log(square / n) + k * np.log(n), rel=1e-9)
     covariance = square / (n - k) * np.linalg.inv(columns.T @ columns)[:size, :size]
     np.testing.assert_allclose(fit.covariance(), covariance, rtol=1e-5, atol=1e-7 * np.max(covariance))
-    spline = fit_spline(T, value, marks, spread)
+    spline, scatter = fit_spline(T, value, marks, spread)
     counts = [len(_fit_knots(T, value * weights, weights, offsets * weights[:, None], each).found) for each in (1, 2)]
     assert spline.c.shape[0] in counts  # a parabola needs one interval, or few
     best = min(
@@ -57,12 +57,13 @@ def test_fit_is_the_weighted_least_squares(marks):
         key=lambda each: each.criterion,
     )
     np.testing.assert_allclose(spline.c[:, 0], best.found)
+    assert scatter == pytest.approx(np.sqrt(best.variance) / np.mean(spread))
     # The errors have the covariance of the coefficients, and are orthogonal over time, the largest first.
     # A common delay of all values moves the curve along its slope.
     t = np.linspace(T[0], T[-1], 30)
     basis, late = (
         BSpline.design_matrix(t, best.knots, 5).toarray(),
-        spline(t, 1)[:, 0] * np.sqrt(best.variance) / np.mean(spread),
+        spline(t, 1)[:, 0] * scatter,
     )
     expected = basis @ best.covariance() @ basis.T + np.outer(late, late)
     np.testing.assert_allclose(spline(t)[:, 1:] @ spline(t)[:, 1:].T, expected, atol=1e-8 * np.max(expected))
@@ -75,8 +76,8 @@ def test_fit_is_the_weighted_least_squares(marks):
 def test_intervals_follow_from_the_information_criterion():
     t = np.linspace(0.0, 3.0, 400)
     noise = 1e-3 * np.random.default_rng(0).normal(size=t.size)
-    assert fit_spline(t, curve(t) + noise).c.shape[0] == 6
-    wavy = fit_spline(t, curve(t) + 0.1 * np.sin(9.0 * t) + noise)
+    assert fit_spline(t, curve(t) + noise)[0].c.shape[0] == 6
+    wavy, _ = fit_spline(t, curve(t) + 0.1 * np.sin(9.0 * t) + noise)
     assert 15 < wavy.c.shape[0] < 40
     np.testing.assert_allclose(wavy(t)[:, 0], curve(t) + 0.1 * np.sin(9.0 * t), atol=1e-3)
     assert np.linalg.norm(wavy(1.5)[1:]) == pytest.approx(1e-3 * np.sqrt(wavy.c.shape[0] / t.size), rel=0.3)
@@ -89,7 +90,8 @@ def drive_of(errors=3):
         [np.cumsum(rng.uniform(1.0, 3.0, (10, 1)), axis=0), 0.1 * rng.normal(size=(10, errors))], axis=1
     )
     spline = BSpline(knots, coefficients, 5)
-    return spline, _recorded_drive(spline)
+    times = np.unique(spline.t)
+    return spline, recorded_drive(times, [spline(times, order) for order in range(3)])
 
 
 def test_recorded_drive_follows_its_spline():

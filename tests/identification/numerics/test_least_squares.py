@@ -148,7 +148,7 @@ def test_gradient_and_information_are_those_of_the_residuals(known):
         [(residuals(problem, *np.split(y + step * e, [p])) - residuals(problem, *np.split(y - step * e, [p]))) / (2.0 * step)
          for e in np.eye(y.size)], axis=1,
     )  # fmt: skip
-    data, prior, gradient = fit._equations(problem, fit._Trial(y[:p], y[p:], 0.0))
+    data, prior, gradient = fit.joint_equations(problem, y[:p], y[p:])
     size = np.linalg.norm(rows, axis=0)
     np.testing.assert_allclose((data + prior) / np.outer(size, size), rows.T @ rows / np.outer(size, size), atol=1e-8)
     np.testing.assert_allclose(gradient / size, -rows.T @ residuals(problem, y[:p], y[p:]) / size, rtol=1e-5, atol=1e-5)
@@ -256,7 +256,7 @@ def test_masked_readings_are_not_numbers_in_the_residuals():
     problem = problem_with()._replace(masks=(mask, mask))
     found = fit.information_at(problem, np.array([0.3, 0.4]))
     assert found.linear.tolist() == [0.3, 0.4, *[0.0] * 8] and found.x.tolist() == [0.0, 0.0]
-    _, prior, _ = fit._equations(problem, fit._Trial(np.zeros(2), found.linear, 0.0))
+    _, prior, _ = fit.joint_equations(problem, np.zeros(2), found.linear)
     np.testing.assert_allclose(found.prior, prior)
     left = found._replace(differences=(np.ones((N, CHANNELS)),) * 2).residuals[1]
     assert np.isnan(left[5, 1]) and np.sum(left[mask]) == mask.sum()
@@ -274,8 +274,8 @@ def test_angle_errors_are_compared_with_the_noise():
 
 def test_longest_step_is_a_factor_of_two():
     problem = SimpleNamespace(unknowns=SimpleNamespace(count=3, errors=1))
-    np.testing.assert_allclose(fit._limited(problem, np.array([0.2, -1.4, 9.0, 5.0])), [0.1, -0.7, 4.5])
-    np.testing.assert_allclose(fit._limited(problem, np.array([0.2, -0.6, 9.0, 5.0])), [0.2, -0.6, 9.0])
+    np.testing.assert_allclose(fit.limited_step(problem, np.array([0.2, -1.4, 9.0, 5.0])), [0.1, -0.7, 4.5, 2.5])
+    np.testing.assert_allclose(fit.limited_step(problem, np.array([0.2, -0.6, 9.0, 5.0])), [0.2, -0.6, 9.0, 5.0])
 
 
 def test_delayed_values_are_interpolated():
