@@ -140,10 +140,9 @@ def _left_out(scene: jv.Scene) -> list[str]:
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import RotorImbalance
 
-    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.all_effects if has_term([effect], RotorImbalance))
-    return (
-        [f"amplitudes and forces are those of the loads only: the {named} adds a vibration at the rotor speed"] if named else []
-    )
+    named = [effect.kind.replace("_", " ") for effect in scene.all_effects if has_term([effect], RotorImbalance)]
+    adds = f"the {' and '.join(named)} {'adds' if len(named) == 1 else 'add'} a vibration at the rotor speed"
+    return [f"amplitudes and forces are those of the loads only: {adds}"] if named else []
 
 
 def _phases(scene: jv.Scene, output: Output) -> None:

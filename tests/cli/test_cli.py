@@ -11,6 +11,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.cli.modes import _left_out
 from jaxvib.machine.files import SCREENS, TEMPLATES
 from jaxvib.machine.validation import implausible_numbers
 
@@ -128,6 +129,8 @@ def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):
     assert said in typed("modes", "shaken.toml")[1]
     assert said not in typed("modes", "machine.toml")[1]
     assert said in typed("modes", "shaken.toml", "--phases")[1]
+    text = TEMPLATES["rotor"].replace("# moment_imbalance", "moment_imbalance")
+    assert "the static imbalance and moment imbalance add a vibration" in _left_out(jv.scene_from_toml(text))[0]
     code, _, err = typed("modes", "shaken.toml", "--exact")
     assert code == 2 and "effects.static_imbalance excites the machine at the rotor speed as well" in err
     assert typed("modes", "shaken.toml", "--exact", "--without", "static_imbalance")[0] == 0

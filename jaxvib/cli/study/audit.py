@@ -81,13 +81,15 @@ def audit_text(found: jv.Audit) -> str:
     """Return an `Audit` as text."""
     took = "" if math.isnan(found.seconds) else f", a run of 100 turns {found.seconds:.2g} s, compiled in {found.compile:.2g} s"
     lines = [f"{found.motion}: {found.kind}; {found.message}", f"equations of motion: {found.operations} operations{took}"]
-    head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by", "operations", "run", "compile"]
-    rows = [_effect(row, found) for row in found.effects]
-    if rows:
+    if found.effects:
         heading = f"changes by effects, %; requested accuracy {100.0 * found.accuracy:g} %"
         absent = any(not row.present for row in found.effects)
-        lines.append(table(f"{heading}; in brackets: added effects" if absent else heading, head, rows))
-    lines += [f"{row.effect}: {row.note}" for row in found.effects if row.note]
+        head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by"]
+        changes = [_changes(row) for row in found.effects]
+        lines.append(table(f"{heading}; in brackets: added effects" if absent else heading, head, changes))
+        head = ["effect", "operations", "time of a run", "time to compile"]
+        lines.append(table("cost of effects", head, [_cost(row, found) for row in found.effects]))
+    lines += [f"{row.effect.replace('_', ' ')}: {row.note}" for row in found.effects if row.note]
     offs = [
         [t.tier, *map(_percent, (t.amplitude, t.foundation_force, t.omega)), _seconds(t.seconds), _seconds(t.compile)]
         for t in found.tiers
@@ -108,13 +110,21 @@ def audit_text(found: jv.Audit) -> str:
     return "\n".join(lines)
 
 
-def _effect(row: EffectRow, found: jv.Audit) -> list[str]:
-    name = row.effect if row.present else f"({row.effect})"
+def _name(row: EffectRow) -> str:
+    name = row.effect.replace("_", " ")
+    return name if row.present else f"({name})"
+
+
+def _changes(row: EffectRow) -> list[str]:
     changes = map(_percent, (row.amplitude, row.foundation_force, row.omega, row.fold))
+    return [_name(row), row.advice, *changes, row.tier.replace("exact orbit", "exact")]
+
+
+def _cost(row: EffectRow, found: jv.Audit) -> list[str]:
     cost = [f"{row.operations:+d}"]
     for mine, whole in ((row.seconds, found.seconds), (row.compile, found.compile)):
         cost.append("" if math.isnan(mine) else f"{100.0 * mine / whole:+.0f} %")
-    return [name, row.advice, *changes, row.tier.replace("exact orbit", "exact"), *cost]
+    return [_name(row), *cost]
 
 
 def _percent(share: float) -> str:

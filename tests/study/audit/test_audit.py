@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -12,6 +13,7 @@ from plugins.effect import SealFriction
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
+from jaxvib.cli.study.audit import audit_text
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
@@ -101,6 +103,34 @@ def test_tiers_are_judged_against_the_best_that_answers(found):
     np.testing.assert_allclose(light.omega, modes.select(1).omega / found.omega - 1.0, rtol=1e-6)
     np.testing.assert_allclose(averaged.omega, light.omega, rtol=1e-3)
     assert abs(full.amplitude) < 1e-5 < abs(light.amplitude) and math.isnan(full.seconds)
+
+
+def test_tables_of_the_command_keep_words_whole():
+    changes = dict(amplitude=-0.00123, foundation_force=0.0456, omega=-1.2e-5, fold=3.4e-4, uncertainty=1e-6)
+    cost = dict(operations=17, seconds=0.004, compile=0.9)
+    rows = [
+        EffectRow("rolling_friction", present, "exact orbit", **changes, **cost, advice="perhaps needed", note="")
+        for present in (True, False)
+    ]
+    numbers = dict(motion="jam", kind="mode 3", message="done", operations=200, seconds=0.02, compile=3.0, accuracy=0.01)
+    text = audit_text(SimpleNamespace(effects=rows, tiers=[], numbers=[], **numbers))
+    words = {word for line in text.splitlines() for word in line.replace("│", " ").replace("┃", " ").split()}
+    assert max(map(len, text.splitlines())) <= 80 and "in brackets: added effects" in " ".join(text.split())
+    assert {
+        "rolling",
+        "friction",
+        "(rolling",
+        "friction)",
+        "load",
+        "amplitude",
+        "operations",
+        "perhaps",
+        "+17",
+        "+20",
+        "+30",
+    } <= words
+    names = {line.split("│")[1].strip() for line in text.splitlines() if line.startswith("│")}
+    assert names <= {"rolling", "friction", "rolling friction", "(rolling", "friction)", "(rolling friction)"}
 
 
 def test_the_command_prints_what_the_function_gives(found, capsys, tmp_path):
