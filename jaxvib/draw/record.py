@@ -13,7 +13,7 @@ from jaxvib.draw.style import COLORS, GUIDE, legend_above, panels
 def swing_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:
     """Draw the recorded and the fitted angle over time, and their difference in a second panel, in degrees.
 
-    `time` (n,) is in s, `angle` and `fitted` (n,) are in rad. The difference, fit minus record, is compared with twice the
+    `time` (n,) is in s, `angle` and `fitted` (n,) are in rad. The difference, record minus fit, is compared with twice the
     `noise`, rad.
 
     >>> import numpy as np
@@ -26,11 +26,11 @@ def swing_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: 
     top.plot(time, degrees * angle, ".", color=COLORS[1], ms=2.5, label="record")
     top.set_ylabel("angle, deg")
     legend_above(top)
-    bottom.plot(time, degrees * (fitted - angle), ".", color=COLORS[0], ms=2.5)
+    bottom.plot(time, degrees * (angle - fitted), ".", color=COLORS[0], ms=2.5)
     for sign in (-2.0, 2.0):
         bottom.axhline(sign * degrees * noise, color=GUIDE, lw=0.9, ls=":", label="twice the noise" if sign > 0.0 else None)
     legend_above(bottom)
-    bottom.set(ylabel="fit - record, deg", xlabel="time, s")
+    bottom.set(ylabel="record - fit, deg", xlabel="time, s")
     return figure if ax is None else ax
 
 

@@ -77,7 +77,7 @@ def _critical_marks(axis: Axes, speed: np.ndarray, sense: np.ndarray, right: flo
 
 
 def whirl_lines(speed: np.ndarray, has_sense: np.ndarray) -> np.ndarray:
-    """Return the lines (k, ns) of the forward or of the backward whirls over ns rotor speeds.
+    """Return the lines (k, ns) of the whirls of one sense over ns rotor speeds.
 
     **Arguments**: `speed` (ns, nd): all whirl speeds; `has_sense` (ns, nd): True for whirls of the requested sense.
 

@@ -1,4 +1,4 @@
-"""Coincident loads as rigid bodies on the linear carrier, and torques on these bodies."""
+"""Jammed loads as rigid bodies on the linear carrier, and torques on these bodies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
 COINCIDENT_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
-"""Terms that exact jams include. Forces between loads cancel in the torque on coincident loads."""
+"""Terms that exact jams include. `LoadInteraction` is not computed: forces between loads cancel in the torque on a body."""
 
 Points = Array | np.ndarray
 
@@ -25,7 +25,7 @@ Points = Array | np.ndarray
 class CoincidentModel(eqx.Module):
     """Scene whose loads are G rigid bodies. It is assembled once for each analysis and passed on.
 
-    Identical loads are one body. If loads differ, each of them is a body.
+    Identical loads are coincident and form one body. If loads differ, each of them is a body with an angle of its own.
 
     **Attributes**
 
@@ -80,7 +80,7 @@ class CoincidentModel(eqx.Module):
         return torque
 
     def torque(self, phi: Points, rate: Array, speed: Array, a: Array, of_each: Callable[..., Array] | None = None) -> Array:
-        """Return the torque on the bodies (G, M), N m, at their angles `phi` (G, M).
+        """Return the torque on the bodies (G, M), N m, at their angles `phi` (G, M), without that of their inertia.
 
         It is the sum over the loads of each body of `of_each`, by default `torque_of_each`. `a` is (np, M).
         """
@@ -94,7 +94,7 @@ class CoincidentModel(eqx.Module):
     def torque_slopes(self, phi: Points, rate: Array, speed: Array, a: Array) -> tuple[Array, Array, Array | None]:
         """Return the derivatives of `torque` with respect to angle and rate of each body (G, M) and to `a` (np, G, M).
 
-        The last one is None without friction, because no other torque depends on the acceleration `a` of the mount.
+        The last one is None without friction, because no other part of `torque` depends on the acceleration `a` of the mount.
         """
         angle = jnp.asarray(phi)
         by_angle = jax.jvp(lambda p: self.torque(p, rate, speed, a), (angle,), (jnp.ones_like(angle),))[1]

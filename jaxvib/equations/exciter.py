@@ -1,11 +1,12 @@
 """One exciter of a machine: its loads and its rotor, eliminated from the equations of motion.
 
-With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, a load obeys u'' = H^-1 (r - E a). Here a is
-the acceleration of the point that carries the load, and E is m J^T minus the factor of a in the friction on the load, if a
-friction is proportional to its normal force. The load exerts the force -(W a + g) on that point, with W = m 1 - m J H^-1 E (1
-is the unit matrix) and g = m (J H^-1 r + c). The unbalanced rotor of a motor is one more such body. The added mass and the
-reaction of the exciter are the sums of W and g over all loads, with the levers of the loads on the rows of the mount. These
-two contain the whole effect of the exciter on the machine.
+A load of mass m and inertia factor kappa (7/5 for balls) has the coordinates u, the position p(u) relative to the point that
+carries it, and the generalised forces Q_u. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c, it
+obeys u'' = H^-1 (r - E a). Here a is the acceleration of the point that carries the load, and E is m J^T minus the factor of a
+in the friction on the load, if a friction is proportional to its normal force. The load exerts the force -(W a + g) on that
+point, with W = m 1 - m J H^-1 E (1 is the unit matrix) and g = m (J H^-1 r + c). The unbalanced rotor of a motor is one more
+such body. The added mass and the reaction of the exciter are the sums of W and g over all loads, with the levers of the loads
+on the rows of the mount. These two contain the whole effect of the exciter on the machine.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from jaxvib.machine.loads import DrillingSpin, Loads
 from jaxvib.numerics.linalg import small_inverse
 
 Axes = dict[int, Array]
-"""Vectors (count,) by axis: 0 horizontal, 1 up."""
+"""Components of a vector by axis, 0 horizontal, 1 up: arrays (count,) with an entry for each load."""
 
 
 class Motion(NamedTuple):
@@ -59,7 +60,7 @@ class Motion(NamedTuple):
     - `imbalance_derivatives` of the rotor, see `RotorDynamics._imbalance_derivatives`
     - `kinematics` of the loads
     - `drag` (count,): torque of the rotor on the loads
-    - `weight`: torque of gravity on the unbalance, see `RotorDynamics.weight`
+    - `weight_torque` of the unbalance, see `RotorDynamics.weight_torque`
     - `rolling`: forces on the loads if all of them roll
     - `housing`: speed at which the housing turns with the machine; None if it does not turn
     - `time`, s
@@ -70,7 +71,7 @@ class Motion(NamedTuple):
     imbalance_derivatives: tuple[list[Array], list[Array]] | None
     kinematics: Kinematics
     drag: Array
-    weight: Array | None
+    weight_torque: Array | None
     rolling: ContactSolution
     housing: Array | None
     time: Array
@@ -98,7 +99,7 @@ class Eliminated(NamedTuple):
     reaction: Sequence[Array | float]
     rotor: tuple[Array, list[Array]] | None
 
-    def change(self, a: Axes) -> tuple[Array, ...]:
+    def acceleration(self, a: Axes) -> tuple[Array, ...]:
         """Return u'' from `a`, the accelerations of the points that carry the loads."""
         return tuple(
             f - sum(self.response_to_carrier[axis][i] * x for axis, x in a.items())
@@ -107,7 +108,7 @@ class Eliminated(NamedTuple):
 
 
 class RotorDynamics(eqx.Module):
-    """Rotor of an exciter without loads.
+    """Rotor of an exciter without loads; base of the rotor with loads.
 
     **Attributes**
 
@@ -116,7 +117,7 @@ class RotorDynamics(eqx.Module):
     - `unbalance` about the axis, kg m, or None
     - `effects`, prepared for the loads
     - `axes` of the mount
-    - `row_count`: number of the first arrays in the rows of the mount on which loads or an unbalanced rotor act
+    - `row_count`: number of entries of `Mount.rows`, from the first, on which loads or an unbalanced rotor act
     """
 
     levers: tuple[Array | None, ...]
@@ -135,13 +136,13 @@ class RotorDynamics(eqx.Module):
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         no_loads, no_contact = Kinematics([], (), ()), ContactSolution(jnp.ones_like(speed), [], [])
-        drag, weight = jnp.zeros_like(speed), self.weight(t, state)
+        drag, weight = jnp.zeros_like(speed), self.weight_torque(t, state)
         return Motion(state, speed, self._imbalance_derivatives(t, state), no_loads, drag, weight, no_contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the exciter's own accelerations in terms of the accelerations of the mount's rows.
 
-        The friction of `contact` is linear in the accelerations.
+        The friction of `contact` must be linear in the accelerations, see `signed`.
         """
         n = self.row_count * len(self.axes)
         added_mass: list[list[Array | float]] = [[0.0] * n for _ in range(n)]
@@ -204,7 +205,7 @@ class RotorDynamics(eqx.Module):
         c has an entry for each of the first rows of the mount; the torque does not depend on the other rows.
         """
         taken = self._total(drag)
-        taken = taken if motion.weight is None else taken + motion.weight
+        taken = taken if motion.weight_torque is None else taken + motion.weight_torque
         by_loads = [self._total(coupling[i], lever) for lever in self.levers for i in self.axes] if coupling else []
         if motion.imbalance_derivatives is None:
             return taken, by_loads
@@ -226,9 +227,10 @@ class RotorDynamics(eqx.Module):
         return part._replace(added_mass=added_mass, reaction=[*part.reaction, torque], rotor=rotor)
 
     def _imbalance_derivatives(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
-        """Return two derivatives of d(theta), the imbalance on each row of the mount; None without an imbalance.
+        """Return two derivatives of d(theta), the unbalance and the imbalances of the effects on each row of the mount.
 
-        The first is d'. The second is d'' theta'^2 under a motor, and the second time derivative of d under an ideal drive.
+        They are None if there are none. The first is d'. The second is d'' theta'^2 under a motor, and the second time
+        derivative of d under an ideal drive.
         """
         terms = terms_of(self.effects, RotorImbalance)
         if not terms and self.unbalance is None:
@@ -252,12 +254,12 @@ class RotorDynamics(eqx.Module):
 
         first, curvature = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
         second = [c * rate**2 for c in curvature]
-        change = self.drive.rotor_acceleration(t)
-        if change is not None:
-            second = [s + d * change for s, d in zip(second, first, strict=True)]
+        acceleration = self.drive.rotor_acceleration(t)
+        if acceleration is not None:
+            second = [s + d * acceleration for s, d in zip(second, first, strict=True)]
         return list(first), second
 
-    def weight(self, t: Array, state: ExciterState) -> Array | None:
+    def weight_torque(self, t: Array, state: ExciterState) -> Array | None:
         """Return S g cos(theta), the torque of gravity on the unbalance against the rotor's rotation.
 
         None without an unbalance or without gravity in the rotor's plane.
@@ -292,20 +294,20 @@ class ExciterDynamics(RotorDynamics):
         rubbing = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
         friction = [each.signed({}) if each.normal is None else each for each in rubbing]
         contact = ContactSolution(self.loads.inertia_factor(), force, friction)
-        return Motion(state, speed, imbalance_derivatives, found, drag, self.weight(t, state), contact, housing, t)
+        return Motion(state, speed, imbalance_derivatives, found, drag, self.weight_torque(t, state), contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the accelerations of loads and rotor in terms of the accelerations of the mount's rows.
 
-        The friction of `contact` is linear in the accelerations.
+        The friction of `contact` must be linear in the accelerations, see `signed`.
         """
         loads, axes, found = self.loads, self.axes, motion.kinematics
         drag, force, coupling = self._add_friction(motion.drag, contact)
         m = loads.mass
         inertia = contact.kappa * m
         solve = small_inverse([[inertia * g for g in row] for row in found.metric])
-        if found.turning is not None:
-            force = [f - inertia * turned for f, turned in zip(force, found.turning, strict=True)]
+        if found.curvature_along is not None:
+            force = [f - inertia * along for f, along in zip(force, found.curvature_along, strict=True)]
         free = solve(tuple(force))
         rows = {axis: [m * column[axis] for column in found.columns] for axis in axes}
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, coupling, strict=True)] for axis, row in rows.items()}
@@ -328,11 +330,11 @@ class ExciterDynamics(RotorDynamics):
         if slip is None:
             return contact
         at_loads = self.at_loads(a)
-        change = part.change(at_loads)
+        acceleration = part.acceleration(at_loads)
         normal_force = self.loads.normal_force(state.angle, state.rate, total_gravity(self.effects))
         assert normal_force is not None
         centre = self.centre_forces(state, motion.speed)
-        needed = contact_force(self.loads, motion.kinematics, change, at_loads, centre, 1.0)
+        needed = contact_force(self.loads, motion.kinematics, acceleration, at_loads, centre, 1.0)
         (limit,) = terms_of(self.effects, SlipRelease)
         return resolve_contact(
             self.loads, motion.kinematics, slip, limit, normal_force, at_loads, needed, contact.force, centre, contact.friction
@@ -343,12 +345,12 @@ class ExciterDynamics(RotorDynamics):
         state, speed = motion.state, motion.speed
         rotor = self._rotor_rates(motion, part, a)
         at_loads = self.at_loads(a)
-        change = part.change(at_loads)
+        acceleration = part.acceleration(at_loads)
         slip = self._slip(state)
-        slip_change = None if slip is None else self._slip_change(motion, slip, rolling, change, at_loads)
+        slip_change = None if slip is None else self._slip_change(motion, slip, rolling, acceleration, at_loads)
         drilling = self._drilling_spin(state, speed)
         spin = None if drilling is None and slip is None else Spin(None if drilling is None else drilling.rate, slip_change)
-        return ExciterState(state.rate, change, rotor, spin)
+        return ExciterState(state.rate, acceleration, rotor, spin)
 
     def centre_forces(self, state: ExciterState, speed: Array) -> list[Array]:
         """Return the generalised forces at the centres of the loads, without contact forces; N m for an angle."""
@@ -362,9 +364,9 @@ class ExciterDynamics(RotorDynamics):
         loads = self.loads
         torque = loads.resistance(state.angle, state.rate, speed)
         force = list(torque)
-        turning = loads.spin_force(state.angle, state.rate, speed) if rotation else None
-        if turning is not None:
-            force = [f + s for f, s in zip(force, turning, strict=True)]
+        spin_force = loads.spin_force(state.angle, state.rate, speed) if rotation else None
+        if spin_force is not None:
+            force = [f + s for f, s in zip(force, spin_force, strict=True)]
         drilling = self._drilling_spin(state, speed) if rotation else None
         if drilling is not None:
             assert state.spin is not None and state.spin.drilling is not None
@@ -394,11 +396,11 @@ class ExciterDynamics(RotorDynamics):
     ) -> tuple[list[list[Array | float]], list[Array | float]]:
         """Return added mass and reaction of the loads.
 
-        Each load acts on a row of the mount with its lever on this row. Rows that move no load are left out.
+        Each load acts on a row of the mount with its lever on this row. Rows that move no load have zeros.
         """
         m, axes, levers = self.loads.mass, self.axes, self.levers
-        across = {axis: [column[axis] for column in found.columns] for axis in axes}
-        own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(across[i], response_to_carrier[k]) for i in axes for k in axes}
+        columns = {axis: [column[axis] for column in found.columns] for axis in axes}
+        own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(columns[i], response_to_carrier[k]) for i in axes for k in axes}
         moments = {
             (i, k, low, high): self._total(own[i, k], levers[low], levers[high])
             for i, k in own
@@ -407,11 +409,11 @@ class ExciterDynamics(RotorDynamics):
         }
         rows = [(row, axis) for row in range(self.row_count) for axis in axes]
         added_mass = [[moments.get((i, k, min(one, two), max(one, two)), 0.0) for two, k in rows] for one, i in rows]
-        load_reaction = {i: m * (dot(across[i], free) + found.curvature[i]) for i in axes}
+        load_reaction = {i: m * (dot(columns[i], free) + found.curvature[i]) for i in axes}
         return added_mass, [self._total(load_reaction[i], levers[row]) if row < len(levers) else 0.0 for row, i in rows]
 
     def _slip_change(
-        self, motion: Motion, slip: tuple[Array, ...], rolling: ContactSolution, change: tuple[Array, ...], at_loads: Axes
+        self, motion: Motion, slip: tuple[Array, ...], rolling: ContactSolution, acceleration: tuple[Array, ...], at_loads: Axes
     ) -> tuple[Array, ...]:
         """Return the rate of each slip: the part of the force required for rolling that the contact cannot transmit, divided
         by the inertia of the load's rotation."""
@@ -419,7 +421,7 @@ class ExciterDynamics(RotorDynamics):
         for each in rolling.friction:
             for i, f in enumerate(each.linear(at_loads)):
                 force[i] = force[i] + f
-        lacking = contact_force(loads, motion.kinematics, change, at_loads, force, rolling.kappa)
+        lacking = contact_force(loads, motion.kinematics, acceleration, at_loads, force, rolling.kappa)
         inertia = (rolling.kappa - 1.0) * loads.mass
         return slip_rates(loads, state.angle, state.rate, slip, [f / inertia for f in lacking])
 

@@ -247,8 +247,8 @@ def _drive_torque(
     if motor is not None:
         return motor[0]
     torque = braking + _imbalance_rate(exciter, mount, turn) @ acceleration
-    weight = dynamics.weight(t, state)
-    return torque if weight is None else torque + weight
+    weight_torque = dynamics.weight_torque(t, state)
+    return torque if weight_torque is None else torque + weight_torque
 
 
 def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tuple[Array, Array]:

@@ -41,7 +41,7 @@ class Kinematics(NamedTuple):
         return [[dot(a, b) for b in self.columns] for a in self.columns]
 
     @property
-    def turning(self) -> list[Array] | None:
+    def curvature_along(self) -> list[Array] | None:
         """J^T c, m^2/s^2; None if it is 0 for every motion."""
         return None if self.lengths is not None else [dot(column, self.curvature) for column in self.columns]
 
@@ -57,7 +57,12 @@ def kinematics(loads: Loads, u: Coordinates, rate: Coordinates) -> Kinematics:
 
 
 def contact_force(
-    loads: Loads, found: Kinematics, change: Coordinates, a: Mapping[int, Array], force: Sequence[Array], kappa: Array | float
+    loads: Loads,
+    found: Kinematics,
+    acceleration: Coordinates,
+    a: Mapping[int, Array],
+    force: Sequence[Array],
+    kappa: Array | float,
 ) -> list[Array]:
     """Return the force of the contact along each coordinate's unit tangent, (count,) N each.
 
@@ -65,13 +70,13 @@ def contact_force(
 
     It is the force that the motion requires in addition to the generalised `force` Q.
 
-    **Arguments**: `change` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`, which is 1 for the
-    mass without rotation.
+    **Arguments**: `acceleration` u''; `a`, the acceleration of the points that carry the loads, by axis; `kappa`, which is 1
+    for the mass without rotation.
     """
-    turning, needed = found.turning, []
+    curvature, needed = found.curvature_along, []
     for i, (column, metric, f, size) in enumerate(zip(found.columns, found.metric, force, found.sizes, strict=True)):
-        inertial = total(g * x for g, x in zip(metric, change, strict=True))
-        inertial = inertial if turning is None else turning[i] + inertial
+        inertial = total(g * x for g, x in zip(metric, acceleration, strict=True))
+        inertial = inertial if curvature is None else curvature[i] + inertial
         carried = total(column[axis] * x for axis, x in a.items())
         needed.append((loads.mass * (kappa * inertial + carried) - f) / size)
     return needed

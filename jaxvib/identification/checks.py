@@ -49,9 +49,9 @@ class FitStatus(eqx.Enumeration):
 
     found = "the model explains the records up to noise"
     patterned = (
-        "the residuals are not noise: they repeat with the rotor's angle, so the model lacks a part, the angle is inaccurate, "
-        "or the minimum is a wrong one, and the intervals are too narrow; see the notes, compare the residuals over speed, and "
-        "start from better values"
+        "the residuals are not noise: they repeat with the rotor's angle or contain another vibration, so the model lacks a "
+        "part, the angle is inaccurate, or the minimum is a wrong one, and the intervals are too narrow; see the notes, "
+        "compare the residuals over speed, and start from better values"
     )
     undetermined = "the records do not determine all unknowns: see `undetermined` for the directions and how to determine them"
     contradicted = (

@@ -21,7 +21,7 @@ from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene, read_unbalance, require_comparable
 from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.runtime.devices import float_dtype
-from jaxvib.units import bounds_of_unknowns, require_real
+from jaxvib.units import conditions_of_traced_values, require_real
 from jaxvib.units.known import is_known, when_known
 
 _VALID_SCENES: weakref.WeakValueDictionary[tuple[int, np.dtype], Scene] = weakref.WeakValueDictionary()
@@ -83,7 +83,7 @@ def allowed_unknowns(scene: Scene) -> Array | None:
         return None
     if is_known(values := jax.tree.map(value_of, scene)):
         return _allowed_value(values)
-    with bounds_of_unknowns() as found:
+    with conditions_of_traced_values() as found:
         _rebuild(scene)
     return jnp.all(jnp.stack(found)) if found else None
 

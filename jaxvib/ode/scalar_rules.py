@@ -53,8 +53,9 @@ def is_known(x: Scalar) -> bool:
 def _is_zero(x: Scalar) -> bool:
     """True if `x` is a 0 of the program itself, such as an entry of an identity matrix or of a direction of a derivative.
 
-    A product with it is omitted with its operations, even if the other factor is infinite or NaN, for which the program on
-    arrays would give NaN. The zeros of parameters and states of a scene are traced, and are multiplied.
+    A product with it, and the operations that only this product needs, are left out. The result is then 0 even if the other
+    factor is infinite or NaN, for which the program on arrays would give NaN. The zeros of parameters and states of a scene
+    are traced, and are multiplied.
     """
     return is_known(x) and x == 0
 
@@ -164,8 +165,8 @@ def _choice(*cases: Scalar, which: Scalar) -> Scalar:
     return lax.select_n(which, *(jnp.asarray(case) for case in cases))
 
 
-def _bound(primitive: Primitive) -> Callable[..., Scalar]:
-    """Rule that applies the operation to scalars."""
+def _by_primitive(primitive: Primitive) -> Callable[..., Scalar]:
+    """Return the rule that applies an operation to traced scalars."""
     return lambda *x, **params: primitive.bind(*(jnp.asarray(joined(v)) for v in x), **params)
 
 
@@ -298,9 +299,9 @@ def rules() -> dict[Primitive, Rule]:
     one = (lax.abs, lax.sign, lax.sqrt, lax.rsqrt, lax.cbrt, lax.exp, lax.exp2, lax.expm1, lax.log, lax.log1p, lax.logistic)
     one += (lax.tan, lax.asin, lax.acos, lax.atan, lax.sinh, lax.cosh, lax.tanh, lax.erf, lax.floor, lax.ceil, lax.round)
     two = (lax.max, lax.min, lax.atan2, lax.pow, lax.rem, lax.lt, lax.le, lax.gt, lax.ge, lax.eq, lax.ne)
-    bound = [(f, (x,)) for f in (*one, lax.is_finite)] + [(f, (x, x)) for f in two]
-    bound += [(f, (yes, yes)) for f in (lax.bitwise_and, lax.bitwise_or)]
-    bound += [(lax.bitwise_not, (yes,)), (lax.clamp, (x, x, x))]
+    direct = [(f, (x,)) for f in (*one, lax.is_finite)] + [(f, (x, x)) for f in two]
+    direct += [(f, (yes, yes)) for f in (lax.bitwise_and, lax.bitwise_or)]
+    direct += [(lax.bitwise_not, (yes,)), (lax.clamp, (x, x, x))]
     whole: list[tuple[_Function, tuple[ArrayLike, ...], Rule]] = [
         (lambda v: lax.broadcast_in_dim(v, (2, 2, 2), (0, 1)), (v,), _broadcast_in_dim),
         (lambda v: lax.reshape(v, (4,)), (v,), lambda x, *, new_sizes, **_: x.reshape(new_sizes)),
@@ -323,12 +324,12 @@ def rules() -> dict[Primitive, Rule]:
     found: dict[Primitive, Rule] = {}
     for function, arguments, rule in (
         *((f, given, elementwise(rule)) for f, given, rule in maps),
-        *((f, given, None) for f, given in bound),
+        *((f, given, None) for f, given in direct),
         *whole,
     ):
         try:
             primitive = primitive_of(function, *arguments)
         except NotScalarizable:
             continue
-        found[primitive] = elementwise(_bound(primitive)) if rule is None else rule
+        found[primitive] = elementwise(_by_primitive(primitive)) if rule is None else rule
     return found

@@ -43,7 +43,7 @@ class Result(eqx.Module):
     """
 
     outer_axes = ()
-    """Names of the axes that replace "*" in the metadata of fields."""
+    """Names of the axes for which "*" stands in the metadata of fields, see `jaxvib.results.fields.in_unit`."""
 
     if TYPE_CHECKING:  # type checkers see the abstract field as a field that is not an argument of the constructor
         status: Any = eqx.field(init=False)

@@ -1,4 +1,4 @@
-"""Conversion of values with units, and checks of values, that users pass. All other packages use SI units only."""
+"""Conversion to SI units, and checks, of the values that users pass. Texts and figures convert back, see `jaxvib.display`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
     "Number",
     "Numbers",
     "Quantity",
-    "bounds_of_unknowns",
+    "conditions_of_traced_values",
     "count",
     "in_own_unit",
     "known_number",
@@ -72,8 +72,8 @@ _COLLECTED: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar(
 
 
 @contextlib.contextmanager
-def bounds_of_unknowns() -> Iterator[list[Array]]:
-    """Collect the conditions of traced values while parts of a scene are built.
+def conditions_of_traced_values() -> Iterator[list[Array]]:
+    """Collect conditions instead of checking traced values while parts of a scene are built.
 
     The yielded list receives a traced Boolean for each traced value, True if the value is allowed.
     """
@@ -90,7 +90,7 @@ _MAX_NUMBERS = 10**7
 
 
 def _check_bounds(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, place: str = "") -> None:
-    """Check values against bounds. The condition for a traced value is added to the list of `bounds_of_unknowns`."""
+    """Check values against bounds. The condition for a traced value is added to the list of `conditions_of_traced_values`."""
     if traced(value):
         collected = _COLLECTED.get()
         if collected is not None:
@@ -136,7 +136,8 @@ def number(
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
     """Return one number like `number`, but as a NumPy array unless it is a JAX array already.
 
-    A call of a program copies a NumPy array to the device in a tenth of the time of a separate copy before the call.
+    A compiled program that is called with a NumPy array copies it to the device itself, in a tenth of the time that a separate
+    copy before the call takes.
     """
     return _number(value, unit, field, Bounds(low, open_low))
 

@@ -266,5 +266,5 @@ def test_a_circles_tangents_are_as_long_as_its_loads_say(kind):
     computed = told._replace(lengths=None)
     for ours, theirs in ((told.sizes, computed.sizes), (told.metric[0], computed.metric[0])):
         np.testing.assert_allclose(jnp.broadcast_to(ours[0], u[0].shape), theirs[0], rtol=1e-14)
-    assert told.turning is None
-    np.testing.assert_allclose(computed.turning[0], 0.0, atol=1e-13)
+    assert told.curvature_along is None
+    np.testing.assert_allclose(computed.curvature_along[0], 0.0, atol=1e-13)

@@ -43,9 +43,13 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode near which
 @_START
 @_MODE
 @SEPARATION
-@click.option("--drift", type=float, help="Largest drift (relative change) of a settled motion [1e-6, or steady in the mean].")
+@click.option(
+    "--drift", type=float, help="Largest drift (relative change) of a settled motion [1e-6, or a change without a trend]."
+)
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-9].")
-@click.option("--stretches", type=int, default=200, show_default=True, help="Largest number of stretches.")
+@click.option(
+    "--stretches", type=int, default=200, show_default=True, help="Largest number of parts of the run (100 slow periods)."
+)
 @SPEED
 @TOLERANCE
 @deck_options
@@ -60,8 +64,8 @@ def settle(
 ) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change, or change without a trend.
 
-    --out saves the last stretch. With --drift, the motion must settle to this drift; a motion that is only steady in the mean
-    does not suffice.
+    The run consists of stretches of 100 periods of the lowest natural frequency; --out saves the last one. With --drift, the
+    motion must settle to this drift; a motion that is only steady in the mean (changes without a trend) does not suffice.
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
     require_tolerances(loaded, tolerances)
@@ -77,7 +81,7 @@ def settle(
 
 
 def _modes_of(run: jv.Run) -> list[int] | None:
-    """Return the jam mode of a run; None for rotating masses of several exciters or without loads.
+    """Return the jam mode of a run in a list; None for rotating masses of several exciters or without loads.
 
     **Raises** `InputError` for loads that are not jammed.
     """
@@ -119,7 +123,7 @@ def envelope(
 @_MODE
 @SEPARATION
 @SPEED
-@click.option("--stretches", type=int, default=40, show_default=True, help="Number of stretches of the run, at least 8.")
+@click.option("--stretches", type=int, default=40, show_default=True, help="Number of equal parts of the run, at least 8.")
 @shared
 def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> None:
     """Measure the growth of small disturbances of a motion of SCENE: regular, unstable, chaotic or undecided, and the time
@@ -132,5 +136,5 @@ def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> No
 
 
 def _with_start(options: dict[str, Any]) -> dict[str, Any]:
-    """Return options of a run that starts in a jam if it has a mode, and otherwise at rest."""
+    """Return options of a run; without a `start` it begins in a jam if it has a mode, and otherwise at rest."""
     return {**options, "start": options["start"] or ("rest" if options["mode"] is None else "jam")}

@@ -45,14 +45,14 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
 
     def text() -> str:
         def shown(error: float) -> str:
-            return f"{error:.2g}" if np.isfinite(error) else "none"
+            return f"{error:.2g}" if np.isfinite(error) else "-"
 
         rows = [["so far", "", "", *map(shown, plan.now)]]
         for name, minutes, benefit, errors in zip(plan.candidates, plan.minutes, plan.benefit, plan.errors, strict=True):
             rows.append([name, f"{minutes:.3g}", f"{benefit:.3g}", *map(shown, errors)])
         heads = ["run", "minutes", "benefit per minute", *(f"({k + 1})" for k in range(len(plan.numbers)))]
         lines = [f"({k + 1}) {name}" for k, name in enumerate(plan.numbers)]
-        lines.append(table("expected relative standard errors; none: not determined", heads, rows))
+        lines.append(table("expected relative standard errors; -: not determined", heads, rows))
         if profile is not None:
             points = zip(np.asarray(profile.times), np.asarray(profile.speeds), strict=True)
             parts = [[f"{t:.4g}", speed_text(float(n), 4)] for t, n in points]

@@ -58,8 +58,8 @@ def support(
 
     **Arguments** (SI, or strings with a unit)
 
-    - `at` (2,): the point of the body, (x, y) m from the centre of mass of the body with its exciters, but without their
-      unbalances; typical: 0.2 to 3 m
+    - `at` (2,): the point of the body, (x, y) m from the centre of mass of the body, whose mass includes the exciters, with
+      their unbalances on the axes unless these have an `unbalance_mass`; typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
     - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). Also a percentage of it, with the
       mass m that this support carries, "5 % of 250 kg", or a loss factor of rubber at a frequency of vibration, "loss factor
@@ -69,8 +69,8 @@ def support(
     - `to`: number of the body at the other end; default: the foundation
     - `at_other` (2,): the point of that body, m from its centre of mass; typical: 0.2 to 3 m
 
-    **Returns** `PlaneSupport`. **Raises** `InputError` for wrong units, wrong lengths, negative coefficients, and another body
-    without a point on it.
+    **Returns** `PlaneSupport`. **Raises** `InputError` for wrong units, wrong lengths, negative coefficients, and `to`
+    without `at_other` or the reverse.
 
     >>> import jaxvib as jv
     >>> jv.support(at=(1.2, -0.2), stiffness=("200 N/mm", "400 N/mm"), damping=(2e3, 4e3)).stiffness.tolist()
@@ -101,7 +101,7 @@ class Body(Part):
 def body(*, mass: Number, inertia: Number) -> Body:
     """Return a rigid body of a `plane_network`.
 
-    **Arguments** (SI, or strings with a unit, greater than 0; exciters included, loads not)
+    **Arguments** (SI, or strings with a unit, greater than 0; exciters included, their loads not, see `plane_body`)
 
     - `mass`, kg; typical: 100 to 10000
     - `inertia` about its centre of mass, kg m^2; typical: 20 to 20000
@@ -139,7 +139,7 @@ class _Bodies(Machine):
         force = {"stiffness": zero[:2], "damping": zero[:2]}
         matrix = {"stiffness": zero, "damping": zero}
         for each in self.supports:
-            rows, along = self._support_rows(each)
+            rows, along = self._relative_motion(each)
             for name in matrix:
                 at_point = _force_rows(each, rows, along, name)
                 if each.to is None:
@@ -175,22 +175,22 @@ class _Bodies(Machine):
         return self._point_rows(jnp.asarray(point, dtype), body)
 
     def support_rows(self) -> tuple[Array, Array]:
-        """Return the rows of all supports, also of those between two bodies."""
+        """Return the rows of the forces of all supports, also of those between two bodies, see `Machine.support_rows`."""
         found: dict[str, list[Array]] = {"stiffness": [], "damping": []}
         for each in self.supports:
-            rows, along = self._support_rows(each)
+            rows, along = self._relative_motion(each)
             for name, of_kind in found.items():
                 of_kind.append(_force_rows(each, rows, along, name))
         return jnp.stack(found["stiffness"]), jnp.stack(found["damping"])
 
     def upward(self) -> np.ndarray:
-        """Return a translation of all bodies."""
+        """Return the coordinates of a translation of all bodies upward by 1 m."""
         return np.tile([0.0, 1.0, 0.0], self.body_count)
 
     def moment_rows(self, about: Array) -> Array:
         """Return the rows (2, nd), see `Machine.moment_rows`.
 
-        **Raises** `InputError` if several bodies stand on the foundation: their distances are not known.
+        **Raises** `InputError` unless exactly one body stands on the foundation: the distances of several are not known.
         """
         on_foundation = [each for each in self.supports if each.to is None]
         bodies = sorted({each.body for each in on_foundation})
@@ -202,13 +202,13 @@ class _Bodies(Machine):
         found = [jnp.zeros(3 * self.body_count, about.dtype)] * 2
         for each in on_foundation:
             lever = jnp.stack([about[1] - each.at[1], each.at[0] - about[0]])
-            rows, along = self._support_rows(each)
+            rows, along = self._relative_motion(each)
             names = ("stiffness", "damping")
             found = [row + lever @ _force_rows(each, rows, along, name) for row, name in zip(found, names, strict=True)]
         return jnp.stack(found)
 
-    def _support_rows(self, each: PlaneSupport) -> tuple[Array, Array]:
-        """Return the rows (2, nd) of the motion of a support, and the directions (2, 2) of its springs."""
+    def _relative_motion(self, each: PlaneSupport) -> tuple[Array, Array]:
+        """Return the rows (2, nd) of the relative motion of a support's ends, and the directions (2, 2) of its springs."""
         rows = self._point_rows(each.at, each.body)
         if each.to is not None and each.at_other is not None:
             rows = rows - self._point_rows(each.at_other, each.to)
@@ -240,7 +240,7 @@ class PlaneBody(_Bodies):
 
     **Attributes**
 
-    - `mass` m, kg, and `inertia` J, kg m^2, about the centre of mass; exciters included, loads not
+    - `mass` m, kg, and `inertia` J, kg m^2, about the centre of mass, see `plane_body`
     - `supports`, see `PlaneSupport`
     """
 
@@ -282,8 +282,8 @@ def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport
 
     **Arguments** (SI, or strings with a unit)
 
-    - `mass` m, kg, exciters included, loads not; typical: 100 to 10000
-    - `inertia` J about the centre of mass, kg m^2, exciters included, loads not; typical: 20 to 20000
+    - `mass` m, kg, exciters included, their loads and unbalances with an `unbalance_mass` not; typical: 100 to 10000
+    - `inertia` J about the centre of mass, kg m^2, of the same parts; typical: 20 to 20000
     - `supports`: a list of `support`, at least one
 
     **Returns** `PlaneBody`.
