@@ -3,10 +3,10 @@
     pip install numba scipy mujoco jitcode scikit-sundae      # those that are missing are left out
     python benchmarks/engine.py [--only single ensemble ...] [--quick] [--out FOLDER]
 
-Prints each measurement as it comes and, at the end, the table. --out adds engine.json, the table and the README's figure (as
-text) in engine.md, the figure of all ratios as engine.png and that of the memory of a reverse gradient as memory.png. --quick
-runs everything small, to see that it runs: its figures say nothing. The other benchmarks (cost, rotor, criterion) are commands
-of their own.
+Prints each measurement as it comes and, at the end, the table; first calls, which compile, are apart from later ones. --out
+adds engine.json, the table and the README's figure (as text) in engine.md, the figure of all ratios as engine.png and that of
+the memory of a reverse gradient as memory.png. --quick runs everything small, to see that it runs: its figures say nothing. The
+other benchmarks (cost, rotor, criterion) are commands of their own.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ import argparse
 import json
 import os
 from pathlib import Path
+
+os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
 
 import jaxvib as jv
 
@@ -30,6 +32,7 @@ from parts.loads import growth_with_loads  # noqa: E402
 from parts.many import ensemble  # noqa: E402
 from parts.orbits import orbits  # noqa: E402
 from parts.single import growth_with_length, single  # noqa: E402
+from parts.sizes import equal_loads, first_answers, platforms  # noqa: E402
 from parts.slopes import designs, gradient, memory  # noqa: E402
 from parts.table import bars, figures, markdown, whole  # noqa: E402
 
@@ -43,6 +46,9 @@ GROUPS = dict(
     designs=designs,
     loads=growth_with_loads,
     length=growth_with_length,
+    platforms=platforms,
+    jams=equal_loads,
+    first=first_answers,
 )
 
 

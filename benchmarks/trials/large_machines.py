@@ -12,10 +12,7 @@ from __future__ import annotations
 import os
 import pathlib
 import sys
-import time
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
 
@@ -32,18 +29,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 
 from guard import chain, planar  # noqa: E402
 from parts.common import machine_line  # noqa: E402
+from parts.sizes import seconds, step_and_rest  # noqa: E402
 
 from jaxvib.steady.balance.speeds import characteristic_speeds  # noqa: E402
-
-
-def seconds(function: Callable[[], Any], repeats: int = 5) -> tuple[float, float]:
-    """Time of the processor of a first call, and the least of several later ones."""
-    found = []
-    for _ in range(repeats + 1):
-        begun = time.process_time()
-        jax.block_until_ready(jax.tree.leaves(function()))
-        found.append(time.process_time() - begun)
-    return found[0], min(found[1:])
 
 
 def jam_error(scene: jv.Scene) -> float:
@@ -72,18 +60,6 @@ def gradient(scene: jv.Scene) -> Callable[[], jax.Array]:
         return jnp.nansum(jv.jam_modes(changed).foundation_force)
 
     return lambda: slope(scene.machine.stiffness)
-
-
-def step_and_rest(scene: jv.Scene) -> tuple[float, float]:
-    """Time of a step of `simulate`, and of a run without its steps."""
-    times, steps = [], []
-    for end in (2.0, 40.0):
-        run = partial(jv.simulate, scene, end, save="window", estimate=False)
-        times.append(seconds(run, 8)[1])
-        done = run()
-        steps.append(int(done.steps) + int(done.rejected))
-    each = (times[1] - times[0]) / (steps[1] - steps[0])
-    return each, times[0] - steps[0] * each
 
 
 def main(sizes: list[int]) -> None:
