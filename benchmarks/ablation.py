@@ -36,9 +36,7 @@ from parts.loads import scene as balls  # noqa: E402
 
 from jaxvib.motion import system  # noqa: E402
 from jaxvib.motion.system import PackedSystem  # noqa: E402
-from jaxvib.numerics.fence import fence  # noqa: E402
 from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize  # noqa: E402
-from jaxvib.ode.dopri8 import UnrolledDopri8  # noqa: E402
 from jaxvib.ode.dopri8_loop import LoopDopri8  # noqa: E402
 
 BATCH_SIZE, STEP = 64, 0.2
@@ -53,12 +51,9 @@ OFF: dict[str, Callable[[], Any]] = {
     "fences in the equations: none": lambda: mock.patch.object(
         system, "fenced", lambda program, x: core.jaxpr_as_fun(program)(*x)
     ),
-    "fences between stages: none": lambda: mock.patch.object(
-        UnrolledDopri8, "_fenced", lambda self, values, *rest, **known: values
-    ),
-    "through memory: a division for each number": lambda: mock.patch.object(
-        dopri8, "through_memory", lambda values, one: [fence(value, one) for value in values]
-    ),
+    "fences between stages: none": lambda: mock.patch.object(dopri8, "_fenced", lambda values, *rest, **known: values),
+    "entries by their bits: as numbers": lambda: mock.patch.object(system, "entries", lambda y, one: jnp.unstack(y)),
+    "reciprocals: divisions": lambda: mock.patch.object(system, "with_reciprocals", lambda program, changing: program),
 }
 
 

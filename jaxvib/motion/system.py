@@ -15,9 +15,10 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.equations.state import State
+from jaxvib.numerics.fence import entries, hidden_one
 from jaxvib.ode.dopri8 import UnrolledDopri8, ravel
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.ode.scalar_programs import fenced
+from jaxvib.ode.scalar_programs import fenced, with_reciprocals
 from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, RealScalarLike
 from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
@@ -38,10 +39,10 @@ _MAX_UNROLLED_SIZE = 8
 
 
 class PackedSystem(eqx.Module):
-    """Conversion between a `State` and the state of the integrator: a vector of its entries, or a tuple of scalars.
+    """Conversion between a `State` and the state of the integrator: a vector of its entries, or for a batch a tuple of them.
 
-    The unrolled method uses a tuple, whose scalars stay in processor registers. All other methods use a vector, because diffrax
-    then stores, compares and copies one array instead of many.
+    With a vector, a few vector instructions add the stages of a step, and diffrax stores, compares and copies one array instead
+    of many. In a batch each entry is an array over the runs, which is contiguous in memory.
 
     If angles are wrapped, the state of the integrator contains each angle within one turn and, separately, the number of whole
     turns. Long runs in single precision then keep their phase: single precision cannot resolve the position within a turn of
@@ -92,17 +93,18 @@ class PackedSystem(eqx.Module):
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
         self.args, given = field, (jnp.zeros((), leaves[0].dtype), state, field)
-        is_unrolled = self.size <= _MAX_UNROLLED_SIZE if solver is None else isinstance(solver, UnrolledDopri8)
         # Without a batch, arrays over the angles of many loads already fill the vector registers.
         is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG_ARRAY)
         program = scalarized_program(_rates_of, *given) if is_small else None
+        if program is not None:
+            program = with_reciprocals(program, 1 + self.size)
         self.is_scalarized = program is not None
         self.program = arrays_program(_rates_of, *given) if program is None else program
         if program is not None:
             # Arrays are split into entries here, so that the time loop contains no arrays.
             self.args = scalars_of(field)
-        self.is_on_scalars = self.is_scalarized and (batch or is_unrolled)
-        self.has_fences = self.is_on_scalars and solver is None
+        self.is_on_scalars = self.is_scalarized and batch
+        self.has_fences = self.is_scalarized and solver is None and (batch or self.size <= _MAX_UNROLLED_SIZE)
 
     @property
     def term(self) -> diffrax.ODETerm:
@@ -114,7 +116,7 @@ class PackedSystem(eqx.Module):
         # `args` is removed, since a method must not contain traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
         if self.size <= _MAX_UNROLLED_SIZE:
-            return UnrolledDopri8(batch=self.batch, wrap=wrap)
+            return UnrolledDopri8(wrap=wrap)
         return LoopDopri8(reuse=adjoint is None or isinstance(adjoint, diffrax.ForwardMode), wrap=wrap)
 
     def pack(self, state: State) -> IntegratorState:
@@ -181,7 +183,7 @@ class PackedSystem(eqx.Module):
         run = jaxpr_as_fun(self.program)
         if not self.is_scalarized:
             return ravel(run(jnp.asarray(t, y.dtype), *jax.tree.leaves(self._state(y)), *jax.tree.leaves(args)))
-        numbers = y if self.is_on_scalars else jnp.unstack(y)
+        numbers = y if self.is_on_scalars else entries(y, hidden_one(y[0])) if self.has_fences else jnp.unstack(y)
         given = [jnp.asarray(t, numbers[0].dtype), *numbers, *args]
         rates = fenced(self.program, given) if self.has_fences else run(*given)
         return tuple(rates) if self.is_on_scalars else jnp.stack(rates)

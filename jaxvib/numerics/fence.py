@@ -7,8 +7,6 @@ XLA does not recognize as 1. LLVM, which compiles the code afterwards, recognize
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,25 +34,19 @@ def hidden_one(value: Array) -> Array:
     return jax.lax.bitcast_convert_type(nothing | np.ones((), dtype).view(bits), dtype)
 
 
-def through_memory(values: Sequence[Array], one: Array) -> list[Array]:
-    """Fence several scalars at once: one piece of code computes, stores and reads them. This takes less time than one fence
-    for each if they are used together.
+@jax.custom_jvp
+def entries(vector: Array, one: Array) -> list[Array]:
+    """Entries of a floating-point vector, read by their bits: if they were read as numbers, the compiler would replace each by
+    its computation. Tangents are read as numbers and fenced; `one` is a `hidden_one`.
 
-    >>> [float(x) for x in through_memory([jnp.asarray(2.0), jnp.asarray(3.0)], hidden_one(jnp.asarray(3.0)))]
+    >>> [float(x) for x in entries(jnp.asarray([2.0, 3.0]), hidden_one(jnp.asarray(3.0)))]
     [2.0, 3.0]
     """
-    return [fence(values[0], one)] if len(values) == 1 else _from_bits(jnp.stack(values), one)
+    bits = jax.lax.bitcast_convert_type(vector, jnp.dtype(f"uint{8 * vector.dtype.itemsize}"))
+    return [jax.lax.bitcast_convert_type(bits[i], vector.dtype) for i in range(len(vector))]
 
 
-@jax.custom_jvp
-def _from_bits(stack: Array, one: Array) -> list[Array]:
-    """Unstack numbers by reading their bits. If they were read as numbers, the compiler would replace them by their operands.
-    Tangents are unstacked as numbers."""
-    bits = jax.lax.bitcast_convert_type(stack, jnp.dtype(f"uint{8 * stack.dtype.itemsize}"))
-    return [jax.lax.bitcast_convert_type(bits[i], stack.dtype) for i in range(len(stack))]
-
-
-@_from_bits.defjvp
-def _from_bits_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[list[Array], list[Array]]:
-    stack, one = primals
-    return _from_bits(stack, one), [fence(tangents[0][i], one) for i in range(len(stack))]
+@entries.defjvp
+def _entries_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[list[Array], list[Array]]:
+    vector, one = primals
+    return entries(vector, one), [fence(tangents[0][i], one) for i in range(len(vector))]

@@ -9,14 +9,13 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar, TypeVar
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.numerics.fence import fence, hidden_one, through_memory
+from jaxvib.numerics.fence import fence, hidden_one
 from jaxvib.ode.interpolation import StepInterpolation
 from jaxvib.ode.types import VF, Args, BoolScalarLike, RealScalarLike, StepResult, Terms, Y
 
@@ -159,9 +158,10 @@ class UnrolledDopri8(AbstractDopri8):
 
     Compilation takes longer than for `LoopDopri8`, with derivatives several times as long.
 
-    **Arguments**: `batch`: True if many runs advance together and each entry of the state is an array over them; fences for
-    arrays are then used, otherwise fences for scalars. `wrap`: function that is applied to the state after each step, for
-    example to remove whole turns from angles.
+    A state of one vector takes less time than a tuple of scalars: the compiler then adds the stages with vector instructions.
+    For a batch, whose entries are arrays over many runs, a tuple of them takes less time.
+
+    **Arguments**: `wrap`: function that is applied to the state after each step, for example to remove whole turns from angles.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -173,7 +173,6 @@ class UnrolledDopri8(AbstractDopri8):
     Source: P. J. Prince and J. R. Dormand, J. Comp. Appl. Math. 7 (1981) 67; interpolation as in diffrax.
     """
 
-    batch: bool = eqx.field(static=True, default=False)
     interpolation_cls: ClassVar[Callable[..., Dopri8Interpolation]] = Dopri8Interpolation
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> VF:
@@ -198,23 +197,16 @@ class UnrolledDopri8(AbstractDopri8):
         stages = [first]
         y = y0
         for row, c in zip(ROWS, NODES, strict=True):
-            y = self._fenced(_stage_state(y0, dt, row[: len(stages)], stages), one)
-            stages.append(self._fenced(terms.vf(t0 + float(c) * dt, y, args), one, known=y))
+            y = _fenced(_stage_state(y0, dt, row[: len(stages)], stages), one)
+            stages.append(_fenced(terms.vf(t0 + float(c) * dt, y, args), one, known=y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
         return y, jnp.stack([ravel(k) for k in stages]), error, stages[-1]
 
-    def _fenced(self, values: Y, one: Array, known: Y = ()) -> Y:
-        """Fence the values, except those that are `known` and already fenced, such as velocities among rates."""
-        leaves, rest = jax.tree.flatten(values)
-        new = [k for k, leaf in enumerate(leaves) if not any(leaf is each for each in jax.tree.leaves(known))]
-        found = [leaves[k] for k in new]
-        if self.batch or any(jnp.ndim(leaf) for leaf in found):
-            found = [fence(leaf, one) for leaf in found]
-        elif found:
-            found = through_memory(found, one)
-        for k, leaf in zip(new, found, strict=True):
-            leaves[k] = leaf
-        return jax.tree.unflatten(rest, leaves)
+
+def _fenced(values: Y, one: Array, known: Y = ()) -> Y:
+    """Fence the values, except those that are `known` and already fenced, such as velocities among rates."""
+    done = {id(leaf) for leaf in jax.tree.leaves(known)}
+    return jax.tree.map(lambda leaf: leaf if id(leaf) in done else fence(leaf, one), values)
 
 
 def _weighted(weights: np.ndarray, values: Sequence[Array]) -> Array:

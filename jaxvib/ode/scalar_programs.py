@@ -21,6 +21,7 @@ from jaxvib.runtime.compat import (
     Primitive,
     Var,
     jaxpr_as_fun,
+    operation_like,
     rewritten,
 )
 
@@ -144,3 +145,30 @@ def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instea
         if found is not None:
             instead[id(equation.outvars[0])] = found[1]
     return rewritten(program, equations, known(program.jaxpr.outvars))
+
+
+def with_reciprocals(program: ClosedJaxpr, changing: int) -> ClosedJaxpr:
+    """Return the program with divisions by values that do not change replaced by products with their reciprocals.
+
+    A time loop then computes these reciprocals once. The results change by rounding errors. The first `changing` inputs change
+    within the loop, the others do not.
+    """
+    moving = set(program.jaxpr.invars[:changing])
+    for equation in program.jaxpr.eqns:
+        if moving.intersection(_variables(equation.invars)):
+            moving.update(equation.outvars)
+    reciprocals: dict[Var, Var] = {}
+
+    def product(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
+        below = inputs[-1]
+        if equation.primitive != _division() or not isinstance(below, Var) or below in moving or not is_floating(below):
+            return None
+        made: list[tuple[JaxprEqn, Atoms]] = []
+        if below not in reciprocals:
+            inverse = operation_like(lambda x: 1.0 / x, below)
+            made.append((inverse, [inverse.invars[0], below]))
+            reciprocals[below] = inverse.outvars[0]
+        times = operation_like(lambda x, y: x * y, below, below)
+        return [*made, (times, [inputs[0], reciprocals[below]])], times.outvars[0]
+
+    return substituted(program, product)

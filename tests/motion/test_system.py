@@ -61,25 +61,25 @@ def test_equations_of_many_operations_stay_on_arrays():
 
 
 @pytest.mark.parametrize("name", ["friction, exact, dc", "imbalance, dc", "contact"])
-@pytest.mark.parametrize("solver", [None, UnrolledDopri8(), LoopDopri8()])
-def test_a_state_comes_back_as_it_was(name, solver):
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_state_comes_back_as_it_was(name, batch):
     """Both from a vector and from a tuple of numbers, with wrapped angles and without."""
     state = rotor_state(case(name), 5)
     for wrapped in (False, True):
-        motion = PackedSystem(jv.vector_field(case(name)), state, wrapped=wrapped, solver=solver)
-        assert motion.is_on_scalars == (isinstance(solver, UnrolledDopri8) and motion.is_scalarized)
+        motion = PackedSystem(jv.vector_field(case(name)), state, wrapped=wrapped, batch=batch)
+        assert motion.is_on_scalars == (batch and motion.is_scalarized)
         back = motion.unpack(jax.tree.map(lambda x: x[None], motion.pack(state)))
         jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b), back, state)
 
 
-@pytest.mark.parametrize("machine", ["one_mass", "two_mass"])
-def test_wrapping_counts_every_turn(machine):
+@pytest.mark.parametrize(("machine", "batch"), [("one_mass", True), ("one_mass", False), ("two_mass", False)])
+def test_wrapping_counts_every_turn(machine, batch):
     """Both for numbers held one by one and for a vector."""
     s = scene(machine, "balls")
     state = eqx.tree_at(lambda y: y.angle, some_state(s), (jnp.asarray([7.0, -20.0, 1.0]),))
     for has_common_turns in (False, True):
-        motion = PackedSystem(jv.vector_field(s), state, wrapped=True, has_common_turns=has_common_turns)
-        assert motion.is_on_scalars == (machine == "one_mass")
+        motion = PackedSystem(jv.vector_field(s), state, wrapped=True, has_common_turns=has_common_turns, batch=batch)
+        assert motion.is_on_scalars == batch
         method = motion.method()
         assert isinstance(method, (LoopDopri8, UnrolledDopri8)) and method.wrap is not None
         held = method.wrap(motion.pack(state))

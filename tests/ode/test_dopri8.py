@@ -13,7 +13,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.compat import no_host_checks
 
 
-@pytest.mark.parametrize("method", [UnrolledDopri8(), UnrolledDopri8(batch=True), LoopDopri8(), LoopDopri8(reuse=True)])
+@pytest.mark.parametrize("method", [UnrolledDopri8(), LoopDopri8(), LoopDopri8(reuse=True)])
 @no_host_checks()  # programs with these are compiled anew each time
 def test_the_step_is_diffraxs(method):
     """Same method, another form: the same steps to rounding, dense output included."""

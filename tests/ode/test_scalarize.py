@@ -10,7 +10,7 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib.motion.start import initial_state
 from jaxvib.ode import scalarize as module
-from jaxvib.ode.scalar_programs import fenced, without_repeats
+from jaxvib.ode.scalar_programs import fenced, with_reciprocals, without_repeats
 from jaxvib.ode.scalar_rules import primitive_of, rules, to_scalars
 from jaxvib.ode.scalarize import (
     MAX_SCALARS,
@@ -207,6 +207,19 @@ def test_each_operation_is_done_once_and_none_for_nothing():
     assert sorted(names) == ["add", "add", "div", "mul", "mul", "sub", "sub"]
     x = np.array([0.3, -0.7])
     np.testing.assert_allclose(jax.core.eval_jaxpr(program.jaxpr, program.consts, *x), [wasteful(jnp.asarray(x))], rtol=1e-15)
+
+
+def test_divisions_by_constants_become_products():
+    def function(y, c):
+        return jnp.stack([y[0] / c[0] + y[1] / c[0], c[1] / y[1], y[0] / y[1], c[0] / c[1]])
+
+    y, c = jnp.asarray([0.3, -0.7]), jnp.asarray([1.7, 2.3])
+    program = with_reciprocals(scalarized_program(function, y, c), 2)
+    divided = [e.invars for e in program.jaxpr.eqns if e.primitive.name == "div"]
+    inputs = program.jaxpr.invars
+    assert sum(below in inputs[2:] for _, below in divided) == 2  # 1 / c[0], which two divisions share, and 1 / c[1]
+    assert sum(below is inputs[1] for _, below in divided) == 2
+    np.testing.assert_allclose(jax.core.eval_jaxpr(program.jaxpr, program.consts, *y, *c), function(y, c), rtol=1e-15)
 
 
 def test_programs_within_a_program_are_not_taken_for_each_other():
