@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxvib.machine.files import scene_to_toml
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.batch import BATCH_SIZE, BatchPlan
+from jaxvib.motion.batch import BATCH_SIZE, BatchPlan, batch_size
 from jaxvib.motion.start import Start
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.compat import enumeration_names
@@ -84,12 +84,21 @@ class Study:
         return self.targets, self.measures, self.plan, self.start, self.mode
 
     @property
+    def batch(self) -> int:
+        """Number of cases that are computed together: a whole chunk on an accelerator, unless it is very large."""
+        return min(batch_size(), _round_up(self._cases_in_chunk, BATCH_SIZE))
+
+    @property
     def size(self) -> int:
         """Number of cases in one call of the program.
 
         It is a multiple of the batch size, because other instructions, with other rounding errors, compute a partial batch.
         """
-        return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // BATCH_SIZE) * BATCH_SIZE
+        return _round_up(self._cases_in_chunk, self.batch)
+
+    @property
+    def _cases_in_chunk(self) -> int:
+        return int(np.prod(self.grid.tile, dtype=np.int64))
 
     @property
     def record(self) -> dict[str, Plain]:
@@ -118,6 +127,11 @@ class Study:
     def nothing(self, cases: int) -> list[np.ndarray]:
         """Return placeholders for the measures of cases without a value: NaN, or -1 for integers."""
         return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]
+
+
+def _round_up(count: int, unit: int) -> int:
+    """Return the smallest multiple of `unit` that is not less than `count`."""
+    return -(-count // unit) * unit
 
 
 def digest(value: Plain) -> str:

@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.batch import BATCH_SIZE, PARTS_OF_RUN, BatchPlan, run_in_batch
+from jaxvib.motion.batch import PARTS_OF_RUN, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.motion.stiffness import equal_step_length, fastest_decay
@@ -54,13 +54,15 @@ class Chunk(NamedTuple):
 def _each(
     scene: Scene,
     values: Array,
+    batch: int,
     targets: tuple[Target, ...],
     measures: tuple[Measure, ...],
     plan: BatchPlan | None,
     start: Start,
     mode: int | None,
 ) -> tuple[tuple[Array, ...], Array]:
-    """Compute the measures of each case (cases, axes), and True for each case whose motion stayed finite."""
+    """Compute the measures of each case (cases, axes), `batch` cases at a time, and True for each case whose motion stayed
+    finite."""
 
     def one(value: Array) -> tuple[tuple[Array, ...], Array]:
         this = put(scene, targets, value)
@@ -80,7 +82,7 @@ def _each(
 
         return tuple(jnp.asarray(read(measure)) for measure in measures), jnp.asarray(True) if run is None else run.finite
 
-    return jax.lax.map(one, values, batch_size=BATCH_SIZE)
+    return jax.lax.map(one, values, batch_size=batch)
 
 
 @cached
@@ -132,7 +134,7 @@ def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
     values = jnp.zeros((1, len(study.targets)))
 
     def cases(values: Array) -> tuple[tuple[Array, ...], Array]:
-        return _each(study.scene, values, *study.choices)
+        return _each(study.scene, values, study.batch, *study.choices)
 
     program, (found, _) = jax.make_jaxpr(cases, return_shape=True)(values)
     text: list[Plain] = [*program_text(program)]
@@ -162,7 +164,7 @@ def _compute_cases(
     filled = np.repeat(values[which[:1]], study.size, axis=0)
     filled[which] = values[which]
     try:
-        found, finite = _cases(study.scene, jnp.asarray(filled), study.program, *study.choices)
+        found, finite = _cases(study.scene, jnp.asarray(filled), study.program, study.batch, *study.choices)
         return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
     except RuntimeError as error:  # raised by a running program; an error of its compilation would concern all cases
         if "RESOURCE_EXHAUSTED" in str(error):

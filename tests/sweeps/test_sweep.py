@@ -11,6 +11,7 @@ import zarr
 from scenes import published, scene
 
 import jaxvib as jv
+from jaxvib.motion import batch
 from jaxvib.sweeps import program
 from jaxvib.sweeps import sweep as sweep_module
 from jaxvib.sweeps.study import study
@@ -61,6 +62,26 @@ def test_every_case_has_the_numbers_of_its_scene(whole):
     words, missing = data.status.attrs["flag_meanings"].split(), np.isnan(expected)
     np.testing.assert_array_equal(data.status.values, np.where(missing, words.index("absent"), words.index("done")))
     assert dict(whole.counts) == {"absent": 15, "done": 30}
+
+
+@pytest.mark.parametrize(("chunk", "together", "size"), [(None, 15808, 15808), (200, 256, 256), (300_000, 2**18, 2**19)])
+def test_batches_on_accelerators_follow_those_of_ensembles(monkeypatch, chunk, together, size):
+    """The processor stands in for the accelerator. The identity of a study does not depend on the device."""
+    asked = study(SCENE, {"drive.speed": {"from": 10.0, "to": 90.0}}, MEASURE, samples=300_000, chunk=chunk)
+    key = asked.key
+    assert asked.batch == 64 and asked.size % 64 == 0
+    monkeypatch.setattr(batch, "is_processor", lambda: False)
+    assert (asked.batch, asked.size, asked.key) == (together, size, key)
+
+
+def test_one_batch_for_a_chunk_gives_the_same_numbers(monkeypatch, tmp_path):
+    asked = study(SCENE, AXES, MEASURE, chunk=200)
+    small = run_study(asked, tmp_path / "small.zarr")
+    monkeypatch.setattr(batch, "_ACCELERATOR_BATCH_SIZE", 256)
+    monkeypatch.setattr(batch, "is_processor", lambda: False)
+    large = run_study(asked, tmp_path / "large.zarr")
+    for name in ("power", "beyond"):
+        np.testing.assert_allclose(large.data[name], small.data[name], rtol=1e-14)
 
 
 @pytest.mark.slow
