@@ -79,9 +79,9 @@ class Study:
         return tuple(axis.target for axis in self.grid.axes)
 
     @property
-    def choices(self) -> tuple[tuple[Target, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None]:
+    def choices(self) -> tuple[int, tuple[Target, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None]:
         """Static arguments of the program of a case."""
-        return self.targets, self.measures, self.plan, self.start, self.mode
+        return self.batch, self.targets, self.measures, self.plan, self.start, self.mode
 
     @property
     def batch(self) -> int:

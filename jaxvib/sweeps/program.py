@@ -134,7 +134,7 @@ def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
     values = jnp.zeros((1, len(study.targets)))
 
     def cases(values: Array) -> tuple[tuple[Array, ...], Array]:
-        return _each(study.scene, values, study.batch, *study.choices)
+        return _each(study.scene, values, *study.choices)
 
     program, (found, _) = jax.make_jaxpr(cases, return_shape=True)(values)
     text: list[Plain] = [*program_text(program)]
@@ -164,7 +164,7 @@ def _compute_cases(
     filled = np.repeat(values[which[:1]], study.size, axis=0)
     filled[which] = values[which]
     try:
-        found, finite = _cases(study.scene, jnp.asarray(filled), study.program, study.batch, *study.choices)
+        found, finite = _cases(study.scene, jnp.asarray(filled), study.program, *study.choices)
         return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
     except RuntimeError as error:  # raised by a running program; an error of its compilation would concern all cases
         if "RESOURCE_EXHAUSTED" in str(error):

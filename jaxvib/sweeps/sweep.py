@@ -169,8 +169,8 @@ def sweep(
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
     - `chunk`: number of cases that are computed and written together; a store is continued only with the same number.
       Typical: the default, about a second of computation. With smaller chunks an interruption loses fewer cases, but there are
-      more file operations. An accelerator computes a whole chunk at once, up to 262,144 cases; use large chunks there, as far
-      as its memory allows
+      more file operations. An accelerator computes a whole chunk at once, up to 262,144 cases; use chunks there that
+      fill its memory
     - `workers`: number of processes on this machine; or `scheduler`: address of a Dask scheduler ("tcp://10.0.0.1:8786"),
       which must answer within `timeout`, s. Both need the extra `cluster`
     - `report`: a function that is called with a `Progress` after each chunk
