@@ -29,9 +29,8 @@ jax.config.update("jax_enable_x64", True)
 from parts.common import ROWS, cpu_name, machine_line, versions  # noqa: E402
 from parts.envelope import run_ups  # noqa: E402
 from parts.loads import growth_with_loads  # noqa: E402
-from parts.many import ensemble  # noqa: E402
 from parts.orbits import orbits  # noqa: E402
-from parts.single import growth_with_length, single  # noqa: E402
+from parts.single import ensemble, growth_with_length, single  # noqa: E402
 from parts.sizes import equal_loads, first_answers, platforms  # noqa: E402
 from parts.slopes import designs, gradient, memory  # noqa: E402
 from parts.table import bars, figures, markdown, whole  # noqa: E402

@@ -1,8 +1,9 @@
-"""One run, and how its time grows with its length: the integrator against others at equal achieved error.
+"""One run, how its time grows with its length, and an ensemble: the integrator against others at equal achieved error.
 
 Run by engine.py. The machine is the two-mass one of the antiphase paper with one load, eps = 0.05, rotor speed 5.1779, started
 at y = (-1, 1), load speed 1. The error is the largest one in the state at the end, angle in rad; every contender's step or
-tolerance is made smaller until it is reached, then the fastest of several runs counts.
+tolerance is made smaller until it is reached, then the fastest of several runs counts. The ensemble has
+rotor speeds from 3 to 6; diffrax runs a share of them only, spread over the same speeds, and its time is scaled up.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +24,7 @@ from parts.common import TOLERANCES, as_first_written, best, best_in_turn, first
 import jaxvib as jv
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.control import PIController
+from jaxvib.runtime.parallel import cores
 
 
 def integrator(scene: jv.Scene, start: jv.State, controller: str = "equal steps") -> Callable[..., Any]:
@@ -195,3 +198,39 @@ def growth_with_length(quick: bool = False) -> None:
         seconds = best(call, 5)
         base = seconds if base is None else base
         say(group, f"T = {end:g}", seconds, base, None, None, f"per time unit {1e6 * seconds / end:.3f} us", end=end)
+
+
+def ensemble(quick: bool = False, error: float = 1e-5) -> None:
+    runs, share, end = (256, 64, 50.0) if quick else (4096, 256, 200.0)
+    group = f"ensemble of {runs}"
+    print(f"{group}, T = {end:g}, error {error:g}, {cores()} cores")
+    scene, start = published(), thrown()
+    par, y0, speeds = native.numbers(scene), flat(start), np.linspace(3.0, 6.0, runs)
+    simd, scalar = native.simd_ensemble(), native.scalar_ensemble()
+    native_compile = first(lambda: simd(y0, speeds, par, 1.0, 20))
+    exact = simd(y0, speeds, par, end, int(20 * end))
+
+    def make(n: jax.Array) -> tuple[jv.Scene, jv.State]:
+        return eqx.tree_at(lambda s: s.drive.speed, scene, n), start
+
+    values = jnp.asarray(speeds)
+
+    def ours(steps: float) -> np.ndarray:
+        many = jv.ensemble(make, values, end, stepsize_controller=jv.EqualSteps(int(steps)), estimate=False)
+        return np.concatenate([np.asarray(leaf).reshape(runs, -1) for leaf in jax.tree.leaves(many.state)], axis=1)
+
+    settings = [float(int(end * r)) for r in np.arange(3.0, 12.0, 0.5)]
+    chosen, found, _ = reach(lambda n: simd(y0, speeds, par, end, int(n)), settings, exact, error)
+    base = best(lambda: simd(y0, speeds, par, end, int(chosen)))
+    steps = f"{chosen:g} steps"
+    say(group, "native, hand-written vector instructions (numba)", base, base, found, native_compile, steps)
+    _, found, compiling = reach(ours, [chosen], exact, error)
+    seconds = best(lambda: jv.ensemble(make, values, end, stepsize_controller=jv.EqualSteps(int(chosen)), estimate=False).state)
+    say(group, "jaxvib.ensemble", seconds, base, found, compiling, steps)
+    _, found, compiling = reach(lambda n: scalar(y0, speeds, par, end, int(n)), [chosen], exact, error)
+    seconds = best(lambda: scalar(y0, speeds, par, end, int(chosen)), 3)
+    say(group, "native scalar loop, prange", seconds, base, found, compiling, steps)
+    every = runs // share
+    asked = dict(end=end, error=error, exact=exact[::every].tolist(), speeds=speeds[::every].tolist())
+    for name, seconds, found, compiling in as_first_written("ensemble", **asked):
+        say(group, name, seconds * every, base, found, compiling, f"{share} runs, their time {every} times")
