@@ -431,8 +431,8 @@ def conveying_speed(amplitude: Array | complex, speed: Number, *, slope: Number 
     - `speed` w, rad/s or text; typical: 75 to 160
     - `slope` of the deck, rad or text, measured anticlockwise from x; typical: "-15 deg" to 0 (the default)
 
-    **Returns** the speed, m/s; typical: 0.1 to 0.5. It is 0 for throw numbers of at most 1, at which material only slides, and
-    NaN above 3.297, at which a flight is longer than a period.
+    **Returns** the speed, m/s; typical: 0.1 to 0.5. It is 0 for throw numbers of at most 1, at which material does not
+    leave the deck, and NaN above 3.297, because a flight is then longer than a period.
 
     >>> import jax.numpy as jnp
     >>> round(float(conveying_speed(0.005 * jnp.array([1.0, 0.6]), 100.0)), 4)

@@ -77,7 +77,7 @@ class CriticalSpeeds(Result):
         return "\n".join([*lines, *lost]) or "no critical speed"
 
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot forward and backward critical speeds, on a line each, in `unit`.
+        """Plot the critical speeds in `unit`, on a line for each sense.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -130,7 +130,7 @@ class Whirl(Result):
 
     @validated
     def plot(self, *, at: float | None = None, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
-        """Plot the Campbell diagram: speeds of forward and backward whirls over the rotor speed.
+        """Plot the Campbell diagram: speeds of forward, backward and straight whirls over the rotor speed.
 
         Critical speeds are marked on the line on which the whirl speed is equal to the rotor speed. A vertical line marks the
         operating speed `at` if it is given.

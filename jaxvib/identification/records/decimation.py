@@ -1,8 +1,9 @@
 """Lower sampling rate of long records: a low-pass filter, of which every n-th reading is kept.
 
-Readings that are recorded much faster than the machine moves contain nothing but noise and other vibrations above its band. The
-filter is symmetric in time. Its gain is 1 up to 0.3 times the new rate and 0 from 0.7 times the new rate, both to 1e-5. Aliases
-lie above 0.3 times the new rate, and white noise remains nearly white.
+Above the frequencies of the machine, a record contains only noise and other vibrations. The filter removes this part of
+records that are sampled much faster than the machine moves. It is symmetric in time. Its gain is 1 up to 0.3 times the new
+rate and 0 from 0.7 times the new rate, both to 1e-5. Aliases lie above 0.3 times the new rate, and white noise remains nearly
+white.
 
 Outliers and missing readings are replaced by values of the filtered signal, and the readings are filtered again. This is exact
 enough, because outliers and gaps are much shorter than the response of the filter.

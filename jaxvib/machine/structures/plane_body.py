@@ -58,8 +58,8 @@ def support(
 
     **Arguments** (SI, or strings with a unit)
 
-    - `at` (2,): the point of the body, (x, y) m from the centre of mass of the body, whose mass includes the exciters, with
-      their unbalances on the axes unless these have an `unbalance_mass`; typical: 0.2 to 3 m
+    - `at` (2,): the point of the body, (x, y) m from the centre of mass of the parts in the body's `mass`, with unbalances on
+      the axes of the exciters; typical: 0.2 to 3 m
     - `stiffness` (k1, k2), N/m; typical: 1e4 to 1e6
     - `damping` (c1, c2), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(k m). Also a percentage of it, with the
       mass m that this support carries, "5 % of 250 kg", or a loss factor of rubber at a frequency of vibration, "loss factor
@@ -101,7 +101,7 @@ class Body(Part):
 def body(*, mass: Number, inertia: Number) -> Body:
     """Return a rigid body of a `plane_network`.
 
-    **Arguments** (SI, or strings with a unit, greater than 0; exciters included, their loads not, see `plane_body`)
+    **Arguments** (SI, or strings with a unit, greater than 0; of the same parts as in `plane_body`)
 
     - `mass`, kg; typical: 100 to 10000
     - `inertia` about its centre of mass, kg m^2; typical: 20 to 20000
@@ -282,7 +282,8 @@ def plane_body(*, mass: Number, inertia: Number, supports: Sequence[PlaneSupport
 
     **Arguments** (SI, or strings with a unit)
 
-    - `mass` m, kg, exciters included, their loads and unbalances with an `unbalance_mass` not; typical: 100 to 10000
+    - `mass` m, kg, with the exciters, but without loads and without unbalances that have an `unbalance_mass`; typical: 100 to
+      10000
     - `inertia` J about the centre of mass, kg m^2, of the same parts; typical: 20 to 20000
     - `supports`: a list of `support`, at least one
 

@@ -152,9 +152,10 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     the same angles without gravity they have errors of 2 % for a screen that passes its resonances within two turns.
 
     **Returns** `MotorRunUp`. The averaged equations are accurate for light unbalances; near the boundary between capture and
-    passage use `simulate`. Motors with currents have their steady torque here. The currents change neither the caught speed
-    nor its fold. If the currents lag behind the speed (L/R of a DC motor) longer than the vibration of the machine takes to
-    decay, the motor may pass a resonance that catches it in the averaged equations: use `simulate` for such motors.
+    passage use `simulate`. Motors with currents have their steady torque here. The currents change neither the speed at
+    which a resonance holds a motor nor the fold at which it releases the motor. If the currents lag behind the speed (L/R of a
+    DC motor) longer than the vibration of the machine takes to decay, the motor may pass a resonance that catches it in the
+    averaged equations: use `simulate` for such motors.
 
     **Raises** `InputError` for a scene without a motor and as `envelope`. A run that fails has a status.
 
