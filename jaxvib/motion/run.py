@@ -143,8 +143,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def largest_force(self) -> Array:
-        """Largest force on the foundation on the way, N, among the stored states; for two directions their resultant."""
-        return jnp.sqrt(jnp.max(jnp.sum(self._whole.foundation_force**2, axis=1)))
+        """Largest force on the foundation on the way, N, among the stored states; for two directions the root of the sum of the
+        squares of both peaks, as `foundation_force`."""
+        return jnp.sqrt(jnp.sum(jnp.max(self._whole.foundation_force**2, axis=0)))
 
     @property
     def _whole(self) -> Trajectory:

@@ -127,10 +127,11 @@ class Regime(Result):
 
     def _remainder(self) -> str:
         share = float(self.unbalance)
-        # The loads can have at most their unbalance at one angle; the excess belongs to the rotor.
-        if share > 1.005:
-            return f"the imbalance of the rotor exceeds what the loads can balance: {share:.2g} times their unbalance is left"
-        return f"{100.0 * share:.3g} % of the loads' unbalance is left"
+        if share < 1.005:
+            return f"{100.0 * share:.3g} % of the loads' unbalance is left"
+        left = f"{share:.2g} times the loads' unbalance is left"
+        # Loads at one angle add at most their own unbalance to that of the rotor.
+        return f"{left}: the imbalance of the rotor exceeds what the loads can balance" if share > 2.005 else left
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -36,14 +36,14 @@ from jaxvib.steady.balance.monodromy import (
     monodromies,
     validate_steps,
 )
-from jaxvib.units import count
+from jaxvib.units import Number, Numbers, count, number, numbers
 
 
 class BalanceStatus(eqx.Enumeration):
     """Outcomes of the balance of loads. The value of each member is the message shown to the user."""
 
-    unique = "the loads cancel in one arrangement, apart from a common rotation and a mirror image"
-    family = "the loads cancel in a family of arrangements, with neutral directions in addition to the common rotation"
+    unique = "the loads cancel in one arrangement and its mirror image"
+    family = "the loads cancel in a family of arrangements: angles that change along the neutral directions keep the balance"
     alone = "a single load has no other load to cancel it"
     outweighed = (
         "one load's m R, or the rotor's imbalance in the plane of the loads, is larger than all others together and cannot be "
@@ -88,7 +88,7 @@ class BalancedStates(Result):
         return balanced_stability(self.scene, self._angles_of(arrangement), steps=steps)
 
     @validated
-    def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
+    def growth(self, speeds: Numbers | ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
         """Return the growth rate of deviations from an arrangement at rotor speeds, 1/s: stable if negative, see
         `balanced_growth`.
 
@@ -98,13 +98,13 @@ class BalancedStates(Result):
 
     @validated
     def intervals(
-        self, low: float, high: float, arrangement: int = 0, *, points: int = 200, steps: int | None = None
+        self, low: Number, high: Number, arrangement: int = 0, *, points: int = 200, steps: int | None = None
     ) -> list[list[float]]:
         """Return the intervals of rotor speed, rad/s, in which an arrangement is stable, see `balanced_intervals`.
 
         **Arguments**
 
-        - `low` and `high`: the range, rad/s
+        - `low` and `high`: the range, rad/s; strings may have a unit, "300 rpm"
         - `arrangement`: its number, counted from 0
         - `points`: number of speeds that are computed in the range; typical: 200 (the default). An interval narrower than
           their spacing can be missed; the time is proportional to this number
@@ -178,14 +178,14 @@ def balanced_states(scene: Scene) -> BalancedStates:
     >>> loads = jv.balls(count=3, mass=[0.3, 0.4, 0.5], radius=0.1, drag=1.0)
     >>> states = jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0)))
     >>> print(states.summary())
-    the loads cancel in one arrangement, apart from a common rotation and a mirror image
+    the loads cancel in one arrangement and its mirror image
       0, 90, 233.1 deg
       0, 270, 126.9 deg
     neutral directions: turn of all loads
     >>> loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     >>> imbalance = jv.StaticImbalance("50 g m", angle="90 deg")    # as much as each of the balls
     >>> print(jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), (imbalance,))).summary())
-    the loads cancel in one arrangement, apart from a common rotation and a mirror image
+    the loads cancel in one arrangement and its mirror image
       210, 330 deg
       330, 210 deg
     neutral directions: none
@@ -401,14 +401,14 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
 
 def balanced_growth(
-    scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int | None = None
+    scene: Scene, speeds: Numbers | ArrayLike, angles: ArrayLike | None = None, *, steps: int | None = None
 ) -> np.ndarray:
     """Return the growth rate of deviations from the balanced motion at many rotor speeds, 1/s: stable if negative.
 
     **Arguments**
 
     - `scene`; its own speed is not used
-    - `speeds`, rad/s, any shape
+    - `speeds`, rad/s, an array of any shape; or a list, also of strings with a unit
     - `angles` and `steps` as `balanced_stability`
 
     **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
@@ -420,15 +420,17 @@ def balanced_growth(
     array([False,  True])
     """
     angles, neutral = _arrangement(scene, angles)
-    flat = np.ravel(np.asarray(speeds, dtype=float))
+    named = isinstance(speeds, str) or (isinstance(speeds, (list, tuple)) and any(isinstance(each, str) for each in speeds))
+    given = numbers(cast(Numbers, speeds), "rad/s", "speeds", None) if named else cast(ArrayLike, speeds)
+    flat = np.ravel(np.asarray(given, dtype=float))
     # Speeds are padded to whole batches, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % BATCH), mode="edge")
     flows = monodromies(at_constant_speed(scene), angles, padded, validate_steps(scene, flat, steps))[: flat.size]
-    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
+    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(given))
 
 
 def balanced_intervals(
-    scene: Scene, low: float, high: float, angles: ArrayLike | None = None, *, points: int = 200, steps: int | None = None
+    scene: Scene, low: Number, high: Number, angles: ArrayLike | None = None, *, points: int = 200, steps: int | None = None
 ) -> list[list[float]]:
     """Return the intervals [from, to] of rotor speed between `low` and `high` (rad/s) in which the balanced motion is exactly
     stable.
@@ -445,7 +447,8 @@ def balanced_intervals(
     >>> [[round(w, 2) for w in row] for row in balanced_intervals(scene, 20.0, 60.0, points=40)]
     [[28.28, 60.0]]
     """
-    if not 0.0 < low < high < np.inf:
+    low, high = (float(number(value, "rad/s", name)) for name, value in (("low", low), ("high", high)))
+    if not 0.0 < low < high:
         raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed, both finite")
     grid = np.linspace(low, high, count(points, "points", low=2, each=1e4))
     stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
@@ -555,7 +558,8 @@ class BalancedStability(Result):
     - `is_decided`: True if the growth over a turn is larger than the error of the computation
     - `growth`, 1/s: the largest growth rate of a deviation (if negative: the slowest decay), without neutral directions
     - `multipliers` (2 (nd + N),), complex, the largest first
-    - `neutral`: the number of multipliers that are 1 because the arrangements form a family (at least by a common rotation)
+    - `neutral`: the number of multipliers that are 1 because the arrangements form a family (without an imbalance at least by a
+      common rotation)
     - `error` of the multipliers, estimated from half the number of steps
     """
 
@@ -575,9 +579,10 @@ class BalancedStability(Result):
 
     def summary(self) -> str:
         """Return the stability and the growth rate as text."""
+        rate = f"at {abs(self.growth):.4g} 1/s" if self.is_decided else f"({self.growth:.4g} 1/s)"
         largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
         return (
-            f"{self.message} at {self.growth:.4g} 1/s; largest multipliers {largest}, {self.neutral} of them neutral, "
+            f"{self.message} {rate}; largest multipliers {largest}, {self.neutral} of them neutral, "
             f"with an error of {self.error:.1e}"
         )
 

@@ -80,7 +80,9 @@ class PhaseJams(AbstractPhaseJam):
 
     def summary(self) -> str:
         """Return a table in text; amplitudes zero to peak, phases in degrees."""
-        return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
+        jams = [self.select(k).summary() for k in range(self.omega.shape[0])] or ["no jam"]
+        as_points = "loads count as points: jams at free phases do not include their ball_radius"
+        return "\n".join([*jams, *([] if getattr(self.scene.loads, "ball_radius", None) is None else [as_points])])
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Axes | None = None) -> Drawn:
@@ -135,6 +137,8 @@ def phase_jams(
       load speeds, the speed is solved for as well (`phase_jam`)
     - Jams that differ by a common rotation of all loads, or by an exchange of equal loads, count as one
     - Loads that turn with the rotor and balance it are left out
+    - Loads count as points: their `ball_radius` is not used, so that loads at one angle have the unbalance N m R. `jam_modes`
+      places them side by side
     - An imbalance of the rotor (`StaticImbalance`, `MomentImbalance`) does not change a jam: its force rotates at the rotor
       speed, that of the loads at the load speed. At this order the imbalance therefore exerts no mean torque on the loads.
       The amplitudes and the foundation force are those caused by the loads only. If the contribution of the imbalance matters,

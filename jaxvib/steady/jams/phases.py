@@ -298,13 +298,24 @@ class PhasePattern(eqx.Enumeration):
 
 
 def phase_pattern(phase: Array) -> PhasePattern:
-    """Return the pattern of phases (count,) rad, from their resultants |mean exp(i k phase)| for k = 1 and 2.
+    """Return the pattern of phases (count,) rad, from their resultants mean exp(i k phase) for k = 1 and 2.
+
+    Loads are together if each is within 30 degrees of their mean direction, and in two opposite groups if each is within 15
+    degrees of their common axis and the groups almost cancel.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> bool(phase_pattern(jnp.array([0.0, 0.1, 3.1, 3.2])) == jv.PhasePattern.opposite)
     True
     """
-    first, second = (jnp.abs(jnp.mean(jnp.exp(1j * k * phase))) for k in (1, 2))
+    turns = [jnp.exp(1j * k * phase) for k in (1, 2)]
+    means = [jnp.mean(turn) for turn in turns]
+    pairs = zip(turns, means, strict=True)
+    close, parallel = (jnp.min((turn * mean.conj()).real) > _COSINE * jnp.abs(mean) for turn, mean in pairs)
+    first = jnp.abs(means[0])
     pattern = PhasePattern.where(first < 0.1, PhasePattern.spread, PhasePattern.other)
-    pattern = PhasePattern.where((first < 0.25) & (second > 0.9), PhasePattern.opposite, pattern)
-    return PhasePattern.where(first > 0.9, PhasePattern.together, pattern)
+    pattern = PhasePattern.where((first < 0.25) & parallel, PhasePattern.opposite, pattern)
+    return PhasePattern.where((first > 0.5) & close, PhasePattern.together, pattern)
+
+
+_COSINE = math.cos(math.radians(30.0))
+"""Cosine of the largest angle between a load and the mean direction of loads that are together."""

@@ -119,7 +119,7 @@ class GradientCheck(Result):
         scale = _scale(self.difference)
         with np.errstate(invalid="ignore"):
             worst = np.max(np.where(np.isfinite(self.error), self.error, np.inf), axis=0)
-        lines = [f"{self.message} (relative tolerance {self.tolerance:.0e})"]
+        lines = [f"{self.message} (relative tolerance {self.tolerance:.0e}); numbers are p dq/dp, p: parameter, q: quantity"]
         for i in np.argsort(-worst):
             found = ", ".join(f"{route} differs by {self.error[k, i]:.1e}" for k, route in enumerate(self.routes))
             floor = f"finite differences accurate to {self.noise[i] / scale[i]:.1e} at a step of {self.step[i]:.1e}"
@@ -158,7 +158,7 @@ def check_gradients(
     quantity: Callable[[Scene], ArrayLike],
     *,
     free: Sequence[str] | None = None,
-    routes: Sequence[str] = ("forward", "reverse"),
+    routes: Sequence[str] | None = None,
     implicit: ImplicitRoute | None = None,
     tolerance: float = 1e-5,
 ) -> GradientCheck:
@@ -186,8 +186,8 @@ def check_gradients(
       an array are checked; default: all parameters of the scene; typical: 5 to 20. The steps of a parameter that is 0 are
       relative to its typical size. A parameter at a bound, such as a damping of 0, is left out. Each parameter needs 22
       evaluations
-    - `routes`: "forward" and "reverse" mode of JAX, if the quantity supports them (`simulate` supports reverse mode by
-      default, and forward mode with `diffrax.ForwardMode()`)
+    - `routes`: "forward" and "reverse" mode of JAX; default: those that the quantity supports (`simulate` supports reverse mode
+      by default, and forward mode with `diffrax.ForwardMode()`)
     - `implicit`: an additional route for a quantity that is computed from the solution of an equation, see `ImplicitRoute`
     - `tolerance` of each derivative, relative to the derivative itself, or to a thousandth of the largest derivative (as
       p dq/dp) if that is more; typical: 1e-4 to 1e-6 (default 1e-5)
@@ -208,9 +208,10 @@ def check_gradients(
     scene = validate_scene(scene)
     if scene.drive.speed.dtype.itemsize < 8:
         raise InputError("scene", "is in single precision; differences need double: switch JAX to float64 before it is made")
-    unknown = [route for route in routes if route not in _MODES]
-    if unknown or not (routes or implicit):
-        raise InputError("routes", f"are {quoted(list(routes))}; name some of {', '.join(_MODES)}")
+    asked = tuple(_MODES) if routes is None else routes
+    unknown = [route for route in asked if route not in _MODES]
+    if unknown or not (asked or implicit):
+        raise InputError("routes", f"are {quoted(list(asked))}; name some of {', '.join(_MODES)}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
         raise InputError("tolerance", f"is {quoted(tolerance)}; it must be a number between 0 and 1, such as 1e-5")
     numbers, scales, left_out = _changeable_parameters(scene, free)
@@ -230,7 +231,7 @@ def check_gradients(
     value = quantity_at(no_change)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise InputError("quantity", f"gives {value.dtype} of shape {value.shape}; it must give one real number")
-    gradient = {route: np.asarray(_MODES[route](quantity_at)(no_change), float) for route in routes}
+    gradient = _gradients(quantity_at, no_change, asked, only_supported=routes is None)
     if implicit is not None:
         gradient["implicit"] = np.asarray(_implicit(implicit, put, no_change), float)
     sweep = np.asarray([[_central(quantity_at, len(numbers), i, h) for h in _DIFFERENCE_STEPS] for i in range(len(numbers))])
@@ -254,6 +255,21 @@ def check_gradients(
         tolerance=float(tolerance),
         left_out=left_out,
     )
+
+
+def _gradients(
+    quantity_at: Callable[[Array], Array], at: Array, routes: Sequence[str], *, only_supported: bool
+) -> dict[str, np.ndarray]:
+    """Return the derivatives (n,) by each route; with `only_supported`, forward mode is left out for runs that do not support
+    it."""
+    found: dict[str, np.ndarray] = {}
+    for route in routes:
+        try:
+            found[route] = np.asarray(_MODES[route](quantity_at)(at), float)
+        except InputError as error:
+            if not only_supported or error.field != "adjoint":
+                raise
+    return found
 
 
 _MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]] = {"forward": jax.jacfwd, "reverse": jax.grad}

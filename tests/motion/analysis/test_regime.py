@@ -186,7 +186,9 @@ def test_summary_names_an_imbalance_beyond_the_loads():
     """Four pendulums of 0.05 kg at 0.08 m: 0.016 kg m of unbalance, opposite each other or all at one angle."""
     opposite, together = [0.0, np.pi, np.pi, 0.0], [0.0] * 4
     found = jv.regime(*made(opposite, 460.0, effects=(jv.StaticImbalance(4.8e3),))).summary()
-    assert "the imbalance of the rotor exceeds what the loads can balance: 3e+05 times their unbalance is left" in found
+    assert "3e+05 times the loads' unbalance is left: the imbalance of the rotor exceeds what the loads can balance" in found
+    added = jv.regime(*made(together, 460.0, effects=(jv.StaticImbalance(8e-3),))).summary()
+    assert "1.5 times the loads' unbalance is left" in added and "exceeds" not in added
     assert (
         "50 % of the loads' unbalance is left"
         in jv.regime(*made(opposite, 460.0, effects=(jv.StaticImbalance(8e-3),))).summary()

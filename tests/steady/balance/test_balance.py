@@ -17,7 +17,13 @@ from scenes import machines
 import jaxvib as jv
 from jaxvib.steady.balance import states
 from jaxvib.steady.balance.speeds import characteristic_speeds
-from jaxvib.steady.balance.states import BalanceStatus, balanced_growth, balanced_intervals, balanced_stability
+from jaxvib.steady.balance.states import (
+    BalancedStability,
+    BalanceStatus,
+    balanced_growth,
+    balanced_intervals,
+    balanced_stability,
+)
 
 POINTS = 112
 """Rotor speeds of one scan; the same in all tests, so that each machine is compiled once."""
@@ -97,6 +103,10 @@ def test_motion_that_is_not_balanced_is_refused():
         balanced_stability(loaded(effects=(jv.Gravity(),)))
     with pytest.raises(jv.InputError, match="low is 5"):
         balanced_intervals(loaded(), 5.0, 3.0)
+    with pytest.raises(jv.InputError, match=r"low is 31\.4\d* and high 3; 0 < low < high"):
+        balanced_intervals(loaded(), "300 rpm", 3.0)
+    with pytest.raises(jv.InputError, match=r"speeds\[1\] is '40 mm', which is not in rad/s"):
+        jv.balanced_states(loaded()).growth(["300 rpm", "40 mm"])
     states = jv.balanced_states(loaded())
     with pytest.raises(jv.InputError, match=r"speeds contain nan rad/s; they must be greater than 0 and below"):
         states.growth([40.0, np.nan], steps=16)
@@ -104,6 +114,15 @@ def test_motion_that_is_not_balanced_is_refused():
         states.stability(1)
     with pytest.raises(jv.InputError, match=r"points is 0; it must be a whole number, at least 2"):
         states.intervals(20.0, 40.0, points=0)
+
+
+def test_summaries_state_rates_without_sign():
+    stable, unstable = (BalancedStability(g < 0.0, True, g, np.array([1.0, 0.9]), 1, 1e-9).summary() for g in (-2.065, 3.0))
+    assert "decay at 2.065 1/s" in stable and "grow at 3 1/s" in unstable
+    undecided = BalancedStability(False, False, -2e-9, np.array([1.0, 1.0]), 1, 1e-9).summary()
+    assert "than the error of the computation (-2e-09 1/s)" in undecided
+    family = jv.balanced_states(loaded(count=4, effects=(jv.StaticImbalance(0.013),))).summary()
+    assert "common rotation" not in family and "along the neutral directions" in family
 
 
 def test_loads_in_contact_balance_in_their_order():

@@ -11,7 +11,7 @@ from scenes import scene as platforms
 import jaxvib as jv
 from jaxvib.numerics.linalg import eliminate
 from jaxvib.steady.jams.phase_search import _same, phase_branch
-from jaxvib.steady.jams.phases import growth_of_free_loads, phase_jam, phase_torques
+from jaxvib.steady.jams.phases import growth_of_free_loads, phase_jam, phase_pattern, phase_torques
 
 K1, K2, L1, L2 = 0.604e6, 0.555e6, 0.165, 0.155
 STATIONS = (0.28, 0.25, -0.25, -0.28)
@@ -264,9 +264,26 @@ def test_wrong_questions():
     with pytest.raises(jv.InputError, match="starts is 0"):
         jv.phase_jams(planar(), starts=0)
     jams = jv.phase_jams(planar(), starts=8)
-    assert "stable" in jams.summary() and "all together" in jams.summary()
+    assert "stable" in jams.summary() and "all together" in jams.summary() and "as points" not in jams.summary()
+    sized = eqx.tree_at(lambda j: j.scene.loads.ball_radius, jams, jnp.asarray(0.01), is_leaf=lambda leaf: leaf is None)
+    assert sized.summary().endswith("loads count as points: jams at free phases do not include their ball_radius")
     with pytest.raises(jv.InputError, match="index is 3; there are 3 jams, counted from 0"):
         jams.select(3)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "pattern"),
+    [
+        ([0.0] * 7 + [-76.18], "other"),
+        ([0.0] * 7 + [61.42], "other"),
+        ([0.0, 10.0, 20.0, 40.0], "together"),
+        ([0.0] * 7 + [180.0], "other"),
+        ([0.0, 5.0, 180.0, 190.0], "opposite"),
+        ([0.0, 60.0, 180.0, 240.0], "spread"),
+    ],
+)
+def test_patterns_hold_for_every_load(degrees, pattern):
+    assert bool(phase_pattern(jnp.radians(jnp.asarray(degrees))) == getattr(jv.PhasePattern, pattern))
 
 
 def test_jams_by_slope_are_judged_for_loads_that_may_part():

@@ -7,6 +7,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.equations.linear import steady_displacement
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import jam_rotor_speed
 
 SCENE = jv.Scene(
@@ -38,6 +39,27 @@ def test_a_closed_form_is_met_within_the_noise_that_is_told():
     np.testing.assert_allclose(check.gradient, np.stack([exact, exact]), rtol=1e-12)
     off = np.abs(check.difference - exact)
     assert np.all(off <= 3.0 * check.noise) and np.all(check.noise < 1e-9 * exact)
+
+
+@jax.custom_vjp
+def cubed(x):
+    return x**3
+
+
+cubed.defvjp(lambda x: (cubed(x), x), lambda x, g: (3.0 * x**2 * g,))
+
+
+@cached
+def reverse_only(x):
+    return cubed(x)
+
+
+def test_default_routes_are_those_that_the_quantity_supports():
+    check = jv.check_gradients(SCENE, lambda s: reverse_only(s.loads.mass), free=("loads.mass",)).require()
+    assert check.routes == ("reverse",) and "numbers are p dq/dp" in check.summary().splitlines()[0]
+    np.testing.assert_allclose(check.gradient, [[3.0 * 0.5**3]], rtol=1e-12)
+    with pytest.raises(jv.InputError, match="adjoint supports reverse-mode"):
+        jv.check_gradients(SCENE, lambda s: reverse_only(s.loads.mass), free=("loads.mass",), routes=("forward", "reverse"))
 
 
 def test_numbers_that_do_not_count_and_those_that_are_zero():
