@@ -221,6 +221,18 @@ def test_balance_holds_within_rounding(two):
     assert float(w) == pytest.approx(float(two.speed), rel=1e-14) and angles.tolist() == two.phases.tolist()
 
 
+def test_residual_is_relative_to_the_largest_vibrational_torques(two):
+    """Beside the solution, where it is far above rounding."""
+    balance = assemble_torque_balance(TWO)
+    x = unknowns_of(balance, two.speed, two.phases) + jnp.array([1e-10, 2e-9])
+    found = jax.jit(synchronous.fields_at)(balance, x, None)
+    w, phases, s = float(found["speed"]), found["phases"], np.array(S[:2])
+    largest = w**4 / 2.0 * s * (np.abs(influence(w)) @ s)
+    expected = np.max(np.abs(motors(w) + vibration(w, phases)) / largest)
+    assert 1e-10 < expected < 1e-8
+    np.testing.assert_allclose(found["residual"], expected, rtol=1e-4)
+
+
 def test_sets_of_phases_are_regular_even_and_random():
     sets = search.sets_of_phases(np.zeros(3, bool), np.dtype(float), 4)
     assert sets.shape == (4 + 2 + 16, 3) and np.all(sets[:, 0] == 0.0)
