@@ -97,6 +97,8 @@ def test_platforms_of_supports_are_counted_from_one(kind, platform):
     part, given, _ = PARTS[kind]
     with pytest.raises(jv.InputError, match="platform"):
         part(**{name: value for name, value in given.items() if name != "position"}, platform=platform)
+    with pytest.raises(jv.InputError, match="position"):
+        part(**given, platform=1)
 
 
 def test_balls_in_contact_start_in_their_order():

@@ -104,7 +104,7 @@ class LoadContact(Effect):
         phi = np.asarray(u[0])
         wrong = ~np.all(np.diff(phi, axis=-1) > 0.0, axis=-1) | ~(phi[..., -1] - phi[..., 0] < 2.0 * np.pi)
         if np.any(wrong):
-            which = np.round(phi[wrong][0] if phi.ndim > 1 else phi, 4).tolist()
+            which = np.round(phi[wrong][0], 4).tolist()
             problem = (
                 "loads in contact cannot pass each other: each angle must be larger than the one before, all within one turn"
             )
