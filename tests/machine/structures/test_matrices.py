@@ -50,6 +50,21 @@ def test_matrices_of_a_plane_body_move_as_it_does():
     np.testing.assert_allclose(machine.carrier().foundation_force(q, v), carrier.foundation_force(q, v), rtol=1e-12)
 
 
+@pytest.mark.parametrize(("count", "axes"), [(1, (1,)), (2, (0, 1)), (3, (0, 1))])
+def test_rows_of_a_place_are_up_or_across_up_and_a_turn(count, axes):
+    rows = np.random.default_rng(2).normal(size=(2, count, 3))
+    machine = jv.from_matrices(np.eye(3), 0.1 * np.eye(3), 4.0 * np.eye(3), places=list(rows))
+    for number, given in ((None, rows[0]), (1, rows[0]), (2, rows[1])):
+        mount = machine.mount(number)
+        assert mount.axes == axes and len(mount.rows) == 1 and (mount.turn is None) == (count < 3)
+        np.testing.assert_array_equal(mount.rows[0], given[:2])
+        np.testing.assert_array_equal(machine.rows_at(number), given[:2])
+        if count == 3:
+            np.testing.assert_array_equal(mount.turn, given[2])
+    with pytest.raises(jv.InputError, match="1 to 2"):
+        machine.mount(3)
+
+
 def test_matrices_of_a_rotor_have_its_gyroscopic_force():
     rotor = jv.rotor(
         mass=37.0, transverse_inertia=0.5, polar_inertia=0.1, stiffness=(6e5, 5e5), damping=(400.0, 300.0), position=(0.2, -0.2)

@@ -1,5 +1,7 @@
 """Quantities of machines with several exciters: an independent calculation, other tiers, derivatives, bad input."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,7 @@ from optimize import (
     throw_stroke,
     tolerance_ranges,
 )
+from optimize.quantities import exciters
 from optimize.quantities.evaluation import Evaluation
 
 DECK = [(-1.5, 0.1), (0.2, 0.1), (1.5, 0.1)]
@@ -119,6 +122,15 @@ def test_derivatives_of_all_quantities_agree_with_differences(screen):
 
 
 @pytest.mark.slow
+def test_nearest_resonance_lies_on_either_side(monkeypatch):
+    monkeypatch.setattr(exciters, "natural_frequencies", lambda scene: jnp.array([50.0, 90.0, 130.0]))
+    for speed, each in ((100.0, [0.5, 0.1, 0.3]), (120.0, [7.0 / 12.0, 0.25, 1.0 / 12.0])):
+        at = SimpleNamespace(scene=None, regime=SimpleNamespace(speed=jnp.asarray(speed)))
+        np.testing.assert_allclose(resonance_distance().read(at), min(each), rtol=1e-12)
+        np.testing.assert_allclose(resonance_distance().pieces(at, 1.0), [min(each)], rtol=1e-12)
+        np.testing.assert_allclose(resonance_distance().pieces(at, -1.0), -np.array(each), rtol=1e-12)
+
+
 def test_equal_motors_have_the_largest_margin_and_no_slope():
     scene = jv.scene_from_toml(SCREENS["linear_screen"])
     margin = synchronization_margin()

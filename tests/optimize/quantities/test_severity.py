@@ -12,6 +12,7 @@ import jaxvib as jv
 from optimize import (
     acceleration,
     amplitude,
+    fold_margin,
     force_per_amplitude,
     foundation_force,
     jam_frequency,
@@ -108,6 +109,25 @@ def test_phases_and_harmonics_of_a_jam(jam):
         np.testing.assert_allclose(phase(mode=3, tier=tier).read(jam), np.pi / 2.0, rtol=1e-14)
     forces = [float(foundation_force(mode=3, harmonic=k, tier="exact").read(jam)) for k in (1, 2, 3)]
     np.testing.assert_allclose(forces, [8.0, 0.0, 3.0], rtol=1e-14)
+
+
+def test_largest_pieces_are_the_quantity(jam):
+    """Forces above their first harmonic have two peaks, a fold margin two sides."""
+    peaks = jnp.array([80.0, -75.0])
+    jam = SimpleNamespace(**vars(jam), folds=lambda mode: (jnp.asarray(28.0), jnp.asarray(160.0)))
+    jam.orbit(3).force_peaks = lambda: peaks
+    both = np.hypot(FIRST["exact"], SECOND["exact"])
+    cases = (
+        (foundation_force(mode=3, tier="exact"), [80.0, -75.0], [-80.0]),
+        (force_per_amplitude(mode=3, tier="exact"), [80.0 / both, -75.0 / both], [-80.0 / both]),
+        (foundation_force(mode=3), [70.0], [-70.0]),
+        (fold_margin(mode=3), [10.0], [-122.0, -10.0]),
+        (stroke(mode=3, of=1), [6e-3], [-6e-3]),
+    )
+    for quantity, up, down in cases:
+        np.testing.assert_allclose(quantity.pieces(jam, 1.0), up, rtol=1e-12)
+        np.testing.assert_allclose(quantity.pieces(jam, -1.0), down, rtol=1e-12)
+        np.testing.assert_allclose(quantity.read(jam), np.max(up), rtol=1e-12)
 
 
 def test_support_carries_weight_and_force_of_the_vibration(jam):

@@ -128,3 +128,13 @@ def test_search_of_two_exciters_equals_a_dense_scan(stall, ways):
 def test_start_with_a_wrong_number_of_phases_is_refused():
     with pytest.raises(jv.InputError, match="one phase for each of the 2 rotating masses"):
         jv.synchronous_regimes(scene_of(PAIR, (1, 1)), near=(99.0, jnp.zeros(3)))
+
+
+def test_margin_is_infinite_for_equal_drives():
+    """Also where the phases are neutral: exciters that turn in opposite directions at the middle of equal springs."""
+    springs = [jv.support(at=(x, 0.0), stiffness=(3e4, 3e4), damping=(600.0, 600.0)) for x in (-0.6, 0.6)]
+    motor = jv.DCMotor(100.0, stall_torque=60.0, inertia=0.05)
+    exciters = [jv.Exciter(drive=motor, unbalance=0.4, at=(0.0, 0.0), direction=way) for way in (1, -1)]
+    scene = jv.Scene(jv.plane_body(mass=300.0, inertia=75.0, supports=springs), exciters=exciters)
+    regime = jv.synchronous_regimes(scene, near=(99.0, jnp.array([0.0, 2.5])))
+    assert regime.status_name == "degenerate" and float(regime.margin) == np.inf
