@@ -391,10 +391,15 @@ def scene_to_toml(scene: Scene) -> str:
 
 
 def _part_table(section: str, part: Any) -> Tables:
-    if part.kind not in SECTIONS[section]:
+    return {"kind": part.kind, **_fields_of_kind(section, part, SECTIONS[section])}
+
+
+def _fields_of_kind(section: str, part: Any, kinds: Mapping[str, Callable[..., object]]) -> Tables:
+    """Return the fields of a part. **Raises** `InputError` for a part of a kind from outside the package."""
+    if part.kind not in kinds:
         problem = f"is {part.kind!r}, which scene files do not describe; build it in Python"
         raise InputError(f"{section}.kind", problem)
-    return {"kind": part.kind, **_fields(part, SECTIONS[section][part.kind])}
+    return _fields(part, kinds[part.kind])
 
 
 def _exciter_table(exciter: Exciter) -> Tables:
@@ -409,7 +414,7 @@ def _exciter_table(exciter: Exciter) -> Tables:
 def _effect_tables(effects: tuple[Effect, ...]) -> Tables:
     tables: Tables = {}
     for effect in effects:
-        fields = _fields(effect, EFFECTS[effect.kind])
+        fields = _fields_of_kind("effects", effect, EFFECTS)
         if effect.repeatable:
             tables.setdefault(effect.kind, []).append(fields)
         else:
