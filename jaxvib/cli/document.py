@@ -48,7 +48,7 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return deck(slope(command))
 
 
-def measures_of(scene: jv.Scene, motion: jv.Jam | jv.Vibration) -> jv.VibrationMeasures:
+def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vibration) -> jv.VibrationMeasures:
     """Return the measures of a vibration, at the points of the option --deck.
 
     **Raises** `InputError` for a machine that is not a body in a plane.

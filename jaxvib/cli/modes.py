@@ -153,6 +153,7 @@ def _phases(scene: jv.Scene, output: Output) -> None:
     found = jv.phase_jams(scene)
     output.picture("phases.png", lambda: found.plot())
     jams = [found.select(k) for k in range(found.omega.shape[0])]
+    measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
     document = {
         "rotor_speed": scene.drive.speed,
         "judged": "by the growth rate of small disturbances, for light loads that move independently",
@@ -161,8 +162,9 @@ def _phases(scene: jv.Scene, output: Output) -> None:
                 **fields_of(jam, "omega", "stable", "growth"),
                 "pattern": jam.pattern_label,
                 **fields_of(jam, "phase", "amplitude", "foundation_force"),
+                **({} if own is None else {"measures": own.document()}),
             }
-            for jam in jams
+            for jam, own in zip(jams, measures, strict=True)
         ],
     }
 
@@ -187,7 +189,10 @@ def _phases(scene: jv.Scene, output: Output) -> None:
             return f"no jam at {rotor}"
         kept = ", ".join(f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable)
         conclusion = f"loads can stay jammed at {kept}" if kept else "none of them is stable: light loads cannot stay jammed"
-        return "\n".join([conclusion, table(title, head, rows), *_left_out(scene)])
+        each = [
+            indented(f"at {speed_text(jam.omega)}:", own) for jam, own in zip(jams, measures, strict=True) if own is not None
+        ]
+        return "\n".join([conclusion, table(title, head, rows), *each, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
 
@@ -200,6 +205,7 @@ def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
     numbers = sorted({*light.mode_numbers(), *exact_mode_speeds(scene)})
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
     known = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
+    measures = {k: measures_of(scene, jam) for k, jam in known.items() if jam.stable}
     diagram = jv.branches(scene, exact=True)
     output.picture("branches.png", lambda: diagram.plot())
     output.csv(csv, diagram, "point")
@@ -212,6 +218,7 @@ def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
                 "mode": k,
                 **fields_of(jam, "omega", "stable", "amplitude", "foundation_force", "multiplier"),
                 "status": jam.message,
+                **({"measures": measures[k].document()} if k in measures else {}),
             }
             for k, jam in known.items()
         ],
@@ -241,6 +248,7 @@ def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
             f"rotor {speed_text(scene.drive.speed)}",
             table("exact jams; amplitudes and force are zero to peak", head, rows),
             *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in known),
+            *(indented(f"mode {k}:", each) for k, each in measures.items()),
         ]
         if points:
             lines.append(table("points where stability changes", ["", f"loads, {unit}", f"rotor, {unit}"], points))

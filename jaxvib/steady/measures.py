@@ -16,6 +16,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import quantity_text
 from jaxvib.equations.coincident import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
+from jaxvib.equations.torque_balance import resultant_of
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import BodyPoint, Place, on_body, read_place
 from jaxvib.machine.effects.base import has_term
@@ -28,6 +29,8 @@ from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit, is_single
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import Jam
+from jaxvib.steady.jams.phases import PhaseJam
+from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.points import STANDARD_GRAVITY, ellipse_at, rows_in_plane
 from jaxvib.units import Number, known_number, number, numbers
 from jaxvib.units.known import when_known
@@ -231,7 +234,7 @@ def _zone_text(velocity: float) -> str:
 @validated
 def vibration_measures(
     scene: Scene,
-    motion: Jam | Vibration,
+    motion: Jam | PhaseJam | Orbit | Vibration,
     *,
     at: int | Number | Sequence[Number] | Sequence[Sequence[Number]] | None = None,
     body: int = 0,
@@ -247,8 +250,9 @@ def vibration_measures(
     **Arguments**
 
     - `scene`
-    - `motion` of the scene: a jam of light loads such as `jam_modes(scene).select(3)`, or the `vibration()` of a run, of a
-      synchronous regime or of a response
+    - `motion` of the scene: a jam of light loads such as `jam_modes(scene).select(3)` or `phase_jams(scene).select(0)`, an
+      exact jam such as `jam_orbit(scene, mode=3)` (whose supports and points move with its first harmonic), or the
+      `vibration()` of a run, of an envelope, of a synchronous regime or of a response
     - `at`: point of a deck, (x, y) of the body number `body`, m, or a list of points; default: its centre of mass; typical:
       both ends of the deck
     - `slope` of the deck, rad or text from x anticlockwise; typical: "-15 deg" to 0 (the default)
@@ -271,6 +275,15 @@ def vibration_measures(
     places = tuple(on_body(read_place(point, "at"), on) for point in points)
     if isinstance(motion, Jam):
         motion = _vibration_of(scene, motion.omega, motion.displacement, motion.foundation_force)
+    elif isinstance(motion, PhaseJam):
+        power = -motion.rotor_speed * jnp.sum(motion.torque)
+        moved = (motion.displacement, motion.amplitude, motion.foundation_force)
+        motion = _vibration_at_phases(scene, motion.omega, motion.phase, *moved, power)
+    elif isinstance(motion, Orbit):
+        turning = eqx.tree_at(lambda s: s.drive.speed, scene, motion.rotor_speed)
+        first = motion.displacement_harmonics[:, motion.orders.index(1)]
+        moved = (first, motion.amplitude, motion.foundation_force)
+        motion = _vibration_at_phases(turning, motion.omega, motion.offsets, *moved, motion.power)
     return _measures(scene, motion, places if has_list else places[0], known_number(slope, "rad", "slope"))
 
 
@@ -281,6 +294,16 @@ def _vibration_of(scene: Scene, omega: Array, displacement: Array, force: Array)
     torque = shaft_torque(model, omega, displacement)[None]
     size = magnitude(displacement)
     return Vibration(omega, displacement, size, force, exciter_force(model, omega), torque, scene.drive.speed * torque)
+
+
+@cached
+def _vibration_at_phases(
+    scene: Scene, omega: Array, phase: Array, displacement: Array, amplitude: Array, force: Array, power: Array
+) -> Vibration:
+    """Return the vibration in a jam whose loads have the phases (count,), rad, and take a mean `power`, W, from the rotor."""
+    exciting = peak_force(omega**2 * resultant_of(linear_model(scene), jnp.exp(1j * phase)))
+    torque = (power / scene.drive.speed)[None]
+    return Vibration(omega, displacement, amplitude, force, exciting, torque, power[None])
 
 
 def exciter_force(model: JammedModel, omega: Array) -> Array:

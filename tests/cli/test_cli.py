@@ -119,6 +119,10 @@ def test_exact_modes_json_has_the_promised_keys(typed):
     assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "special", "missing"}
     assert set(document["special"][0]) == {"omega", "rotor_speed", "kind"}
     assert {"fold"} <= {point["kind"] for point in document["special"]}
+    jams = {each["mode"]: each for each in document["modes"]}
+    measured = jv.vibration_measures(jv.load_scene("machine.toml"), jv.jam_orbit(jv.load_scene("machine.toml"), mode=3))
+    np.testing.assert_allclose(jams[3]["measures"]["stroke"], measured.stroke, rtol=1e-9)
+    assert {k for k, each in jams.items() if "measures" in each} == {k for k, each in jams.items() if each["stable"]}
 
 
 def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):

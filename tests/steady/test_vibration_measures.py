@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -226,3 +227,56 @@ def test_no_transmissibility_is_shown_for_balanced_loads(jam):
     measures = jv.vibration_measures(*jam)
     balanced = dataclasses.replace(measures, transmissibility=jnp.asarray(3.5e5))
     assert "reach the foundation" in measures.summary() and "reach the foundation" not in balanced.summary()
+
+
+def test_an_exact_jam_has_the_measures_of_its_period(jam):
+    shaken, _ = jam
+    orbit = jv.jam_orbit(shaken, mode=3)
+    measures = jv.vibration_measures(shaken, orbit)
+    turns = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
+    q, v, _, (rate,) = jax.tree.map(np.asarray, jax.vmap(orbit.at)(jnp.asarray(turns)))
+    n, w, machine = float(shaken.drive.speed), float(orbit.omega), shaken.machine
+    torque = 3 * 1.5 * 0.12**2 * (n - np.mean(rate))
+    np.testing.assert_allclose(measures.torque, torque, rtol=1e-9)
+    np.testing.assert_allclose(measures.power, n * torque, rtol=1e-9)
+    np.testing.assert_allclose(measures.stroke, np.ptp(q, axis=0), rtol=1e-4)
+    forces = np.asarray(machine.stiffness) * q + np.asarray(machine.damping) * v
+    first = 2.0 * np.abs(np.mean(forces * np.exp(-1j * turns)[:, None], axis=0))
+    np.testing.assert_allclose(measures.dynamic_load, first, rtol=1e-9)
+    np.testing.assert_allclose(measures.exciter_force, 3 * 0.8 * 0.12 * w**2, rtol=1e-9)
+
+
+def test_jams_with_phases_have_the_measures_of_their_resultant():
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    rotor = jv.Scene(machine, jv.pendulums(count=3, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
+    found = jv.phase_jams(rotor)
+    for k in range(found.omega.shape[0]):
+        each = found.select(k)
+        measures, w = jv.vibration_measures(rotor, each), float(each.omega)
+        resultant = abs(np.sum(0.05 * 0.08 * np.exp(1j * np.asarray(each.phase)))) * w**2
+        np.testing.assert_allclose(measures.exciter_force, np.sqrt(2.0) * resultant, rtol=1e-9)
+        torque = 3 * 0.04 * 0.08**2 * (460.0 - w)
+        np.testing.assert_allclose([measures.torque[0], measures.power[0]], [torque, 460.0 * torque], rtol=1e-6)
+        lift = np.hypot(1.16e6, 843.0 * w) * np.asarray(each.amplitude)[1]
+        np.testing.assert_allclose(measures.dynamic_load, lift, rtol=1e-9)
+
+
+def test_an_averaged_jam_has_the_measures_of_light_loads(jam):
+    shaken, found = jam
+    run = jv.envelope(shaken, "20 s", start="jam", mode=3)
+    measures, light = (jv.vibration_measures(shaken, each) for each in (run.vibration(), found))
+    for name in ("stroke", "acceleration", "velocity", "dynamic_load", "static_load", "transmissibility", "torque", "power"):
+        np.testing.assert_allclose(getattr(measures, name), getattr(light, name), rtol=1e-6, err_msg=name)
+    assert measures.summary().splitlines()[0] in run.summary()
+
+
+def test_an_averaged_motor_has_the_torque_of_its_speed():
+    body = jv.one_mass(mass=200.0, stiffness="800 N/mm", damping=600.0)
+    motor = jv.DCMotor("1500 rpm", stall_torque=12.0, inertia=0.1)
+    table = jv.Scene(body, exciters=[jv.Exciter(drive=motor, unbalance="0.05 kg m")])
+    run = jv.envelope(table, "100 s", start="rest")
+    measures, n = jv.vibration_measures(table, run.vibration()), float(np.mean(run.window.rotor_speed))
+    line = 12.0 * (1.0 - n / (50.0 * np.pi))
+    np.testing.assert_allclose([measures.torque[0], measures.power[0]], [line, n * line], rtol=1e-6)
+    lost = 300.0 * n**2 * float(run.amplitude[0]) ** 2  # c (w A)^2 / 2
+    np.testing.assert_allclose(measures.power, lost, rtol=1e-3)  # the tolerance of a step is 1e-4

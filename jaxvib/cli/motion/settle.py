@@ -25,6 +25,7 @@ from jaxvib.cli.document import (
     chosen_steps,
     deck_options,
     measured_document,
+    measures_of,
     require_deck_options,
     run_document,
     run_measures,
@@ -101,6 +102,7 @@ def _modes_of(run: jv.Run) -> list[int] | None:
 @click.option("--spin-up", help="Duration of the spin-up, with --start spin_up [half of --until].")
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-4].")
 @WITHOUT
+@deck_options
 @csv_options
 @shared
 def envelope(
@@ -112,8 +114,9 @@ def envelope(
     output.picture("envelope.png", run.plot)
     output.keep("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
-    document = {**measured_document(run, loaded), "ripple": run.ripple}
-    output.done(document, run.summary, "envelope", run)
+    measures = measures_of(loaded, run.vibration())
+    document = {**measured_document(run, loaded), "measures": measures.document(), "ripple": run.ripple}
+    output.done(document, lambda: run.summary(measures), "envelope", run)
 
 
 @app.command("growth")

@@ -5,19 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit, speed_text
-from jaxvib.machine.scene import Scene
+from jaxvib.equations.linear import linear_model, peak_force
+from jaxvib.equations.torque_balance import resultant_of
+from jaxvib.machine.drives.drive import Motor
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import ContactFriction, RotorImbalance
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, only_exciter_value
 from jaxvib.motion.run import SETTLED_DRIFT
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_name
+from jaxvib.steady.measures import Vibration, VibrationMeasures, vibration_measures
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.steady.points import Harmonic, PathsOfPoints
 
@@ -110,8 +118,38 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         rest = 0.5 * (away.T @ jnp.conj(away)).real / away.shape[0]
         return Harmonic(self.scene.machine, jnp.mean(self.window.omega), mean, rest)
 
-    def summary(self) -> str:
-        """Return the outcome of the run as text; amplitudes zero to peak."""
+    def vibration(self) -> Vibration:
+        """Return the mean vibration over the window, for `vibration_measures`.
+
+        The torque of a motor is that of its speed. The torque of a prescribed drive is the drag of its loads, NaN for loads
+        with dry friction and for unbalances.
+        """
+        scene, window = self.scene, self.window
+        turn = jnp.mean(jnp.exp(1j * window.phase), axis=0)
+        force = peak_force(self.omega**2 * resultant_of(linear_model(scene), turn))
+        rates = zip(scene.exciters, window.rotor_speeds, _split(scene, window.load_speed), strict=True)
+        torques = [_torque_of(each, window.time, speed, rate) for each, speed, rate in rates]
+        powers = [
+            jnp.mean(each.direction * n * own)
+            for each, n, own in zip(scene.exciters, window.rotor_speeds, torques, strict=True)
+        ]
+        return Vibration(
+            speed=self.omega,
+            displacement=jnp.mean(window.displacement, axis=0),
+            amplitude=self.amplitude,
+            foundation_force=self.foundation_force,
+            exciter_force=jnp.where(has_term(scene.all_effects, RotorImbalance), jnp.nan, force),
+            torque=jnp.stack([jnp.mean(own) for own in torques]),
+            power=jnp.stack(powers),
+        )
+
+    def summary(self, measures: VibrationMeasures | None = None) -> str:
+        """Return the outcome of the run as text; amplitudes zero to peak.
+
+        **Arguments**: `measures` of the vibration that are shown; default: those of the centre of mass on a level deck.
+        """
+        moves = bool(np.all(np.isfinite(self.amplitude)))
+        measured = (measures or vibration_measures(self.scene, self.vibration())).summary().splitlines() if moves else []
         named, first = status_name(self.status), []
         end, state = self.message, "settled" if bool(self.settled) else "not settled: run longer"
         if named in ("would_separate", "unstable"):
@@ -126,6 +164,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  loads turn at {speed_text(self.omega, 6)} (each: {speed_text(self.load_speed, 6)}), {rotor} at {rotors}",
                 f"  {self.amplitude_text(self.scene)}",
+                *(f"  {line}" for line in measured),
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
         )
@@ -137,6 +176,22 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
         **Arguments**: `unit` and `ax` as `Run.plot`.
         """
         return plot_histories(self, unit=unit, ax=ax)
+
+
+def _split(scene: Scene, speeds: Array) -> list[Array]:
+    """Return the speeds (nt, mass) of all masses that turn as one array for each exciter."""
+    counts = [1 if each.loads is None else each.loads.count for each in scene.exciters]
+    return jnp.split(speeds, np.cumsum(counts)[:-1], axis=1)
+
+
+def _torque_of(exciter: Exciter, time: Array, speed: Array, load_speed: Array) -> Array:
+    """Return the torque of a drive, N m, in its direction, over the times (nt,)."""
+    n, rates, loads = exciter.direction * speed, exciter.direction * load_speed, exciter.loads
+    if isinstance(exciter.drive, Motor):
+        return jax.vmap(exciter.drive.torque_at)(time, n)
+    if loads is None or has_term(exciter.effects, ContactFriction) or not isinstance(loads, CircularLoads):
+        return jnp.full_like(n, jnp.nan)
+    return jnp.sum(loads.drag * loads.radius**2 * (n[:, None] - rates), axis=1)
 
 
 def plot_histories(run: Envelope, *, resonances: Sequence[float] = (), unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
