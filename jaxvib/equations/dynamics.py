@@ -6,9 +6,11 @@ import dataclasses
 import functools
 import itertools
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -31,6 +33,40 @@ from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
+from jaxvib.runtime.structure import leaf_key
+
+_LEAST_GROUP = 8
+"""Smallest number of exciters of equal structure that are computed as one group."""
+
+
+class _Group(eqx.Module):
+    """One exciter, or many of equal structure as one whose arrays have a leading axis over them.
+
+    `members`: the numbers of the exciters.
+    """
+
+    exciter: RotorDynamics
+    members: tuple[int, ...] = eqx.field(static=True)
+
+    def each(self, function: Callable[..., Any], *values: Any) -> Any:
+        """Return function(exciter, *values) of each member."""
+        return (function if len(self.members) == 1 else eqx.filter_vmap(function))(self.exciter, *values)
+
+
+def _joined(members: Sequence[int], trees: Sequence[Any]) -> Any:
+    """Return some of many trees as one, with a leading axis over them if there are several."""
+    if len(members) == 1:
+        return trees[members[0]]
+    return jax.tree.map(lambda *x: jnp.stack(x), *(trees[k] for k in members))
+
+
+def _apart(groups: Iterable[_Group], trees: Iterable[Any]) -> list[Any]:
+    """Return the trees of all exciters in order from those of their groups."""
+    found = {}
+    for group, tree in zip(groups, trees, strict=True):
+        for i, k in enumerate(group.members):
+            found[k] = tree if len(group.members) == 1 else jax.tree.map(lambda x, i=i: x[i], tree)
+    return [found[k] for k in range(len(found))]
 
 
 class _Support(eqx.Module):
@@ -51,8 +87,7 @@ class Dynamics(eqx.Module):
     - `input_matrix` M^-1 P^T (nd, nP): acceleration per force on the rows
     - `accelerance` P M^-1 P^T (nP, nP), and `rows` P (nP, nd)
     - `mass` M (nd, nd) if P has more rows than there are coordinates, otherwise None
-    - `turns`: for each exciter the row (1, nd) of the rotation of its housing, None if it does not turn
-    - `exciters`, see `RotorDynamics`; `supports`, a place for each `SupportForce`
+    - `groups` of the exciters, see `_Group`; `supports`, a place for each `SupportForce`
     """
 
     stiffness: Array
@@ -62,9 +97,13 @@ class Dynamics(eqx.Module):
     accelerance: Array
     rows: Array
     mass: Array | None
-    turns: tuple[Array | None, ...]
-    exciters: tuple[RotorDynamics, ...]
+    groups: tuple[_Group, ...]
     supports: tuple[_Support, ...]
+
+    @property
+    def exciters(self) -> list[RotorDynamics]:
+        """The exciters of the scene, in order."""
+        return _apart(self.groups, (group.exciter for group in self.groups))
 
     def __call__(self, t: Array, state: State) -> State:
         """Return the time derivative of `state` at time `t`.
@@ -74,16 +113,14 @@ class Dynamics(eqx.Module):
         equation per row, for any number of platforms and loads. If there are more rows than coordinates, q'' follows from
         (M + P^T W P) q'' = M q''_free - P^T g instead.
         """
-        pairs = list(zip(self.exciters, state.exciters, strict=True))
-        speeds = [exciter.drive.rotor_speed(t, own.rotor) for exciter, own in pairs]
+        states = [_joined(group.members, state.exciters) for group in self.groups]
+        speeds = self._each(lambda exciter, own: exciter.drive.rotor_speed(t, own.rotor), states)
         unforced = self._unforced(state, speeds)
-        housings = [None if turn is None else times(turn, state.velocity)[0] for turn in self.turns]
-        cases = zip(pairs, speeds, housings, strict=True)
-        motions = [exciter.motion(t, own, speed, housing) for (exciter, own), speed, housing in cases]
+        housings = self._each(lambda exciter: exciter.housing_speed(state.velocity))
+        motions = self._each(lambda exciter, *given: exciter.motion(t, *given), states, speeds, housings)
 
         def solve(contacts: Sequence[ContactSolution]) -> tuple[list[tuple[Eliminated, list[Array]]], Array]:
-            cases = zip(self.exciters, motions, contacts, strict=True)
-            parts = [exciter.eliminate(motion, contact) for exciter, motion, contact in cases]
+            parts = self._each(lambda exciter, *given: exciter.eliminate(*given), motions, contacts)
             accelerations, carrier = self._solve_rows(parts, unforced)
             return list(zip(parts, accelerations, strict=True)), carrier
 
@@ -91,16 +128,18 @@ class Dynamics(eqx.Module):
         if any(map(depends_on_acceleration, contacts)):
             # The sign of a normal force that depends on the accelerations is taken from the motion without its friction.
             plain, _ = solve([without_coupling(contact) for contact in contacts])
-            cases = zip(self.exciters, contacts, plain, strict=True)
-            contacts = [signed(contact, exciter.at_loads(a)) for exciter, contact, (_, a) in cases]
+            contacts = self._each(lambda exciter, contact, part: signed(contact, exciter.at_loads(part[1])), contacts, plain)
         solved, carrier = solve(contacts)
         rolling = contacts
-        if any(exciter.can_slide for exciter in self.exciters):
-            cases = zip(self.exciters, motions, contacts, solved, strict=True)
-            solved, carrier = solve([exciter.slide(motion, contact, *part) for exciter, motion, contact, part in cases])
-        cases = zip(self.exciters, motions, rolling, solved, strict=True)
-        rates = [exciter.rates(motion, contact, *part) for exciter, motion, contact, part in cases]
-        return State(state.velocity, carrier, exciters=rates)
+        if any(group.exciter.can_slide for group in self.groups):
+            sliding = self._each(lambda exciter, *given: exciter.slide(*given[:2], *given[2]), motions, contacts, solved)
+            solved, carrier = solve(sliding)
+        rates = self._each(lambda exciter, *given: exciter.rates(*given[:2], *given[2]), motions, rolling, solved)
+        return State(state.velocity, carrier, exciters=_apart(self.groups, rates))
+
+    def _each(self, function: Callable[..., Any], *values: Sequence[Any]) -> list[Any]:
+        """Return function(exciter, *values) of each group."""
+        return [group.each(function, *own) for group, *own in zip(self.groups, *values, strict=True)]
 
     def at_rows(self, rows: Array) -> Dynamics:
         """Return the equations with the accelerations of P's rows and of further `rows` (k, nd) in place of the carrier's q''.
@@ -123,7 +162,8 @@ class Dynamics(eqx.Module):
         """Return the accelerations of the carrier without exciters."""
         flow = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
-            speed = speeds[0] if len(speeds) == 1 else sum(speeds[1:], speeds[0]) / len(speeds)
+            each = _apart(self.groups, speeds)
+            speed = each[0] if len(each) == 1 else sum(each[1:], each[0]) / len(each)
             flow = flow - speed * times(self.gyroscopic, state.velocity)
         for term, support in zip(terms_of(self.exciters[0].effects, SupportForce), self.supports, strict=True):
             x, v = times(support.rows, state.displacement), times(support.rows, state.velocity)
@@ -131,7 +171,9 @@ class Dynamics(eqx.Module):
         return flow
 
     def _solve_rows(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
-        """Return the accelerations of the rows of each exciter, and those of the carrier."""
+        """Return the accelerations of the rows of each exciter, by group, and those of the carrier."""
+        if any(len(group.members) > 1 for group in self.groups):
+            return self._solve_rows_of_groups(parts, unforced)
         ends = np.cumsum([len(part.reaction) for part in parts]).tolist()
         blocks = [range(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
         own = [block for block in blocks for _ in block]
@@ -154,6 +196,31 @@ class Dynamics(eqx.Module):
         push = [-sum(w * a[k] for k, w in weights[i].items()) - reaction[i] for i in range(n)]
         carrier = unforced + sum(self.input_matrix[:, i] * push[i] for i in range(n))
         return [[a[k] for k in block] for block in blocks], carrier
+
+    def _solve_rows_of_groups(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
+        """Return the same as `_solve_rows`, from arrays over all rows of a group."""
+        arrays = self._each(lambda _, part: (jnp.asarray(part.added_mass), jnp.asarray(part.reaction)), parts)
+        weights = [added.reshape(-1, *added.shape[-2:]) for added, _ in arrays]
+        reaction = jnp.concatenate([jnp.ravel(g) for _, g in arrays])
+        ends = np.cumsum([w.shape[0] * w.shape[1] for w in weights])
+
+        def weighted(x: Array) -> Array:
+            """Return W x of the added mass W, which acts within an exciter, for x (nP, k)."""
+            blocks = (block.reshape(*w.shape[:2], -1) for w, block in zip(weights, jnp.split(x, ends[:-1]), strict=True))
+            products = (jnp.sum(w[..., None] * x[:, None], axis=2) for w, x in zip(weights, blocks, strict=True))
+            return jnp.concatenate([product.reshape(-1, x.shape[1]) for product in products])
+
+        if self.mass is not None:
+            mass, push = self.rows.T @ weighted(self.rows), self.rows.T @ reaction
+            carrier = solve_definite(self.mass + mass, times(self.mass, unforced) - push)
+            a = self.rows @ carrier
+        else:
+            free = self.rows @ unforced
+            matrix = jnp.eye(reaction.shape[0], dtype=free.dtype) + weighted(self.accelerance)
+            force = small_solve(matrix, weighted(free[:, None])[:, 0] + reaction)
+            carrier, a = unforced - self.input_matrix @ force, free - self.accelerance @ force
+        each = [block.reshape(w.shape[:2]) for w, block in zip(weights, jnp.split(a, ends[:-1]), strict=True)]
+        return [list(block[0] if len(block) == 1 else block.T) for block in each], carrier
 
     def _solve_in_coordinates(
         self, mass: Array, unforced: Array, weights: list[dict[int, Array | float]], reaction: list[Array | float]
@@ -198,11 +265,11 @@ def vector_field(scene: Scene) -> Dynamics:
 def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_solve) -> Dynamics:
     """Return `vector_field` of a scene that is already assembled. `solve` returns x of a x = b, where a is the mass matrix."""
     scene, carrier, gyroscopic = model.scene, model.carrier, model.mounts[0].gyroscopic
-    exciters = tuple(map(_exciter_dynamics, scene.exciters, model.mounts, itertools.repeat(scene.effects)))
-    turns = tuple(None if mount.turn is None else mount.turn[None] for mount in model.mounts)
-    moving = []
-    for exciter, mount, turn in zip(exciters, model.mounts, turns, strict=True):
-        moving += [*mount.rows[: exciter.row_count], *([] if turn is None else [turn])]
+    exciters = [_exciter_dynamics(*each, scene.effects) for each in zip(scene.exciters, model.mounts, strict=True)]
+    groups, moving = _groups(exciters), []
+    for k in itertools.chain.from_iterable(group.members for group in groups):
+        turn = exciters[k].turn
+        moving += [*model.mounts[k].rows[: exciters[k].row_count], *([] if turn is None else [turn])]
     rows = moving[0] if len(moving) == 1 else jnp.concatenate(moving)
     parts = [carrier.stiffness, carrier.damping, rows.T, *(place.T for place in model.supports)]
     if gyroscopic is not None:
@@ -217,16 +284,26 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
         accelerance=rows @ input_matrix,
         rows=rows,
         mass=carrier.mass if rows.shape[0] > rows.shape[1] else None,
-        turns=turns,
-        exciters=exciters,
+        groups=groups,
         supports=tuple(map(_Support, model.supports, rest)),
     )
+
+
+def _groups(exciters: Sequence[RotorDynamics]) -> tuple[_Group, ...]:
+    """Return exciters in groups of equal structure. A group of fewer than `_LEAST_GROUP` is divided into single exciters."""
+    kinds: dict[Hashable, list[int]] = {}
+    for k, exciter in enumerate(exciters):
+        leaves, structure = jax.tree.flatten(exciter)
+        kinds.setdefault((structure, *map(leaf_key, leaves)), []).append(k)
+    groups = [group for kind in kinds.values() for group in ([kind] if len(kind) >= _LEAST_GROUP else [[k] for k in kind])]
+    return tuple(_Group(_joined(members, exciters), tuple(members)) for members in sorted(groups))
 
 
 def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]) -> RotorDynamics:
     """Return the dynamics of an exciter under its own effects and those of the scene."""
     effects, loads = (*shared, *exciter.effects), exciter.loads
-    rotor = (mount.levers, mount.rotor_levers, exciter.turning_drive, exciter.unbalance)
+    turn = None if mount.turn is None else mount.turn[None]
+    rotor = (mount.levers, mount.rotor_levers, turn, exciter.turning_drive, exciter.unbalance)
     row_count = len(mount.rows) if has_term(effects, RotorImbalance) else len(mount.levers)
     if loads is None:
         return RotorDynamics(*rotor, effects, mount.axes, row_count)

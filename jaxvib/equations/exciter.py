@@ -45,7 +45,7 @@ from jaxvib.machine.effects.terms import (
     SlipRelease,
 )
 from jaxvib.machine.loads import DrillingSpin, Loads
-from jaxvib.numerics.linalg import small_inverse
+from jaxvib.numerics.linalg import small_inverse, times
 
 Axes = dict[int, Array]
 """Components of a vector by axis, 0 horizontal, 1 up: arrays (count,) with an entry for each load."""
@@ -113,6 +113,7 @@ class RotorDynamics(eqx.Module):
     **Attributes**
 
     - `levers` of the loads and `rotor_levers`, see `Mount`
+    - `turn`: row (1, nd) of the rotation of the housing, None if it does not turn
     - `drive` in the direction of the exciter
     - `unbalance` about the axis, kg m, or None
     - `effects`, prepared for the loads
@@ -122,6 +123,7 @@ class RotorDynamics(eqx.Module):
 
     levers: tuple[Array | None, ...]
     rotor_levers: tuple[Array | None, ...]
+    turn: Array | None
     drive: Drive
     unbalance: Array | None
     effects: tuple[Effect, ...]
@@ -132,6 +134,10 @@ class RotorDynamics(eqx.Module):
     def can_slide(self) -> bool:
         """True if an effect lets loads slide."""
         return False
+
+    def housing_speed(self, velocity: Array) -> Array | None:
+        """Return the speed at which the housing turns with the machine; None if it does not turn."""
+        return None if self.turn is None else times(self.turn, velocity)[0]
 
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
