@@ -138,7 +138,7 @@ class Dynamics(eqx.Module):
         return State(state.velocity, carrier, exciters=_apart(self.groups, rates))
 
     def _each(self, function: Callable[..., Any], *values: Sequence[Any]) -> list[Any]:
-        """Return function(exciter, *values) of each group."""
+        """Return function(exciter, *values) of each exciter, by group."""
         return [group.each(function, *own) for group, *own in zip(self.groups, *values, strict=True)]
 
     def at_rows(self, rows: Array) -> Dynamics:
@@ -198,7 +198,10 @@ class Dynamics(eqx.Module):
         return [[a[k] for k in block] for block in blocks], carrier
 
     def _solve_rows_of_groups(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
-        """Return the same as `_solve_rows`, from arrays over all rows of a group."""
+        """Return the same as `_solve_rows`, from arrays over all rows.
+
+        In the second case the unknowns are the forces f = W a + g: (1 + W accelerance) f = W a_free + g.
+        """
         arrays = self._each(lambda _, part: (jnp.asarray(part.added_mass), jnp.asarray(part.reaction)), parts)
         weights = [added.reshape(-1, *added.shape[-2:]) for added, _ in arrays]
         reaction = jnp.concatenate([jnp.ravel(g) for _, g in arrays])
@@ -211,14 +214,14 @@ class Dynamics(eqx.Module):
             return jnp.concatenate([product.reshape(-1, x.shape[1]) for product in products])
 
         if self.mass is not None:
-            mass, push = self.rows.T @ weighted(self.rows), self.rows.T @ reaction
-            carrier = solve_definite(self.mass + mass, times(self.mass, unforced) - push)
-            a = self.rows @ carrier
+            mass = self.mass + jnp.matmul(self.rows.T, weighted(self.rows), precision="highest")
+            carrier = solve_definite(mass, times(self.mass, unforced) - times(self.rows.T, reaction))
+            a = times(self.rows, carrier)
         else:
-            free = self.rows @ unforced
+            free = times(self.rows, unforced)
             matrix = jnp.eye(reaction.shape[0], dtype=free.dtype) + weighted(self.accelerance)
             force = small_solve(matrix, weighted(free[:, None])[:, 0] + reaction)
-            carrier, a = unforced - self.input_matrix @ force, free - self.accelerance @ force
+            carrier, a = unforced - times(self.input_matrix, force), free - times(self.accelerance, force)
         each = [block.reshape(w.shape[:2]) for w, block in zip(weights, jnp.split(a, ends[:-1]), strict=True)]
         return [list(block[0] if len(block) == 1 else block.T) for block in each], carrier
 

@@ -153,6 +153,19 @@ def test_several_exciters_are_euler_lagrange(name, n):
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * float(jnp.max(jnp.abs(expected))))
 
 
+@pytest.mark.parametrize(("name", "kind"), [("network", 5), pytest.param("rotor", 2, marks=pytest.mark.slow)])
+def test_a_group_of_exciters_is_euler_lagrange(name, kind):
+    """Eight exciters of one kind, `exciter` has a period of twelve, and one of another kind."""
+    machine, places = MACHINES[name]
+    alike = [exciter(kind + 12 * (j % 3), places) for j in range(8)]
+    scene = jv.Scene(machine, exciters=[alike[0], exciter(0, places), *alike[1:]], effects=GRAVITY)
+    assert sorted(len(group.members) for group in jv.vector_field(scene).groups) == [1, 8]
+    state = state_of(scene)
+    found = flat(scene, jax.jit(lambda y: jv.vector_field(scene)(T, y))(state))
+    expected = jax.jit(lambda y: lagrange(scene, y))(state)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * float(jnp.max(jnp.abs(expected))))
+
+
 @pytest.mark.parametrize(("name", "n"), [("network", 3), ("network", 5), ("rotor", 4)])
 def test_energy_changes_by_the_power_of_all_exciters(name, n):
     scene = scene_of(name, n, (*GRAVITY, *([jv.Stop(1e5, gap=0.01, damping=20.0)] if name == "network" else [])))

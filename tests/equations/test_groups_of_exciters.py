@@ -1,0 +1,113 @@
+"""Exciters of equal structure that are computed as one group, against the same exciters one by one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.equations import dynamics
+
+SUPPORTS = [jv.support(at=(x, -0.2), stiffness=(4e5, 7e5), damping=(2e3, 3e3)) for x in (-1.0, 1.1)]
+BODY = jv.plane_body(mass=2000.0, inertia=600.0, supports=SUPPORTS)
+PLANAR = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+TWELVE = jv.network(
+    mass=[40.0 + k for k in range(12)],
+    stiffness=[2e4] * 12,
+    damping=[20.0] * 12,
+    links=[(k, k + 1) for k in range(1, 12)],
+    link_stiffness=[1e5] * 11,
+    link_damping=[20.0] * 11,
+    exciter=1,
+)
+
+
+def dc(k):
+    return jv.DCMotor(100.0 + k, stall_torque=6.0 + k, inertia=0.2 + 0.01 * k)
+
+
+def electrical(k):
+    circuit = jv.InductionMotorElectrical(400.0, 314.0, 2, 1.0, 1.0, 0.005, 0.005, 0.15, inertia=0.2)
+    return eqx.tree_at(lambda motor: motor.rotor_resistance, circuit, jnp.asarray(1.0 + 0.1 * k))
+
+
+def loads(k, kind=jv.balls):
+    return kind(count=2, mass=0.4 + 0.01 * k, radius=0.1 + 0.001 * k, drag=0.7)
+
+
+def motors(n, drive=dc, direction=lambda k: (1, -1)[k % 2]):
+    """Exciters with unbalances at different places of the body."""
+    at = [(-1.0 + 0.03 * k, 0.1 * (k % 3)) for k in range(n)]
+    return [jv.Exciter(None, drive(k), unbalance=0.3 + 0.01 * k, at=at[k], direction=direction(k)) for k in range(n)]
+
+
+def clockwise(k):
+    return -1
+
+
+def torus(k):
+    return jv.torus_balls(count=2, mass=0.1 + 0.01 * k, radius=0.2, tube=0.015, ball_radius=0.0145)
+
+
+LOADED = [jv.Exciter(loads(k), dc(k), unbalance=0.1 + 0.01 * k, at=1 + k) for k in range(8)]
+IDEAL = [jv.Exciter(loads(k), jv.SpinUp(90.0 + k, 1.0), at=(0.1 * k, 0.4), direction=clockwise(k)) for k in range(8)]
+DRY = [jv.Exciter(loads(k, jv.pendulums), jv.ConstantSpeed(80.0 + k), effects=[jv.DryFriction(0.002, 0.02)]) for k in range(8)]
+ROLLS = (jv.RollingFriction(3e-5), jv.FreeSpin(), jv.Sliding(0.2))
+SLIDING = [jv.Exciter(torus(k), jv.ConstantSpeed(60.0 + k), effects=ROLLS) for k in range(8)]
+SCENES = {
+    "unbalances": jv.Scene(BODY, exciters=motors(8, direction=clockwise), effects=jv.Gravity()),
+    "two kinds": jv.Scene(BODY, exciters=[*motors(8, direction=clockwise), *motors(1, electrical)]),
+    "both directions": jv.Scene(BODY, exciters=motors(64)),
+    "currents": jv.Scene(BODY, exciters=motors(8, electrical, clockwise)),
+    "ideal drives": jv.Scene(BODY, exciters=[*IDEAL, *motors(8, lambda k: jv.ConstantSpeed(60.0 + k), clockwise)][::-1]),
+    "more coordinates than rows": jv.Scene(TWELVE, exciters=LOADED, effects=[jv.Gravity(), jv.Stop(1e5, gap=0.01)]),
+    "dry friction": jv.Scene(PLANAR, exciters=DRY, effects=jv.Gravity()),
+    "sliding": jv.Scene(PLANAR, exciters=SLIDING, effects=jv.Gravity(along="axis")),
+}
+
+
+def state_of(scene):
+    rng = np.random.default_rng(0)
+    leaves, structure = jax.tree.flatten(jv.initial_state(scene, "rest"))
+    return jax.tree.unflatten(structure, [jnp.asarray(rng.normal(size=np.shape(leaf))) for leaf in leaves])
+
+
+def close(found, expected, error=1e-13):
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(x, y, rtol=error, atol=error * max(np.max(np.abs(y), initial=0.0), 1.0))
+
+
+def rate(scene, state):
+    return jv.vector_field(scene)(jnp.asarray(0.3), state)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_groups_have_the_rates_of_single_exciters(name, monkeypatch):
+    scene = SCENES[name]
+    state = state_of(scene)
+    assert max(len(group.members) for group in jv.vector_field(scene).groups) >= 8
+    found = jax.jit(lambda y: rate(scene, y))(state)
+    monkeypatch.setattr(dynamics, "_LEAST_GROUP", 1000)
+    assert all(len(group.members) == 1 for group in jv.vector_field(scene).groups)
+    close(found, jax.jit(lambda y: rate(scene, y))(state))
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("more coordinates than rows", "dry friction")]
+
+
+@pytest.mark.parametrize("name", ["two kinds", *SLOW])
+def test_groups_have_the_derivatives_of_single_exciters(name, monkeypatch):
+    scene = SCENES[name]
+    state = state_of(scene)
+
+    @jax.jit
+    def slopes(scene, state):
+        value, back = jax.vjp(rate, scene, state)
+        ones = jax.tree.map(jnp.ones_like, (scene, state))
+        return jax.jvp(rate, (scene, state), ones)[1], back(jax.tree.map(jnp.ones_like, value))
+
+    found = slopes(scene, state)
+    monkeypatch.setattr(dynamics, "_LEAST_GROUP", 1000)
+    jax.clear_caches()
+    close(found, slopes(scene, state), 1e-12)
