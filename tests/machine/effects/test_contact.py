@@ -99,6 +99,17 @@ def test_compiled_run_ups_build_a_restitution_anew():
     assert bool(np.all(found.finished))
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_energy_counts_each_overlapping_pair_once(count):
+    loads = balls(count)
+    u = (jnp.arange(count) ** 1.2 * 0.9 * OWN / RADIUS, *loads.rest()[1:])
+    place = np.stack(loads.position(*u))
+    pairs = [(i, k) for k in range(count) for i in range(k)]
+    overlaps = np.array([max(2.0 * OWN - np.linalg.norm(place[:, i] - place[:, k]), 0.0) for i, k in pairs])
+    assert np.sum(overlaps > 0.0) >= count - 1
+    np.testing.assert_allclose(jnp.sum(jv.LoadContact(1e5).energy(loads, u)), 0.5e5 * np.sum(overlaps**2), rtol=1e-9)
+
+
 def test_overlapping_balls_are_refused_named_starts_avoid_them():
     s, zero = on_equator(0.5, count=3), jnp.zeros(2)
 

@@ -121,7 +121,6 @@ def test_derivatives_of_all_quantities_agree_with_differences(screen):
     np.testing.assert_allclose(np.asarray(forward) * np.asarray(start) / scale, differences / scale, atol=1e-4)
 
 
-@pytest.mark.slow
 def test_nearest_resonance_lies_on_either_side(monkeypatch):
     monkeypatch.setattr(exciters, "natural_frequencies", lambda scene: jnp.array([50.0, 90.0, 130.0]))
     for speed, each in ((100.0, [0.5, 0.1, 0.3]), (120.0, [7.0 / 12.0, 0.25, 1.0 / 12.0])):
@@ -131,6 +130,7 @@ def test_nearest_resonance_lies_on_either_side(monkeypatch):
         np.testing.assert_allclose(resonance_distance().pieces(at, -1.0), -np.array(each), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_equal_motors_have_the_largest_margin_and_no_slope():
     scene = jv.scene_from_toml(SCREENS["linear_screen"])
     margin = synchronization_margin()

@@ -68,7 +68,7 @@ def jam():
     time = np.linspace(0.0, 4.0 * np.pi / SPEEDS["time"], 801)
     moving = np.asarray(run.displacement) * np.exp(1j * SPEEDS["time"] * time)[:, None]
     run.window = Window(jnp.asarray(time), Moving(jnp.asarray(moving.real), jnp.asarray((1j * SPEEDS["time"] * moving).real)))
-    at = {3: leading}, {3: exact}, {3: run}
+    at = {2: leading, 3: leading}, {3: exact}, {3: run}
     ways = dict(zip(("jam", "orbit", "jam_run"), (each.__getitem__ for each in at), strict=True))
     return SimpleNamespace(scene=scene, jammed=Evaluation(scene).jammed, **ways)
 
@@ -114,7 +114,9 @@ def test_phases_and_harmonics_of_a_jam(jam):
 def test_largest_pieces_are_the_quantity(jam):
     """Forces above their first harmonic have two peaks, a fold margin two sides."""
     peaks = jnp.array([80.0, -75.0])
-    jam = SimpleNamespace(**vars(jam), folds=lambda mode: (jnp.asarray(28.0), jnp.asarray(160.0)))
+    jam = SimpleNamespace(
+        **vars(jam), folds=lambda mode: [jnp.asarray(speed) for speed in ((28.0, 160.0) if mode == 3 else (160.0, 28.0))]
+    )
     jam.orbit(3).force_peaks = lambda: peaks
     both = np.hypot(FIRST["exact"], SECOND["exact"])
     cases = (
@@ -122,6 +124,7 @@ def test_largest_pieces_are_the_quantity(jam):
         (force_per_amplitude(mode=3, tier="exact"), [80.0 / both, -75.0 / both], [-80.0 / both]),
         (foundation_force(mode=3), [70.0], [-70.0]),
         (fold_margin(mode=3), [10.0], [-122.0, -10.0]),
+        (fold_margin(mode=2), [10.0], [-122.0, -10.0]),
         (stroke(mode=3, of=1), [6e-3], [-6e-3]),
     )
     for quantity, up, down in cases:
