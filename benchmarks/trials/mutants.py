@@ -12,9 +12,9 @@ A mutant is the package with one change in one line:
 Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
 in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
 Each is given to the nearest `--files` test files, first the test file of its name, then those of its folder, then those that
-name most of it; and to the examples in its own file. Of these the tests that reach its line run first; the first test
-that fails ends it. The lines that each test of a file reaches are measured (`coverage`) when a mutant needs that file, once for
-an `--out`. Take a new `--out` for changed packages.
+name most of it; a third of them are those that consist most of calls of it, in any folder. The examples in its own file are run
+as well. Of these the tests that reach its line run first; the first test that fails ends it. The lines that each test of a file
+reaches are measured (`coverage`) when a mutant needs that file, once for an `--out`. Take a new `--out` for changed packages.
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
 Survivors, and mutants that no such test reaches, are printed with their changes, to be explained or killed by a new test.
@@ -84,7 +84,7 @@ def nearest(file: str, count: int) -> list[str]:
     text, place = (ROOT / file).read_text(), _home(pathlib.Path(file.removeprefix("jaxvib/")))
     public = re.search(r"^__all__ = \[(.*?)\]", text, re.DOTALL | re.MULTILINE)
     words = re.findall(r"\w+", public[1]) if public else re.findall(r"^(?:def|class) ([a-zA-Z]\w*)", text, re.MULTILINE)
-    names = re.compile(rf"\b({'|'.join([place[-1], *words])})\b")
+    names, calls = (re.compile(rf"\b({'|'.join(each)}){end}") for each, end in (([place[-1], *words], r"\b"), (words, r"\(")))
 
     def distance(path: pathlib.Path) -> tuple:
         own, test = _home(path.relative_to(ROOT / "tests")), path.read_text()
@@ -92,7 +92,12 @@ def nearest(file: str, count: int) -> list[str]:
         same, named = own[-1] == place[-1], len(set(names.findall(test)))
         return not (same and common), common < len(own), common < len(place) - 1, -common - named, not same, len(test)
 
+    def share(path: pathlib.Path) -> float:
+        test = path.read_text()
+        return -len(calls.findall(test)) / len(test)
+
     tests = sorted((ROOT / "tests").rglob("test_*.py"), key=distance)
+    tests[count - count // 3 :] = sorted(tests[count - count // 3 :], key=share)
     first, *others = [str(path.relative_to(ROOT)) for path in tests[:count]]
     return [first, *[file] * (">>>" in text), *others]
 

@@ -117,7 +117,7 @@ class LoadContact(Effect):
         points = np.stack([np.asarray(x) for x in place], axis=-1).reshape(-1, loads.count, len(place))
         wide = 2.0 * np.asarray(ball_radius(loads)).reshape(-1, 1, 1)
         apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
-        apart = np.where(np.eye(loads.count, dtype=bool), np.inf, apart)
+        apart = np.where(np.eye(loads.count), np.inf, apart)
         if np.min(apart) < MIN_DISTANCE:
             run, i, j = np.unravel_index(np.argmin(apart), apart.shape)
             size = float(np.broadcast_to(wide, (apart.shape[0], 1, 1))[run, 0, 0])
