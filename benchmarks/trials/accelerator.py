@@ -2,10 +2,11 @@
 
     python benchmarks/trials/accelerator.py [--quick] [--out FOLDER]
 
-The work is 1e6 runs with full equations (`ensemble`, 200 s each), 1e6 leading-order designs with gradient, 1e5 exact orbits,
-and 1e4 exact orbits with their multipliers. A process on two cores computes every hundredth run and every tenth orbit; its
-time is scaled up. The difference is the largest one between results of both, relative to the largest result. --quick computes
-a thousandth, to see that it runs. Where JAX finds no accelerator both columns are of the processor.
+The work is 1e6 runs with full equations (`ensemble`, 200 s each), a sweep of 65,536 runs with its store, 1e6 leading-order
+designs with gradient, 1e5 exact orbits, and 1e4 exact orbits with their multipliers. A process on two cores computes every
+hundredth run and every tenth orbit; its time is scaled up. The difference is the largest one between results of both, relative
+to the largest result. --quick computes a thousandth, to see that it runs. Where JAX finds no accelerator both columns are of
+the processor.
 """
 
 from __future__ import annotations
@@ -52,6 +53,18 @@ def runs(values: np.ndarray, _batch: int) -> Call:
     return lambda: jv.ensemble(make, speeds, 200.0, stepsize_controller=steps, estimate=False).load_speed
 
 
+def sweep(values: np.ndarray, _batch: int) -> Call:
+    """Return a call that computes a sweep of runs from rest, with its store."""
+    axes, measures = {"drive.speed": (3.0 + 3.0 * values).tolist()}, ["run.load_speed", "run.amplitude", "run.foundation_force"]
+
+    def call() -> Any:
+        with tempfile.TemporaryDirectory() as folder:
+            done = jv.sweep(published(), axes, measures, f"{folder}/study.zarr", until=200.0, steps=1400, chunk=65_536)
+            return [jnp.asarray(done.data[name.removeprefix("run.")].values) for name in measures]
+
+    return call
+
+
 def designs(values: np.ndarray, batch: int) -> Call:
     """Return a call that computes the rotor speed of a jam and its gradient by two stiffnesses."""
     scene = published()
@@ -79,6 +92,7 @@ def orbits(values: np.ndarray, batch: int, *, multipliers: bool = False) -> Call
 
 WORK: dict[str, tuple[Callable[..., Call], int, int, int, int]] = {
     "runs of 200 s": (runs, 1_000_000, 100, 0, 0),
+    "cases of a sweep of runs": (sweep, 65_536, 1, 0, 0),
     "leading-order designs with gradient": (designs, 1_000_000, 1, 1000, 250_000),
     "exact orbits": (orbits, 100_000, 10, 100, 100_000),
     "exact orbits with multipliers": (
