@@ -17,6 +17,12 @@ from jaxvib.identification.problem import Problem
 UNDETERMINED = 1.0
 """Relative standard error of a direction above which it counts as undetermined: a factor of e."""
 
+_UNSEEN = 1e3
+"""Standard error of the logarithm of a number above which the records say nothing about it, not even that it is small."""
+
+_SINGLE = 0.99
+"""Share of a number in a direction above which the direction is that of the number alone."""
+
 _MIN_SHARE = 0.05
 """Share of a number in an undetermined direction above which the number itself counts as undetermined."""
 
@@ -50,6 +56,7 @@ class Information(NamedTuple):
     - `covariance` (k, k) of the coordinates in the determined directions
     - `undetermined`: directions (k, u); `errors` (u,) of them
     - `determined` (k,): False for numbers that take part in an undetermined direction
+    - `vanished` (k,): True for positive numbers that are not distinguishable from 0, because their standard error is larger
     - `by_gain`: directions (k, g) that only the known errors of the sensors' gains determine, and their errors
     """
 
@@ -61,6 +68,7 @@ class Information(NamedTuple):
     undetermined: np.ndarray
     errors: np.ndarray
     determined: np.ndarray
+    vanished: np.ndarray
     by_gain: np.ndarray
     by_gain_errors: np.ndarray
 
@@ -82,16 +90,23 @@ def information_of(fitted: Fitted) -> Information:
     without_gains[gains, gains] = 0.0
 
     whole, loose = (eliminate(data + known, own) for known in (prior, without_gains))
-    found = covariance_of(whole)
+    errors, axes = _errors(whole)
+    single = np.abs(axes) > _SINGLE
+    error = np.sum(single * errors, axis=1)
+    # Unbalances are left out: the direction of one that runs to 0 is unknown, too.
+    vanished = logarithmic & (error > UNDETERMINED) & (error < _UNSEEN) & (np.arange(own.size) < number_count)
+    unit = np.where(vanished, 10.0 * error, 1.0)  # of a vanished number: ten times its standard error in place of its value
+    found = covariance_of(whole * np.outer(unit, unit))
     covariance, undetermined = found.covariance, found.undetermined
-    loose_errors, loose_axes = _errors(loose)
+    loose_errors, loose_axes = _errors(loose * np.outer(unit, unit))
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
     # Directions that nothing determines are left out of those that the gains determine.
     by_gain = by_gain - undetermined @ (undetermined.T @ by_gain)
     basis, sizes_of, _ = np.linalg.svd(by_gain, full_matrices=False)
     by_gain = basis[:, : int(np.sum(sizes_of > 0.5))]
     by_gain_errors = np.sqrt(np.einsum("ku,kl,lu->u", by_gain, covariance, by_gain))
-    return Information(names, values, scale, logarithmic, *found, by_gain, by_gain_errors)
+    found = found._replace(covariance=covariance * np.outer(unit, unit))
+    return Information(names, values, scale, logarithmic, *found, vanished, by_gain, by_gain_errors)
 
 
 class Covariance(NamedTuple):

@@ -31,6 +31,9 @@ _VALLEY_STEPS = 3
 _CONVERGED = 1e-2
 """Length of the next undamped step, in standard errors, below which the fit has converged."""
 
+_VANISHED = 10.0
+"""Standard error of the logarithm of a number above which it is not reduced further: the data cannot distinguish it from 0."""
+
 _MAX_PASSES = 8
 _STEADY_NOISE = 0.01
 """Relative change of the noise of a channel below which its filter is final."""
@@ -211,29 +214,41 @@ def minimize(problem: Problem, x: np.ndarray) -> tuple[_Trial, np.ndarray, np.nd
     def moved(trial: _Trial, step: np.ndarray) -> _Trial:
         return project(problem, trial.x + limited_step(problem, step)[: x.size])
 
-    best, (information, prior, _), converged = descend(project(problem, x), equations, moved, x.size)
+    best, (information, prior, _), converged = descend(project(problem, x), equations, moved, x.size, positive_places(problem))
     return best, information, prior, converged
 
 
+def positive_places(problem: Problem) -> np.ndarray:
+    """Return the places in x of positive numbers, whose logarithms are unknown."""
+    return np.flatnonzero(np.asarray(problem.unknowns.positive))
+
+
 def descend(
-    best: Any, equations: Callable[[Any], Equations], moved: Callable[[Any, np.ndarray], Any], damped_count: int
+    best: Any,
+    equations: Callable[[Any], Equations],
+    moved: Callable[[Any, np.ndarray], Any],
+    damped_count: int,
+    positive: np.ndarray,
 ) -> tuple[Any, Equations, bool]:
     """Return the minimum near a trial, its equations, and True if it was reached.
 
+    A number that runs to 0 stays at a value that the data do not distinguish from 0. With its logarithm as the unknown, the
+    expected reduction of the cost would remain the same at every smaller value, and the descent would never end.
+
     **Arguments**: the first trial `best`, with its `cost`; `equations` of a trial; `moved`: the trial after a step;
-    `damped_count`: number of the first unknowns, whose steps are damped.
+    `damped_count`: number of the first unknowns, whose steps are damped; places of the `positive` numbers.
     """
     damping, places = 1e-2, np.arange(damped_count)
     for _ in range(_MAX_ITERATIONS):
-        information, prior, gradient = found = equations(best)
-        matrix = information + prior
+        found = equations(best)
+        matrix, gradient = _without_vanished(found, positive)
         if not np.all(np.isfinite(matrix)):
             return best, found, False
         undamped = _undamped(matrix, gradient)
         if gradient @ undamped < _CONVERGED**2:
             return best, found, True
         if gradient @ undamped < _NEAR_REDUCTION * best.cost:
-            trial = _follow_valley(moved(best, undamped), equations, moved)
+            trial = _follow_valley(moved(best, undamped), equations, moved, positive)
             if trial.cost < best.cost:
                 best = trial
                 continue
@@ -250,6 +265,15 @@ def descend(
     return best, equations(best), False
 
 
+def _without_vanished(found: Equations, positive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrix and the gradient in which positive numbers that are not distinguishable from 0 are not reduced."""
+    information, prior, gradient = found
+    matrix, gradient = information + prior, gradient.copy()
+    still = positive[(gradient[positive] < 0.0) & (np.diagonal(matrix)[positive] < _VANISHED**-2)]
+    matrix[still], matrix[:, still], matrix[still, still], gradient[still] = 0.0, 0.0, 1.0, 0.0
+    return matrix, gradient
+
+
 def _undamped(matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     return solved(matrix + 1e-9 * np.diag(np.diagonal(matrix)), gradient)
 
@@ -260,12 +284,14 @@ def limited_step(problem: Problem, step: np.ndarray) -> np.ndarray:
     return step * min(1.0, _LONGEST_STEP / max(longest, 1e-300))
 
 
-def _follow_valley(trial: Any, equations: Callable[[Any], Equations], moved: Callable[[Any, np.ndarray], Any]) -> Any:
+def _follow_valley(
+    trial: Any, equations: Callable[[Any], Equations], moved: Callable[[Any, np.ndarray], Any], positive: np.ndarray
+) -> Any:
     """Return the values after some undamped steps. The cost may rise in between: this follows a curved valley of the cost,
     such as that of two dampings under hardly any noise, in a tenth of the steps of the damped method."""
     for _ in range(_VALLEY_STEPS):
-        information, prior, gradient = equations(trial)
-        step = _undamped(information + prior, gradient)
+        matrix, gradient = _without_vanished(equations(trial), positive)
+        step = _undamped(matrix, gradient)
         if not np.all(np.isfinite(step)) or gradient @ step < _CONVERGED**2:
             break
         trial = moved(trial, step)

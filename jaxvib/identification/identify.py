@@ -265,12 +265,22 @@ def _interpret(scene: Scene, fitted: Fitted) -> MachineFit:
     modes = propagate(
         fitted_to, known.names, known.covariance, known.undetermined, known.errors, lambda scene: np.concatenate(natural(scene))
     )
-    estimates = list(map(_estimate, known.values, known.scale, known.logarithmic, _spreads(known), known.determined))
+    logarithmic = known.logarithmic & ~known.vanished
+    estimates = list(map(_estimate, known.values, known.scale, logarithmic, _spreads(known), known.determined))
+    estimates = [
+        each._replace(low=max(each.low, 0.0)) if own else each for each, own in zip(estimates, known.vanished, strict=True)
+    ]
     ends = profile_intervals(fitted, known) if resembles(fitted) and not fitted.misfits else {}
     for name, (low, high) in ends.items():
         i = known.names.index(name)
         estimates[i] = _with_ends(estimates[i], known.scale[i], bool(known.logarithmic[i]), low, high)
-        notes.append(f"the interval of {name} follows from its profile likelihood, because the cost is not quadratic about it")
+        if not known.vanished[i]:
+            notes.append(
+                f"the interval of {name} follows from its profile likelihood, because the cost is not quadratic about it"
+            )
+    for i in np.flatnonzero(known.vanished & known.determined):
+        unit = find_number(scene, known.names[i], "unknown").unit
+        notes.append(f"{known.names[i]} is not distinguishable from 0; it is at most {estimates[i].high:.3g} {unit}".rstrip())
     return MachineFit(
         status=status,
         notes=(*problem.notes, *notes, *coverage_notes(fitted, *natural(fitted_to))),

@@ -39,7 +39,8 @@ class _Profile:
 
     **Attributes**: the `fitted` problem; `index` of the number in x, or of an exciter if `is_unbalance`; `center` and standard
     error `spread` of its coordinate (its entry of x, or the logarithm of the unbalance); `slopes` (p,): change of x with the
-    number; `floor`: the least cost.
+    number; `floor`: the least cost; `is_vanished`: True for a number whose distances count in standard errors of its value, not
+    of its logarithm.
     """
 
     fitted: Fitted
@@ -49,19 +50,26 @@ class _Profile:
     spread: float
     slopes: np.ndarray
     floor: float
+    is_vanished: bool
+
+    def shift(self, distance: float) -> float:
+        """Return the change of the coordinate at a `distance` in standard errors."""
+        return math.log1p(distance * self.spread) if self.is_vanished else distance * self.spread
 
     def rise(self, distance: float, is_exact: bool) -> float:
         """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted;
         otherwise only the linear ones are fitted, and the others follow the quadratic form."""
-        target = self.center + distance * self.spread
+        target = self.center + self.shift(distance)
         problem, own_cost = self._held(target)
         x = self.fitted.x + distance * self.spread * self.slopes
+        if self.is_vanished:
+            x[self.index] = target
         trial = minimize(problem, x)[0] if is_exact else project(problem, x)
         return trial.cost + own_cost - self.floor
 
     def _held(self, target: float) -> tuple[Problem, float]:
         """Return the problem with the number held at `target`, and the cost of its own known value there."""
-        problem, tight = self.fitted.problem, _TIGHT_ERROR * self.spread
+        problem, tight = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
         if self.is_unbalance:
             known, value = problem.unbalances[self.index], math.exp(target)
             unbalances = list(problem.unbalances)
@@ -96,7 +104,9 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     """Return the distances of the ends of the intervals from the fitted values, by the names of the numbers in which the cost
     is not quadratic. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
 
-    **Arguments**: `fitted`, and what is `known` about its numbers. Undetermined numbers are left out.
+    A number that is not distinguishable from 0 has no lower end. Undetermined numbers are left out.
+
+    **Arguments**: `fitted`, and what is `known` about its numbers.
     """
     problem, p, number_count = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
@@ -107,12 +117,17 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     for i, name in enumerate(known.names):
         if not known.determined[i]:
             continue
-        is_unbalance = i >= number_count
+        is_unbalance, is_vanished = i >= number_count, bool(known.vanished[i])
         place = p + i - number_count if is_unbalance else i
         index = free[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
-        slopes = covariance[:p, place] / covariance[place, place]
-        profile = _Profile(fitted, index, is_unbalance, center, math.sqrt(covariance[place, place]), slopes, floor)
+        slopes, variance = covariance[:p, place] / covariance[place, place], covariance[place, place]
+        if is_vanished:  # its information may be below the accuracy of the pseudoinverse
+            slopes, variance = np.zeros(p), known.covariance[i, i]
+        profile = _Profile(fitted, index, is_unbalance, center, math.sqrt(variance), slopes, floor, is_vanished)
+        if is_vanished:
+            found[name] = -math.inf, profile.shift(profile.end(1.0))
+            continue
         rises = [profile.rise(side * _COMPARED_DISTANCE, is_exact=False) for side in (-1.0, 1.0)]
         if max(abs(rise / _COMPARED_DISTANCE**2 - 1.0) for rise in rises) > _MAX_DIFFERENCE:
             found[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)

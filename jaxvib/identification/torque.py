@@ -36,6 +36,7 @@ from jaxvib.identification.fit import (
     fit_from,
     limited_step,
     linear_places,
+    positive_places,
     prior_equations,
     run_equations,
     unbalance_prior,
@@ -277,7 +278,8 @@ def _minimum(problem: Problem, runs: list[_Run], y: np.ndarray, free: np.ndarray
         whole[free] = step
         return _trial(problem, runs, trial.y + limited_step(problem, whole), free)
 
-    best, _, converged = descend(_trial(problem, runs, y, free), lambda trial: trial.equations, moved, free.size)
+    positive = np.flatnonzero(np.isin(free, positive_places(problem)))
+    best, _, converged = descend(_trial(problem, runs, y, free), lambda trial: trial.equations, moved, free.size, positive)
     return best, converged
 
 

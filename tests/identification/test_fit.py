@@ -47,6 +47,23 @@ def fitted():
     return jv.identify(start(1.1, 1.5), run_of(), unknown=NAMES)
 
 
+def test_vanishing_damping_has_an_upper_bound():
+    """The least cost lies at a negative damping. The cost rises by 1.96^2 to the bound."""
+    times, name = T[::8], "machine.damping[1]"
+    run = record(times, accelerations(times, [TRUTH | {name: 0.0}])[0], NOISE, np.random.default_rng(0))
+    fit = jv.identify(start(), run, unknown=NAMES)
+    found = fit.estimate(name)
+    assert fit.status_name == "found" and fit.undetermined == ()
+    assert found.low == 0.0 and 20.0 * found.value < found.high < 3.0
+    assert any(f"{name} is not distinguishable from 0; it is at most {found.high:.3g} N s/m" in note for note in fit.notes)
+
+    def cost(value):
+        held = jv.identify(start(), run, unknown=NAMES, known={name: value})
+        return np.nansum(((held.readings[0] - held.fitted[0]) / fit.noise[0]) ** 2)
+
+    assert cost(found.high) - cost(1e-6) == pytest.approx(1.96**2, rel=0.06)
+
+
 def test_fit_finds_the_numbers_from_wrong_first_values():
     fit = fitted()
     assert fit.status_name == "found" and fit.undetermined == ()
