@@ -50,7 +50,7 @@ class _Profile:
     spread: float
     slopes: np.ndarray
     floor: float
-    is_vanished: bool
+    is_vanished: bool = False
 
     def shift(self, distance: float) -> float:
         """Return the change of the coordinate at a `distance` in standard errors."""

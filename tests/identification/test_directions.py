@@ -130,11 +130,24 @@ def test_directions_that_only_the_gains_determine():
     assert unknown.by_gain.shape == (2, 0) and unknown.undetermined.shape == (2, 1)
 
 
+@pytest.mark.parametrize(("error", "vanished"), [(0.9, False), (20.0, True), (2e3, False)])
+def test_number_smaller_than_its_error_is_vanished(error, vanished):
+    """The stiffness is less than its error; the other number, of either sign, has an undetermined direction of its own."""
+    matrix = np.zeros((5, 5))
+    matrix[:2, :2] = np.diag([error**-2, 1e-4])
+    matrix[4, 4] = 1.0
+    found = information_of(fit_like(matrix, np.zeros((5, 5)), (Known(5.0, 1e-9),)))
+    assert found.vanished.tolist() == [vanished, False]
+    assert found.determined.tolist() == [error < 1e3, False]
+    if error < 1e3:
+        np.testing.assert_allclose(found.covariance, np.diag([error**2, 0.0]), atol=1e-12)
+
+
 def information(names, axes, errors):
     size, none = len(names), np.zeros(0)
     empty = np.zeros((size, 0))
     ones = np.ones(size)
-    return Information(names, ones, ones, ones, np.eye(size), axes, np.array(errors), ones, empty, none)
+    return Information(names, ones, ones, ones, np.eye(size), axes, np.array(errors), ones, ones < 0.0, empty, none)
 
 
 def test_common_factor_is_one_sentence():

@@ -114,7 +114,7 @@ def test_undetermined_combinations_return_to_the_first_values(monkeypatch):
     axes = np.array([[1.0], [1.0]]) / np.sqrt(2.0)
     starts = []
 
-    def fit_from(problem, given):
+    def fit_with_torques(problem, given):
         starts.append(given[0])
         return fitted_at(given[0][0], 0.5 if len(starts) < 2 else 0.0)
 
@@ -125,7 +125,7 @@ def test_undetermined_combinations_return_to_the_first_values(monkeypatch):
         values = np.array([0.0, 0.05 * np.exp(fitted.linear[0])])
         return SimpleNamespace(undetermined=axes, values=values)
 
-    monkeypatch.setattr(sys.modules[propagate.__module__], "fit_from", fit_from)
+    monkeypatch.setattr(sys.modules[propagate.__module__], "fit_with_torques", fit_with_torques)
     monkeypatch.setattr(sys.modules[propagate.__module__], "information_of", information_of)
     found = _near_first_values(scene_of(2), problem, fitted_at(0.3, 0.5))
     np.testing.assert_allclose(starts[0], [0.3 - 0.4])
@@ -134,7 +134,7 @@ def test_undetermined_combinations_return_to_the_first_values(monkeypatch):
     starts.clear()
     lost = fitted_at(0.3, 0.5, converged=False)
     assert _near_first_values(scene_of(2), problem, lost) is lost and starts == []
-    monkeypatch.setattr(sys.modules[propagate.__module__], "fit_from", lambda *_: lost)
+    monkeypatch.setattr(sys.modules[propagate.__module__], "fit_with_torques", lambda *_: lost)
     good = fitted_at(0.3, 0.5)
     assert _near_first_values(scene_of(2), problem, good) is good
     axes = np.zeros((2, 0))

@@ -112,7 +112,9 @@ def test_intervals_of_numbers_with_a_cubic_cost(monkeypatch, skew, names):
         unknowns=SimpleNamespace(numbers=(1, 2)), means=np.zeros(2), precisions=np.zeros(2), unbalances=(None,)
     )
     fitted = SimpleNamespace(problem=problem, x=MINIMUM[:2])
-    known = SimpleNamespace(names=("machine.damping", "machine.mass", "unbalance"), determined=[True, True, True])
+    known = SimpleNamespace(
+        names=("machine.damping", "machine.mass", "unbalance"), determined=[True, True, True], vanished=[False] * 3
+    )
     found = profile_intervals(fitted, known)
     assert list(found) == names
     for name in names:
@@ -131,7 +133,7 @@ def test_one_side_that_is_not_quadratic_suffices(monkeypatch, rises, is_quadrati
     monkeypatch.setattr(_Profile, "rise", lambda self, distance, is_exact: 9e9 if is_exact else costs[distance])
     monkeypatch.setattr(_Profile, "end", lambda self, side: 3.0 + side)
     problem = SimpleNamespace(unknowns=SimpleNamespace(numbers=(1, 2)), unbalances=())
-    known = SimpleNamespace(names=("mass", "damping"), determined=[False, True])
+    known = SimpleNamespace(names=("mass", "damping"), determined=[False, True], vanished=[False] * 2)
     found = profile_intervals(SimpleNamespace(problem=problem, x=np.zeros(2)), known)
     assert found == ({} if is_quadratic else {"damping": (-0.5 * 2.0, 0.5 * 4.0)})
 
