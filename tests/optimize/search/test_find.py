@@ -1,6 +1,8 @@
 """Search from starts to the best designs: ranking, continuation, choice from catalogues."""
 
+import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -171,6 +173,28 @@ def interrupts(what_begins):
             raise KeyboardInterrupt
 
     return tell, after
+
+
+@pytest.mark.parametrize(("tolerances", "polishing", "steps"), [(False, 8, 20), (False, 30, 30), (True, 8, 8)])
+def test_second_search_starts_from_the_best_of_the_first(tolerances, polishing, steps, monkeypatch):
+    asked, told = [], []
+    results = {"simple": ended([3.0, 1.0, 2.0], np.zeros(3))._replace(drawn=40, existing=30), "small": ended([0.5], [0.0])}
+
+    def search(problem, options, report):
+        asked.append((problem, options))
+        report("polishing", 0.5)
+        return results[problem]
+
+    problem = SimpleNamespace(simplified=lambda: "simple", space=SimpleNamespace(size=2))
+    for name, part in (("_find", search), ("_in_small_batches", lambda *_: "small"), ("_has_tolerances", lambda _: tolerances)):
+        monkeypatch.setattr(find_module, name, part)
+    found = find(problem, dataclasses.replace(OPTIONS, polishing=polishing), lambda what, share: told.append(share))
+    (one, first), (other, second) = asked
+    assert (one, other, told) == ("simple", "small", [0.25, 0.75]) and (first.iterations, first.polishing) == (25, polishing)
+    assert (second.iterations, second.polishing) == (25 if tolerances else 0, steps)
+    np.testing.assert_array_equal(second.begin[:3], _best_distinct(results["simple"]))
+    assert len(second.begin) == (16 if tolerances else 3) and np.all((second.begin >= 0.0) & (second.begin <= 1.0))
+    assert (found.drawn, found.existing, found.interrupted, len(found.point.z)) == (40, 30, False, 1)
 
 
 @pytest.mark.parametrize("stage", ["descending", "polishing"])
