@@ -41,8 +41,8 @@ _MAX_UNROLLED_SIZE = 8
 class PackedSystem(eqx.Module):
     """Conversion between a `State` and the state of the integrator: a vector of its entries, or for a batch a tuple of them.
 
-    With a vector, a few vector instructions add the stages of a step, and diffrax stores, compares and copies one array instead
-    of many. In a batch each entry is an array over the runs, which is contiguous in memory.
+    With a vector, a compiled step moves fewer values to and from memory, and diffrax stores, compares and copies one array
+    instead of many. In a batch each entry is an array over the runs, which is contiguous in memory.
 
     If angles are wrapped, the state of the integrator contains each angle within one turn and, separately, the number of whole
     turns. Long runs in single precision then keep their phase: single precision cannot resolve the position within a turn of

@@ -158,8 +158,8 @@ class UnrolledDopri8(AbstractDopri8):
 
     Compilation takes longer than for `LoopDopri8`, with derivatives several times as long.
 
-    A state of one vector takes less time than a tuple of scalars: the compiler then adds the stages with vector instructions.
-    For a batch, whose entries are arrays over many runs, a tuple of them takes less time.
+    A state of one vector takes less time than a tuple of scalars: the compiled step moves fewer values to and from memory. For
+    a batch, whose entries are arrays over many runs, a tuple of them takes less time.
 
     **Arguments**: `wrap`: function that is applied to the state after each step, for example to remove whole turns from angles.
 
