@@ -310,5 +310,5 @@ def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]
     row_count = len(mount.rows) if has_term(effects, RotorImbalance) else len(mount.levers)
     if loads is None:
         return RotorDynamics(*rotor, effects, mount.axes, row_count)
-    effects = tuple(effect.prepare(loads) for effect in effects)
+    effects = tuple(effect.prepare(loads, mount) for effect in effects)
     return ExciterDynamics(*rotor, effects, mount.axes, row_count, loads)

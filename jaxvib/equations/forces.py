@@ -136,6 +136,8 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         drive = exciter.turning_drive
         turn, rate = drive.rotor_angle(t, own.rotor), drive.rotor_speed(t, own.rotor)
         effects = (*scene.effects, *exciter.effects)
+        if exciter.loads is not None:
+            effects = tuple(effect.prepare(exciter.loads, mount) for effect in effects)
         parts += _load_energies(exciter.loads, mount, effects, v, own, rate)
         parts.append(rate * _imbalance_rate(exciter, mount, turn) @ v)
         weight = total_gravity(effects).get(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Literal, cast, get_args
 
@@ -296,4 +297,22 @@ def require_start(scene: Scene, state: State) -> None:
         for term in terms_of(exciter.effects, LoadInteraction):
             if term.validate_start is not None and exciter.loads is not None:
                 with within(scene.prefix_of(k)):
-                    when_known(lambda *u, term=term, loads=exciter.loads: term.validate_start(loads, u), *own.angle)
+                    _validate_places(scene, exciter, own.angle, term.validate_start)
+
+
+def _validate_places(
+    scene: Scene,
+    exciter: Exciter,
+    u: tuple[Array, ...],
+    validate: Callable[[Loads, tuple[Array, ...], np.ndarray | None], None],
+) -> None:
+    loads = exciter.loads
+    assert loads is not None
+    machine, place = scene.machine, exciter.place
+    if jnp.ndim(exciter.drive.speed):  # scenes of a batch: loads that share a track do so in all of them
+        machine, place = jax.tree.map(lambda leaf: leaf[0], (machine, place))
+    mount = machine.mount(place)
+    if mount.at_one_point:
+        when_known(lambda *u: validate(loads, u, None), *u)
+    else:
+        when_known(lambda at, *u: validate(loads, u, np.asarray(at)), mount.distances(loads.count), *u)

@@ -138,11 +138,6 @@ def contact():
     return (jv.LoadContact(stiffness=1e5),)
 
 
-def touching():
-    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, ball_radius=0.01)
-    return jv.Scene(jv.rotor(**ROTOR, stations=[0.2, 0.1, -0.1, -0.2]), balls_, jv.ConstantSpeed(1.0), contact())
-
-
 WRONG_ROTORS = {
     "stations of other loads": (lambda: rotor_scene(count=3), r"machine\.stations has 4 values; one for all loads or 3"),
     "slip": (lambda: motor(slip=1.2), r"drive\.breakdown_slip is 1\.2; it must be greater than 0 and less than 1"),
@@ -191,10 +186,6 @@ WRONG_ROTORS = {
     "unknown side": (lambda: jv.Stop(1.0, 0.0, side="left"), r"effects\.stop\.side is 'left'; allowed: above, below, both"),
     "reaction": (lambda: jv.DryFriction(0.1, 0.01, reaction="none"), r"is 'none'; allowed: exact, run_up, steady"),
     "pendulums in contact": (lambda: rotor_scene(effects=contact()), r"give balls or rollers their ball_radius"),
-    "contact of several tracks": (
-        lambda: touching(),
-        r"needs loads on one track, but the loads of this machine run at several stations",
-    ),
     "twice": (lambda: rotor_scene(effects=(jv.Gravity(), jv.Gravity())), r"contains gravity 2 times"),
 }
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted, require_one_of
-from jaxvib.machine.carrier import Machine
+from jaxvib.machine.carrier import Machine, Mount
 from jaxvib.machine.effects.terms import ContactFriction, Coordinates, GravityField, LoadPotential, RotorImbalance, Term
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.numbers import Part, read_numbers, unit
@@ -119,8 +119,9 @@ class Effect(Part):
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` if the effect cannot act on this `machine` or these `loads`."""
 
-    def prepare(self, loads: Loads) -> Effect:
-        """Return the effect with everything precomputed that depends on the parameters of the `loads` but not on time."""
+    def prepare(self, loads: Loads, mount: Mount) -> Effect:
+        """Return the effect with everything precomputed that depends on the parameters of the `loads` and on their `mount`, but
+        not on time."""
         return self
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.machine.carrier import Machine
+from jaxvib.machine.carrier import Machine, Mount
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import Coordinates, LoadInteraction, Term
 from jaxvib.machine.loads import CircularLoads, Loads, ball_radius
@@ -30,6 +31,7 @@ class LoadContact(Effect):
     - On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1 follows load j, and load 1
       follows the last one a turn later, so there are N pairs. The angles of a start must be in this order, within one turn;
       starts by name, such as "rest", place coincident loads side by side
+    - Only loads at one station of a rotor can touch. The attribute `tracks` contains the stations while a motion is computed
     - With several coordinates each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 times 2 r
 
     Two loads that collide on a track at rest separate at e times the speed at which they approached. The restitution e is
@@ -63,6 +65,7 @@ class LoadContact(Effect):
     restitution: Array | None = eqx.field(
         metadata=unit("", low=0.0, open_low=True, high=1.0, words="restitution of contacts between loads")
     )
+    tracks: Tracks | None
     kind: str = eqx.field(static=True)
 
     def __init__(self, stiffness: Number, damping: Number = 0.0, restitution: Number | None = None):
@@ -75,33 +78,34 @@ class LoadContact(Effect):
             if when_known(lambda damping: damping == 0.0, self.damping) is False:
                 problem = "excludes damping, which it determines; leave one of them out"
                 raise InputError("effects.load_contact.restitution", problem)
-        self.kind = "load_contact"
+        self.tracks, self.kind = None, "load_contact"
 
     def terms(self) -> tuple[Term, ...]:
         """Return the forces between the loads."""
         return (LoadInteraction(self.energy, self.resistance, self.validate_start),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
-        """**Raises** `InputError` for `loads` without a size, or at several stations of the `machine`."""
+        """**Raises** `InputError` for `loads` without a size, and for loads of unequal mass with a restitution."""
         ball_radius(loads, "effects.load_contact")
         if self.restitution is not None and jnp.ndim(loads.mass) > 0:
             raise InputError(
                 "effects.load_contact.restitution", "needs loads of equal mass; give the damping of the contacts in its place"
             )
-        if not machine.mounting().at_one_point:
-            raise InputError(
-                "effects.load_contact", "needs loads on one track, but the loads of this machine run at several stations"
-            )
 
-    def validate_start(self, loads: Loads, u: Coordinates) -> None:
+    def validate_start(self, loads: Loads, u: Coordinates, stations: np.ndarray | None = None) -> None:
         """**Raises** `InputError` if the `loads` cannot start at the coordinates `u`.
 
-        Loads on a circle must be in order within one turn. Other loads must not overlap.
+        Loads on a circle must be in order within one turn, those of each of the `stations` (count,) for themselves. Other loads
+        must not overlap.
         """
         if not loads.circular:
-            self._require_distances(loads, u)
+            self._require_distances(loads, u, stations)
             return
-        phi = np.asarray(u[0])
+        numbers = np.zeros(loads.count) if stations is None else stations
+        for station in np.unique(numbers):
+            self._require_order(np.asarray(u[0])[..., numbers == station])
+
+    def _require_order(self, phi: np.ndarray) -> None:
         wrong = ~np.all(np.diff(phi, axis=-1) > 0.0, axis=-1) | ~(phi[..., -1] - phi[..., 0] < 2.0 * np.pi)
         if np.any(wrong):
             which = np.round(phi[wrong][0], 4).tolist()
@@ -112,12 +116,13 @@ class LoadContact(Effect):
                 "start.angle", f"is {which} rad; {problem} (add 2 pi to angles that are one turn behind, or sort them)"
             )
 
-    def _require_distances(self, loads: Loads, u: tuple[Array, ...]) -> None:
+    def _require_distances(self, loads: Loads, u: tuple[Array, ...], stations: np.ndarray | None) -> None:
         place = loads.position(*u) if np.ndim(u[0]) == 1 else jax.vmap(lambda each, v: each.position(*v))(loads, u)
         points = np.stack([np.asarray(x) for x in place], axis=-1).reshape(-1, loads.count, len(place))
         wide = 2.0 * np.asarray(ball_radius(loads)).reshape(-1, 1, 1)
         apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
-        apart = np.where(np.eye(loads.count), np.inf, apart)
+        others = np.eye(loads.count, dtype=bool) | (False if stations is None else stations[:, None] != stations)
+        apart = np.where(others, np.inf, apart)
         if np.min(apart) < MIN_DISTANCE:
             run, i, j = np.unravel_index(np.argmin(apart), apart.shape)
             size = float(np.broadcast_to(wide, (apart.shape[0], 1, 1))[run, 0, 0])
@@ -128,17 +133,19 @@ class LoadContact(Effect):
         """Return sqrt(k / mu), the natural frequency of a contact, rad/s; typical: 300 to 5000."""
         return jnp.sqrt(self.stiffness / self._reduced_mass(loads))
 
-    def prepare(self, loads: Loads) -> LoadContact:
-        """Return the contact with the damping that gives its restitution."""
-        if self.restitution is None:
-            return self
+    def prepare(self, loads: Loads, mount: Mount) -> LoadContact:
+        """Return the contact with the damping that gives its restitution, and with the tracks of the loads."""
+        tracks = None if mount.at_one_point else Tracks.of(mount.distances(loads.count))
         return eqx.tree_at(
-            lambda c: (c.damping, c.restitution), self, (self._damping(loads), None), is_leaf=lambda leaf: leaf is None
+            lambda c: (c.damping, c.restitution, c.tracks),
+            self,
+            (self._damping(loads), None, tracks),
+            is_leaf=lambda leaf: leaf is None,
         )
 
     def energy(self, loads: Loads, u: Coordinates) -> Array:
         """Return k (2 r - s)^2 / 2, (count,) J, of the pairs of `loads` that overlap at the coordinates `u`."""
-        parts = [0.5 * self.stiffness * jnp.maximum(-gap, 0.0) ** 2 for gap in _clearances(loads, u)]
+        parts = [0.5 * self.stiffness * jnp.maximum(-gap, 0.0) ** 2 for gap in _clearances(loads, u, self.tracks)]
         if parts[-1].shape != (loads.count,):  # with an even count there are only half as many pairs of opposite loads
             parts[-1] = jnp.concatenate([parts[-1], jnp.zeros_like(parts[-1])])
         return sum(parts[1:], parts[0])
@@ -151,7 +158,7 @@ class LoadContact(Effect):
         damping = self._damping(loads)
 
         def gaps(*v: Array) -> tuple[Array, ...]:
-            return tuple(_clearances(loads, v))
+            return tuple(_clearances(loads, v, self.tracks))
 
         clearances, back = jax.vjp(gaps, *u)
         _, partings = jax.jvp(gaps, u, rate)
@@ -215,16 +222,46 @@ def _loss(ratio: Array) -> Array:
     return jnp.where(middle, series, jnp.where(near < 0.0, below, above))
 
 
-def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
+class Tracks(NamedTuple):
+    """Tracks of loads at several stations.
+
+    **Attributes** (count,): `stations`, m; `follower`: the number of the next load on the same track, and `turns`: 1 if it
+    follows a turn later.
+    """
+
+    stations: Array
+    follower: Array
+    turns: Array
+
+    @staticmethod
+    def of(stations: Array) -> Tracks:
+        """Return the tracks of loads at `stations`.
+
+        >>> import jax.numpy as jnp
+        >>> tracks = Tracks.of(jnp.asarray([0.2, -0.2, 0.2, 0.2]))
+        >>> tracks.follower.tolist(), tracks.turns.tolist()
+        ([2, 1, 3, 0], [0, 1, 0, 1])
+        """
+        n = stations.shape[0]
+        ahead = np.mod(np.arange(n)[None, :] - np.arange(n)[:, None] - 1, n) + 1
+        nearest = jnp.min(jnp.where(stations[:, None] == stations[None, :], ahead, n), axis=1)
+        after = jnp.arange(n) + nearest
+        return Tracks(stations, after % n, after // n)
+
+
+def _clearances(loads: Loads, u: tuple[Array, ...], tracks: Tracks | None) -> list[Array]:
     """Return the distances between surfaces, negative for an overlap.
 
     The k-th array contains the distances of each load to the k-th load after it; each pair occurs once. On a circle there is
-    only k = 1.
+    only k = 1, the next load on the same track.
     """
     own = ball_radius(loads)
     if isinstance(loads, CircularLoads):
         (phi,) = u
-        ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])
+        if tracks is None:
+            ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])
+        else:
+            ahead = phi[tracks.follower] + 2.0 * jnp.pi * tracks.turns
         return [2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own]
     n, place = loads.count, loads.position(*u)
     found = []
@@ -233,5 +270,8 @@ def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
         square = sum((jnp.concatenate([x[k:], x[:k]])[:pairs] - x[:pairs]) ** 2 for x in place)
         same = square == 0.0
         distance = jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, square)))
+        if tracks is not None:
+            is_same = jnp.roll(tracks.stations, -k)[:pairs] == tracks.stations[:pairs]
+            distance = jnp.where(is_same, distance, jnp.inf)
         found.append(distance - 2.0 * own)
     return found or [jnp.ones_like(u[0])]

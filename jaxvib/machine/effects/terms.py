@@ -13,6 +13,7 @@ from typing import ClassVar, NamedTuple, TypeAlias, final
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.machine.carrier import Machine
@@ -85,12 +86,13 @@ class LoadInteraction:
 
     - `energy` of the pairs, J, (count,)
     - `resistance`: generalised forces that dissipate energy of the relative motion, or None
-    - `validate_start`: function that raises `InputError` if loads cannot start at `u` (..., count), or None
+    - `validate_start`: function of the loads, `u` (..., count) and the stations (count,) of the loads, m, None for a
+      single track; it raises `InputError` if loads cannot start there. Or None
     """
 
     energy: Energy
     resistance: Resistance | None = None
-    validate_start: Callable[[Loads, Coordinates], None] | None = None
+    validate_start: Callable[[Loads, Coordinates, np.ndarray | None], None] | None = None
     is_smooth: ClassVar[bool] = False
 
     def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:

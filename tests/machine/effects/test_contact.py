@@ -7,7 +7,7 @@ import pytest
 from torus import OWN, RADIUS, balls
 
 import jaxvib as jv
-from jaxvib.machine.effects.contact import damping_ratio
+from jaxvib.machine.effects.contact import Tracks, _clearances, damping_ratio
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.study.capture.capture import steps_per_second
 
@@ -44,6 +44,39 @@ def test_balls_separate_with_the_coefficient_of_restitution(make, restitution):
     np.testing.assert_allclose(rates[-1, 1] - rates[-1, 0], 3.0 * restitution, rtol=0.02, atol=2e-3)
     np.testing.assert_allclose(np.sum(rates[-1]), 1.0, rtol=1e-9)  # and keep their common one
     assert 0.9 < least < 1.0
+
+
+HEAVY_ROTOR = dict(mass=1e12, transverse_inertia=1e12, polar_inertia=1e11, stiffness=(1.0, 1.0), damping=(0.0, 0.0))
+
+
+def test_only_loads_at_one_station_touch():
+    """Two planes of two balls each, against two machines with one plane each."""
+    angle, rate = np.array([0.0, 0.05, 0.09, 0.13]), np.array([1.0, 3.0, -2.0, 2.0])
+    zero = jnp.zeros(4)
+    machine = jv.rotor(**HEAVY_ROTOR, position=(0.2, -0.2), stations=[0.15, -0.15, 0.15, -0.15])
+    loads = jv.balls(count=4, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)
+    s = jv.Scene(machine, loads, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))
+    state = jv.State(zero, zero, (jnp.asarray(angle),), (jnp.asarray(rate),))
+    found = jv.vector_field(s)(0.0, state).azimuth_rate
+    for own in ([0, 2], [1, 3]):
+        alone = jv.State(zero[:2], zero[:2], (jnp.asarray(angle[own]),), (jnp.asarray(rate[own]),))
+        expected = jv.vector_field(plane(0.5))(0.0, alone).azimuth_rate
+        assert np.min(np.abs(expected)) > 10.0
+        np.testing.assert_allclose(found[np.array(own)], expected, rtol=1e-9)
+    pressed = [2.0 * 0.01 - 2.0 * 0.2 * np.sin(0.5 * (angle[j + 2] - angle[j])) for j in (0, 1)]
+    still = jv.State(zero, zero, (jnp.asarray(angle),), (zero,))
+    np.testing.assert_allclose(jv.energy(s, still, 0.0), 0.5e5 * np.sum(np.square(pressed)), rtol=1e-9)
+    assert jv.initial_state(s, angles=[0.0, 0.0, 1.0, 2.0]).azimuth.shape == (4,)
+    with pytest.raises(jv.InputError, match=r"start\.angle is \[2\.0, 1\.0\] rad; loads in contact cannot pass each other"):
+        jv.initial_state(s, angles=[0.0, 2.0, 1.0, 1.0])
+
+
+def test_balls_of_a_torus_at_other_stations_do_not_touch():
+    u = tuple(jnp.asarray(x) for x in ([0.0, 0.01, 0.05], [0.0, 0.0, 0.0]))
+    loads = balls(3)
+    gaps = [np.concatenate(_clearances(loads, u, tracks)) for tracks in (None, Tracks.of(jnp.asarray([0.1, -0.1, 0.1])))]
+    assert np.all(gaps[0] < 0.0)
+    assert np.isinf(gaps[1]).tolist() == [True, True, False] and gaps[1][2] == gaps[0][2]
 
 
 def test_three_balls_in_a_torus_meet_in_any_pair_and_do_not_pass():
