@@ -156,18 +156,22 @@ class Averaged(eqx.Module):
         circle, levers = self._circle(), self.levers
         input_column = jnp.sum(self.input_matrix * circle, axis=1)
         output_row = jnp.sum(self.port * jnp.conj(circle), axis=1)
-        accelerance = jnp.sum(output_row[:, None, :] * input_column[None, :, :], axis=-1)
 
         def unbalance_force(rate: Array) -> Array:
             return jnp.sum(levers * (self.unbalance * at * (state.rate**2 - 1j * rate))[None, :], axis=-1)
 
-        share = levers[:, None, :] * levers[None, :, :] * (self.unbalance**2 / (4.0 * self.inertia))[None, None, :]
-        alone = jnp.eye(levers.shape[0]) - _product(accelerance, jnp.sum(share, axis=-1))
-        mirrored = _product(accelerance, jnp.sum(share * (at**2)[None, None, :], axis=-1))
-        forward = _with_conjugate(alone, mirrored, times(output_row, unforced) + times(accelerance, unbalance_force(free)))
-        forward = jnp.sum(levers * forward[:, None], axis=0)
-        rate = free + mean_torque(self.unbalance, jnp.conj(at) * forward) / self.inertia
-        acceleration = unforced + jnp.sum(input_column * unbalance_force(rate)[:, None], axis=0)
+        if levers.shape[0] > unforced.shape[0]:
+            acceleration, forward = self._solve_in_coordinates(input_column, output_row, at, unforced, unbalance_force(free))
+            rate = free + mean_torque(self.unbalance, jnp.conj(at) * forward) / self.inertia
+        else:
+            accelerance = jnp.sum(output_row[:, None, :] * input_column[None, :, :], axis=-1)
+            share = levers[:, None, :] * levers[None, :, :] * (self.unbalance**2 / (4.0 * self.inertia))[None, None, :]
+            alone = jnp.eye(levers.shape[0]) - _product(accelerance, jnp.sum(share, axis=-1))
+            mirrored = _product(accelerance, jnp.sum(share * (at**2)[None, None, :], axis=-1))
+            right = times(output_row, unforced) + times(accelerance, unbalance_force(free))
+            forward = jnp.sum(levers * _with_conjugate(alone, mirrored, right)[:, None], axis=0)
+            rate = free + mean_torque(self.unbalance, jnp.conj(at) * forward) / self.inertia
+            acceleration = unforced + jnp.sum(input_column * unbalance_force(rate)[:, None], axis=0)
         turn = 1j * jnp.mean(state.rate)
         return Amplitudes(
             displacement=state.velocity - turn * state.displacement,
@@ -175,6 +179,21 @@ class Averaged(eqx.Module):
             rate=rate,
             phase=state.rate - turn.imag,
         )
+
+    def _solve_in_coordinates(
+        self, input_column: Array, output_row: Array, at: Array, unforced: Array, force: Array
+    ) -> tuple[Array, Array]:
+        """Return the acceleration A (nd,) and its forward circular part at each rotating mass (count,).
+
+        It is the solution of (1 - sum_j h_j u_j v_j^T) A + sum_j h_j e^{2 i psi_j} u_j conj(v_j)^T conj(A) = right side, with
+        u_j = M^-1 B_j^T e and v_j = e^H B_j. The cost is linear in the number of rotating masses.
+        """
+        u, v = (jnp.matmul(self.levers.T, each, precision="highest") for each in (input_column, output_row))
+        weighted = (self.unbalance**2 / (4.0 * self.inertia))[:, None] * u
+        alone = jnp.eye(unforced.shape[0]) - jnp.matmul(weighted.T, v, precision="highest")
+        mirrored = jnp.matmul((weighted * (at**2)[:, None]).T, jnp.conj(v), precision="highest")
+        acceleration = _with_conjugate(alone, mirrored, unforced + jnp.sum(input_column * force[:, None], axis=0))
+        return acceleration, times(v, acceleration)
 
     def rotor_speeds(self, t: Array, rate: Array) -> list[Array]:
         """Return the speed of each exciter's rotor in its direction, rad/s, from the rates (count,) of the rotating masses."""

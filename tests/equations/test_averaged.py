@@ -9,7 +9,7 @@ from gyroscopic_rotor import rotor
 from scenes import machines, published, scene
 
 import jaxvib as jv
-from jaxvib.equations.averaged import Amplitudes, _with_conjugate, amplitudes_of, averaged_field
+from jaxvib.equations.averaged import Amplitudes, _with_conjugate, amplitudes_of, averaged_field, averaged_model
 from jaxvib.equations.linear import linear_model, steady_displacement
 from jaxvib.steady.jams.folds import jam_rotor_speed
 
@@ -150,3 +150,30 @@ def test_ripple_of_a_point_mass_is_its_closed_form():
     for rate, swing in ((w, w * 0.05 / (8.0 * w**2 * 0.1)), (0.0, 0.0)):
         state = Amplitudes(velocity / (1j * w), velocity, jnp.full(2, rate), jnp.zeros(2))
         np.testing.assert_allclose(field.ripple(state), swing, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_motors_accelerate_by_torque_and_vibration(count):
+    """Up to three exciters the accelerations at their axes are the unknowns, beyond those of the body's three coordinates."""
+    springs = [jv.support(at=(x, -0.2), stiffness=(4e5, 7e5), damping=(2e3, 3e3)) for x in (-1.0, 1.1)]
+    body = jv.plane_body(mass=200.0, inertia=60.0, supports=springs)
+    motors = [jv.DCMotor(100.0 + k, stall_torque=300.0, inertia=0.5) for k in range(count)]
+    exciters = [
+        jv.Exciter(drive=motor, unbalance=1.5, at=(0.4 * k - 1.0, 0.1 * k), direction=(1, -1)[k % 2])
+        for k, motor in enumerate(motors)
+    ]
+    scene = jv.Scene(body, exciters=exciters)
+    rng = np.random.default_rng(0)
+    y, v = rng.normal(size=(2, 3, 2)) @ np.array([1e-2, 1e-2j])
+    w, psi = 60.0 + rng.normal(size=count), rng.normal(size=count)
+    change = averaged_model(linear_model(scene))(jnp.asarray(0.0), Amplitudes(*map(jnp.asarray, (y, v, w, psi))))
+    acceleration = np.asarray(change.velocity) + 1j * np.mean(w) * v
+    carrier, force = scene.machine.carrier(), 0.0
+    for k, (exciter, motor) in enumerate(zip(exciters, motors, strict=True)):
+        turning = np.array([1.0, -1j * exciter.direction]) @ np.asarray(scene.machine.mount(exciter.place).rows[0])
+        local = np.exp(-1j * psi[k]) * (turning.conj() @ acceleration)
+        expected = (motor.torque(w[k]) - 1.5 / 2.0 * local.imag) / 0.5
+        np.testing.assert_allclose(change.rate[k], expected, rtol=1e-12)
+        force = force + turning * 1.5 * np.exp(1j * psi[k]) * (w[k] ** 2 - 1j * np.asarray(change.rate)[k])
+    rest = carrier.mass @ acceleration + carrier.damping @ v + carrier.stiffness @ y - force
+    np.testing.assert_allclose(rest, 0.0, atol=1e-12 * np.max(np.abs(force)))
