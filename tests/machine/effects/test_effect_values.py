@@ -126,3 +126,10 @@ def test_length_of_no_speed_is_zero_with_its_slope():
     np.testing.assert_allclose(_length((x, y)), [0.0, 5.0, 1e-9], rtol=1e-14)
     slopes = jax.grad(lambda x: jnp.sum(_length((x, y))))(x)
     np.testing.assert_allclose(slopes, [0.0, 0.6, -1.0], rtol=1e-14)
+
+
+def test_slip_decays_with_its_closed_form_rate():
+    """kappa/(kappa - 1) = 7/2 of a ball."""
+    loads = jv.balls(count=3, mass=0.1, radius=0.3, drag=0.5, ball_radius=0.01)
+    rate = jv.Sliding(0.2, width=0.05).fastest_rate(loads, jnp.asarray(60.0))
+    np.testing.assert_allclose(rate, 3.5 * 0.2 * 0.3 * 60.0**2 / 0.05, rtol=1e-12)
