@@ -67,6 +67,8 @@ def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output
     ]
 
     def text() -> str:
+        if len(found.angle) == 1:
+            return found.summary()
         shares = [[f"{row['drag']:.5g}", *(f"{100.0 * row['shares'][kind]:.3g} %" for kind in kinds)] for row in rows]
         return "\n".join([table("final motion of the loads", ["drag, N s/m", *kinds], shares), found.summary()])
 

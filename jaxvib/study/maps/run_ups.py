@@ -25,6 +25,7 @@ from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.plan import StepChoice, Tolerance, enough_steps
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state, require_start
+from jaxvib.results.estimate import wilson
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
@@ -73,14 +74,21 @@ class RunUps(Result):
         return np.mean(self.kind == kind, axis=1)
 
     def summary(self) -> str:
-        """Return a line of text for each drag: shares of the regimes at the end, speeds of jams, and failed runs."""
-        lines = [f"of {len(self.angle)} starts at each drag"]
+        """Return a line of text for each drag: shares of the regimes at the end with intervals of 95 %, speeds of jams, and
+        failed runs. A single start is no share."""
+        n = len(self.angle)
+        single = "one start at each drag, which is no share: a small change of it may change the outcome; give more starts"
+        lines = [single if n == 1 else f"of {n} starts at each drag (in brackets: 95 % intervals)"]
         for k, drag in enumerate(self.drag):
             portions = []
             for kind in (kind for kind in (*REGIMES, _FAILED) if np.any(self.kind[k] == kind)):
                 speeds = self.omega[k][self.kind[k] == kind]
                 at = f" at {_span(speeds)}" if kind == "jammed" else ""
-                portions.append(f"{100.0 * np.mean(self.kind[k] == kind):.3g} % {kind}{at}")
+                if n == 1:
+                    portions.append(f"{kind}{at}")
+                    continue
+                low, high = (100.0 * float(end) for end in wilson(np.asarray(speeds.size), np.asarray(n)))
+                portions.append(f"{100.0 * speeds.size / n:.3g} % ({low:.3g} to {high:.3g} %) {kind}{at}")
             lines.append(f"drag {drag:.4g} N s/m: {', '.join(portions)}")
         return "\n".join(lines)
 
@@ -147,9 +155,9 @@ def run_ups(
     >>> found.kind.shape, found.fraction("jammed").tolist()
     ((2, 6), [0.0, 1.0])
     >>> print(found.summary())
-    of 6 starts at each drag
-    drag 0.05 N s/m: 100 % unsettled
-    drag 5 N s/m: 100 % jammed at 39... rpm
+    of 6 starts at each drag (in brackets: 95 % intervals)
+    drag 0.05 N s/m: 100 % (61 to 100 %) unsettled
+    drag 5 N s/m: 100 % (61 to 100 %) jammed at 39... rpm
 
     Source: Artyunin 2013, section V, with a single set of angles.
     """

@@ -26,9 +26,13 @@ def test_run_ups_name_each_lane():
     np.testing.assert_allclose(found.omega[1, 1], run.omega, rtol=1e-6)
     assert len(found.plot().axes) == 2
     lines = found.summary().splitlines()
-    assert lines[0] == "of 2 starts at each drag" and lines[1].startswith("drag 0.05 N s/m: ")
+    assert (
+        lines[0] == "of 2 starts at each drag (in brackets: 95 % intervals)"
+        and "% (" in lines[1]
+        and lines[1].startswith("drag 0.05 N s/m: ")
+    )
     for line, kinds in zip(lines[1:], found.kind, strict=True):
-        assert all(f"{50 * np.sum(kinds == kind)} % {kind}" in line for kind in kinds)
+        assert all(f"{50 * np.sum(kinds == kind)} % (" in line and f"%) {kind}" in line for kind in kinds)
     with pytest.raises(jv.InputError, match=r"angles has shape \(1, 3\)"):
         jv.run_ups(s, 5.0, angles=[[0.0, 0.1, 0.2]])
     for more, says in ((dict(drag=np.zeros(0)), "drag is an empty array"), (dict(starts=2, seed=-1), "seed is -1")):
@@ -49,7 +53,8 @@ def test_run_ups_that_fail_are_no_motion():
         found = jv.run_ups(s, 2.0, drag=[5.0, 1e12], max_steps=2**14)
     assert found.finished.tolist() == [[True], [False]]
     assert found.fraction("failed").tolist() == [0.0, 1.0] and found.kind[1, 0] == "failed"
-    assert found.summary().splitlines()[2] == "drag 1e+12 N s/m: 100 % failed"
+    assert found.summary().splitlines()[2] == "drag 1e+12 N s/m: failed"
+    assert "%" not in found.summary() and "one start at each drag, which is no share" in found.summary()
     assert len(found.plot().axes) == 2
     with pytest.raises(jv.InputError, match=r"kind is 'lost'; allowed: swinging, .*unsettled, failed"):
         found.fraction("lost")
