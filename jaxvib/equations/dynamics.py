@@ -165,7 +165,8 @@ class Dynamics(eqx.Module):
             each = _apart(self.groups, speeds)
             speed = each[0] if len(each) == 1 else sum(each[1:], each[0]) / len(each)
             flow = flow - speed * times(self.gyroscopic, state.velocity)
-        for term, support in zip(terms_of(self.exciters[0].effects, SupportForce), self.supports, strict=True):
+        effects = self.exciters[0].effects if self.supports else ()
+        for term, support in zip(terms_of(effects, SupportForce), self.supports, strict=True):
             x, v = times(support.rows, state.displacement), times(support.rows, state.velocity)
             flow = flow - times(support.input_matrix, term.force(x, v))
         return flow
