@@ -123,6 +123,7 @@ def phase_circles(
     weights: np.ndarray | None = None,
     imbalance: complex = 0.0,
     first: int = 1,
+    resultant: bool = True,
     ax: Onto = None,
 ) -> Drawn:
     """Draw angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
@@ -130,7 +131,8 @@ def phase_circles(
     A black arrow shows the mean of the unit vectors to the loads. Its length is 1 if all loads coincide, and 0 if they cancel.
     `weights` (count,), whose sum is 1, are those of the mean; default: equal ones. An orange arrow shows the `imbalance` of the
     rotor, relative to the unbalance of all loads at one angle. `first`: number of the first point; loads are numbered from 1,
-    exciters from 0. `ax` must contain one axes object for each circle.
+    exciters from 0. `resultant`: False for masses that turn in different directions, whose mean has no meaning. `ax` must
+    contain one axes object for each circle.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
@@ -165,12 +167,13 @@ def phase_circles(
                 )
         _loads_on_circle(axis, angles, first)
         mean = np.average(np.exp(1j * angles), weights=weights) if angles.size else 0.0
-        for value, color in ((mean, "black"), (imbalance, COLORS[1])):
+        for value, color in ((mean, "black"), (imbalance, COLORS[1])) if resultant else ():
             if abs(value) > 0.02:
                 arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": color, "shrinkA": 0.0, "shrinkB": 0.0}
                 axis.annotate("", (np.real(value), np.imag(value)), (0.0, 0.0), arrowprops=arrow)
         axis.plot([0.0], [0.0], "+", color="black", ms=7.0)
-        axis.set_title(f"{title}\n{_resultant_text(mean, imbalance)}", fontsize="medium")
+        text = f"\n{_resultant_text(mean, imbalance)}" if resultant else ""
+        axis.set_title(f"{title}{text}", fontsize="medium")
     return figure if ax is None else ax
 
 

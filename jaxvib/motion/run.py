@@ -21,6 +21,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import on_body, read_place
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import start_notes
 from jaxvib.motion.analysis.measure import AbstractMeasured, Measured, Trajectory
 from jaxvib.motion.analysis.points import PointMotion, fit_harmonic, motion_of_point, vibration_of
 from jaxvib.motion.analysis.regime import Regime, regime
@@ -160,7 +161,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         error = "error not estimated" if np.isnan(self.error) else error
         rotors = [w[-1] for w in self.window.rotor_speeds]
         rotor = "rotor" if len(rotors) == 1 else "rotors"
-        state = "settled" if bool(self.settled) else "not settled: run longer"
+        stuck = [] if np.max(np.abs(rotors)) > 1.0 else start_notes(self.scene)
+        state = "settled" if bool(self.settled) else f"not settled: {stuck[0] if stuck else 'run longer'}"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         state = "balanced" if bool(self.status == RunStatus.creeping) else state
         unstable, first = bool(self.status == RunStatus.would_separate), []

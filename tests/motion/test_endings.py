@@ -184,3 +184,12 @@ def test_one_number_that_is_not_finite_makes_a_state_that_is_not():
         for k, leaf in enumerate(jax.tree.leaves(state)):
             broken = eqx.tree_at(lambda y, k=k: jax.tree.leaves(y)[k], state, leaf.at[-1].set(bad))
             assert not bool(is_finite(broken))
+
+
+def test_a_motor_that_cannot_start_is_not_advised_to_run_longer():
+    motor = jv.DCMotor(100.0, stall_torque=3.0, inertia=0.5)
+    exciter = jv.Exciter(drive=motor, unbalance=0.4)
+    table = jv.Scene(jv.one_mass(mass=300.0, stiffness=6e4, damping=600.0), exciters=[exciter], effects=jv.Gravity())
+    said = jv.simulate(table, 3.0, save="window", estimate=False).summary()
+    assert "not settled: the motor cannot start: the weight of its unbalance needs 3.92 N m" in said
+    assert "run longer" not in said

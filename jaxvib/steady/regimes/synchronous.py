@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, overload
+from typing import Any, TypedDict, overload
 
 import equinox as eqx
 import jax
@@ -166,7 +166,7 @@ class SynchronousRegime(PathsOfPoints, AbstractSynchronousRegime):
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
-        return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], first=_first_number(self.scene), ax=ax)
+        return phase_circles([(speed_text(self.speed, 6), np.asarray(self.phases))], **_circle_options(self.scene), ax=ax)
 
 
 @cached
@@ -177,6 +177,15 @@ def _vibration_of(regime: SynchronousRegime) -> Vibration:
     return Vibration(
         speed, regime.displacement, regime.amplitude, regime.foundation_force, exciter, regime.power / rotors, regime.power
     )
+
+
+class _CircleOptions(TypedDict):
+    first: int
+    resultant: bool
+
+
+_MAX_CIRCLES = 8
+"""Maximum number of regimes in a figure."""
 
 
 class SynchronousRegimes(AbstractSynchronousRegime):
@@ -208,23 +217,25 @@ class SynchronousRegimes(AbstractSynchronousRegime):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the phases of the masses of each regime on a circle.
+        """Plot the phases of the masses of each regime on a circle: the stable ones first, and at most 8 without `ax`.
 
         **Returns** a matplotlib figure, or the given `ax`, which must contain one axes object for each regime.
         """
         from jaxvib.draw.results import phase_circles  # slow import
 
+        order = np.argsort(~np.asarray(self.stable), kind="stable")[: None if ax is not None else _MAX_CIRCLES]
         sets = [
-            (f"{speed_text(w, 6)}\n{'stable' if s else 'unstable'}", np.asarray(a))
-            for w, s, a in zip(self.speed, self.stable, self.phases, strict=True)
+            (f"{speed_text(self.speed[k], 6)}\n{'stable' if self.stable[k] else 'unstable'}", np.asarray(self.phases[k]))
+            for k in order
         ]
-        return phase_circles(sets, first=_first_number(self.scene), ax=ax)
+        return phase_circles(sets, **_circle_options(self.scene), ax=ax)
 
 
-def _first_number(scene: Scene) -> int:
-    """Return the number of the first rotating mass in figures: 1 if there are loads; unbalances have the numbers of their
-    exciters, from 0."""
-    return int(any(exciter.loads is not None for exciter in scene.exciters))
+def _circle_options(scene: Scene) -> _CircleOptions:
+    """Return options of `phase_circles`: the number of the first mass, 1 if there are loads and otherwise that of exciter 0,
+    and whether the masses, which must turn in one direction, have a resultant."""
+    first = int(any(exciter.loads is not None for exciter in scene.exciters))
+    return {"first": first, "resultant": len({exciter.direction for exciter in scene.exciters}) == 1}
 
 
 @validated

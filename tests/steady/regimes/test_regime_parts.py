@@ -486,14 +486,17 @@ def test_summary_and_plot_of_regimes(two):
     for index in (3, -1):
         with pytest.raises(jv.InputError, match=rf"^index is {index}; there are 3 regimes, counted from 0"):
             several.select(index)
-    figure = several.plot()
-    titles = [axis.get_title().rpartition("\n")[0] for axis in figure.axes[:3]]
-    assert titles == ["300 rpm\nstable", "290.451 rpm\nstable", "280.901 rpm\nstable"]
+    assert [each.get_title()[:11] for each in several.plot().axes[:3]] == ["300 rpm\nsta", "290.451 rpm", "280.901 rpm"]
     (axis,) = regime.plot().axes
-    assert axis.get_title().startswith("300 rpm\nresultant") and {"0", "1"} <= {text.get_text() for text in axis.texts}
+    assert axis.get_title() == "300 rpm" and {"0", "1"} <= {text.get_text() for text in axis.texts}
+    mixed = eqx.tree_at(lambda r: r.stable, as_list(regime, 12), jnp.arange(12) == 11)
+    assert [axis.get_title().rpartition("\n")[2] for axis in mixed.plot().axes] == ["stable", *7 * ["unstable"]]
+    same = [jv.Exciter(drive=each.drive, unbalance=each.unbalance, at=each.at) for each in TWO.exciters]
+    together = eqx.tree_at(lambda r: r.scene, regime, jv.Scene(TWO.machine, exciters=same))
+    assert together.plot().axes[0].get_title().startswith("300 rpm\nresultant")
     plt.close("all")
     loads = jv.Scene(body(), jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(80.0))
-    assert (synchronous._first_number(loads), synchronous._first_number(TWO)) == (1, 0)
+    assert [synchronous._circle_options(each)["first"] for each in (loads, TWO)] == [1, 0]
 
 
 def motions():
