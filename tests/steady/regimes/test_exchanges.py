@@ -26,3 +26,13 @@ def test_shifts_follow_couplings_that_some_speeds_lack():
     influence[1, 1:, 0] = (0.3 + 0.1j) * np.array([1.0, np.exp(0.7j)])
     found = {tuple(map(int, each.order)): each.shift for each in exchanges_of(influence, np.full((3, 2), 0.4))}
     np.testing.assert_allclose(np.exp(1j * (found[0, 2, 1] - found[0, 2, 1][0])), np.exp([0.0, 0.7j, -0.7j]), atol=1e-12)
+
+
+def test_each_speed_has_its_own_size_of_influences():
+    """Masses that are alike at one speed and differ at another one, where all influences are small, are not exchanged."""
+    influence = np.full((2, 2, 2), 0.1 + 0.02j) + np.eye(2)
+    influence[0] = 1e-9 * (influence[0] + np.diag([0.0, 0.5]))
+    equal = np.full((2, 2), 0.4)
+    assert [tuple(map(int, each.order)) for each in exchanges_of(influence, equal)] == [(0, 1)]
+    influence[0, 1, 1] = influence[0, 0, 0]
+    assert len(exchanges_of(influence, equal)) == 2
