@@ -17,7 +17,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.angle import RotorAngle, rotor_angles
 from jaxvib.identification.records.agreement import ROTOR_KINDS
-from jaxvib.identification.records.decimation import MIN_LONG, decimated
+from jaxvib.identification.records.decimation import MIN_SAMPLES, decimated
 from jaxvib.identification.response import BLOCK, STRETCH, Samples, Unknowns, rows_of_channel, state_count
 from jaxvib.identification.run import MeasuredRun
 from jaxvib.machine.effects.base import has_term
@@ -227,7 +227,7 @@ def _with_own_rate(scene: Scene, run: MeasuredRun) -> MeasuredRun:
 
     The natural frequencies have a margin, because they are those of the first values.
     """
-    if max(time.size for time in run.times.values()) < MIN_LONG:
+    if max(time.size for time in run.times.values()) < MIN_SAMPLES:
         return run
     measured = run.rotor_speed()
     if measured is not None:

@@ -142,7 +142,7 @@ _MARKS = {
 def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> InputError:
     """Return the error for an unknown `name` in a file of a `kind`.
 
-    The error suggests a similar name or, if the names belong to another kind of file, names that kind.
+    The error suggests a similar name or, if the tables are those of another kind of file, states that kind.
 
     >>> str(misplaced_name("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
     'machine is not part of a design file: this is a scene file'
@@ -219,7 +219,9 @@ def scene_from_toml(text: str) -> Scene:
     **Arguments**: `text` in TOML
 
     - the tables `[machine]`, `[loads]` and `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit
-    - the table `[effects]` names only the effects of the scene, each as `gravity = true` or as a table of its arguments
+    - for several exciters, a table `[[exciters]]` for each, with its `[exciters.loads]` and `[exciters.drive]`, in place of
+      `[loads]` and `[drive]`
+    - the table `[effects]` contains the effects of the scene, each as `gravity = true` or as a table of its arguments
 
     **Returns** `Scene`.
 
@@ -450,8 +452,8 @@ def _plain(value: np.ndarray | float, *, unwrap: bool) -> float | list:
 class Templates(Mapping[str, str]):
     """Commented example files by name; each is read when it is used.
 
-    **Arguments**: the `folder` of the files; for each name the names of the `parts` of its text, without ".toml"; rotor
-    `speeds` that replace 1500 rpm.
+    **Arguments**: the `folder` of the files; `parts`: for each name the files, without ".toml", whose texts are joined;
+    `speeds`: rotor speeds of examples that do not have the default, 1500 rpm.
     """
 
     def __init__(self, folder: Path, parts: Mapping[str, tuple[str, ...]], **speeds: str) -> None:
@@ -475,7 +477,7 @@ _ROTORS = {name: (name, "rotors_end") for name in ("planar_rotor", "rotor")}
 TEMPLATES = Templates(
     _FOLDER, {**_PLATFORMS, **_ROTORS, "ball_balancer": ("ball_balancer",), "torus": ("torus",)}, one_mass="600 rpm"
 )
-"""Scene files with comments for every kind of platforms and rotors, and for a rotor with balls in a torus."""
+"""Scene files with comments for every kind of platforms and rotors, a ball balancer, and a rotor with balls in a torus."""
 
 SCREENS = Templates(_FOLDER, {name: (name,) for name in ("linear_screen", "circular_screen", "feeder")})
 """Scene files of a linear screen, a circular screen and a feeder, with the numbers of a data sheet."""

@@ -60,7 +60,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     Between two samples the motion is the polynomial p of degree 7 through the values and slopes of four samples. The two
     samples are the middle ones of the four; at the ends the outermost four samples are used. The error is
 
-        |x - p| <= 0.32 / 8! max |d^8 x/ds^8|        (at the ends 0.88 / 8!)
+        |x - p| <= 0.32 / 8! max |d^8 x/ds^8|        (at the ends 1 / 8!)
 
     with s the time in steps: 4e-9 of the amplitude for 16 samples a period, and 256 times less for twice as many.
 
@@ -72,7 +72,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
     share, inner = _extrema_between(x, v)
 
-    def greatest(sign: Array) -> tuple[Array, Array, Array]:
+    def maxima(sign: Array) -> tuple[Array, Array, Array]:
         """Maxima of `sign` times the motion over the first half of the samples, the second half and the step between them.
 
         Of equal maxima the first is returned.
@@ -96,7 +96,7 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
         return value, begin, place
 
     signs = jnp.asarray([-1.0, 1.0], x.dtype)
-    value, k, place = jax.vmap(greatest)(signs)
+    value, k, place = jax.vmap(maxima)(signs)
     best = jnp.argmax(value, axis=1)[:, None]
     value, k, place = (
         jnp.concatenate([row[:, :2], jnp.take_along_axis(row, best, 1)], axis=1) for row in (value * signs[:, None], k, place)
@@ -139,6 +139,7 @@ def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
     polynomial = _polynomial(*([y[k : n - 1 + k] for k in range(NODES)] for y in padded))
     slope = _derivative(polynomial)
     curvature = _derivative(slope)
+    # Newton's method starts at the extremum of the cubic polynomial through the two samples of the step and their slopes.
     turns = begin * end < 0.0
     bend = 3.0 * rise - 2.0 * begin - end
     root = jnp.sqrt(jnp.where(turns, jnp.abs(bend**2 - 3.0 * (begin + end - 2.0 * rise) * begin), 1.0))

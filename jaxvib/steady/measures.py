@@ -78,7 +78,7 @@ def vibration_zone(
     """Return the zone A, B, C or D of ISO 20816-3 of a vibration.
 
     A: new machines; B: allowed for long operation; C: allowed for a limited time; D: causes damage. The standard is about
-    parts that shall not vibrate, such as motors, frames and foundations. Platforms of a vibration machine are always in zone D.
+    parts that shall not vibrate, such as motors, frames and foundations. Decks, which shall vibrate, are in zone D.
 
     **Arguments**
 
@@ -110,7 +110,7 @@ def vibration_zone(
 class Vibration(NamedTuple):
     """Vibration of a machine at one speed of its exciters, q = Re(displacement exp(i w t)).
 
-    Returned by `Run.vibration`, and by the same method of synchronous regimes and responses.
+    Returned by `Run.vibration`, and by the same method of envelopes, synchronous regimes and responses.
 
     **Attributes** (nd coordinates)
 
@@ -184,7 +184,7 @@ class VibrationMeasures(eqx.Module):
     def summary(self) -> str:
         """Return the measures as text, one line for each coordinate, each support, the isolation, each shaft and each point.
 
-        The zone of ISO 20816-3 is not shown for a body in a plane, because decks of screens are always in zone D.
+        The zone of ISO 20816-3 is not shown for a body in a plane: it is usually a deck, whose zone is D.
         """
         of, zones = ("", True) if self.point is None else (" of the centre of mass", False)
         lines = [

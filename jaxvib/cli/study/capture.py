@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 @click.option(
     "--turns", type=click.IntRange(min=1), default=2000, show_default=True, help="Duration of each run, in turns of the rotor."
 )
-@click.option("--resolution", type=float, help="Resolution of the threshold.")
+@click.option("--resolution", type=float, help="Resolution of the threshold, relative to the rotor [spacing of the speeds].")
 @click.option(
     "--rotation",
     type=click.Choice(["rolling", "none"]),

@@ -105,8 +105,8 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
     """Return half the sum of the logarithms of the expected variances of the numbers, and its gradient by the speeds.
 
     F is the Fisher information of the run (the matrix of its normal equations). L, the projection onto the numbers that are not
-    eliminated, is kept fixed, so that a change dF changes L^T F L by L^T dF L. The gradient is therefore one derivative of F in
-    reverse mode, with the derivatives of the objective with respect to the entries of F.
+    eliminated, is kept fixed, so that a change dF changes L^T F L by L^T dF L. The gradient is therefore one vector-Jacobian
+    product of F: the vector contains the derivatives of the objective with respect to the entries of F.
     """
     fitted, k, p = expected.fitted, len(fit.names), expected.fitted.x.size
     problem, place = fitted.problem, linear_places(fitted.problem)[0]

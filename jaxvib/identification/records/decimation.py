@@ -1,4 +1,4 @@
-"""Lower sampling rate of long records: a low-pass filter, of which every n-th reading is kept.
+"""Lower sampling rate of long records: every n-th reading after a low-pass filter.
 
 Above the frequencies of the machine, a record contains only noise and other vibrations. The filter removes this part of
 records that are sampled much faster than the machine moves. It is symmetric in time. Its gain is 1 up to 0.3 times the new
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SAMPLES_PER_PERIOD = 10.0
 """Smallest number of samples per period of the highest frequency."""
 
-MIN_LONG = 2**14
+MIN_SAMPLES = 2**14
 """Smallest number of samples of a record that is filtered."""
 
 _MIN_FACTOR, _MIN_LEFT = 4, 1024
@@ -33,9 +33,9 @@ _HALF_LENGTH, _KAISER = 8, 10.06
 """Half of the length of the filter, in new steps, and the parameter of its Kaiser window: 100 dB."""
 
 _PASSES, _OUTLIER_DISTANCE, _RIPPLE = 4, 6.0, 1e-3
-"""Largest number of filter passes for a record with outliers or missing readings. Smallest distance of an outlier from the
-filtered signal, in standard deviations of this distance and relative to the standard deviation of the signal. The second one is
-above the error of the filter."""
+"""Largest number of filter passes for a record with outliers or missing readings. The distance of an outlier from the filtered
+signal is at least 6 standard deviations of the distances of all readings, and at least 1e-3 of the standard deviation of the
+signal, which is above the error of the filter."""
 
 _NEIGHBORS = 2
 """Number of readings on each side of an outlier with which it is compared."""
@@ -50,13 +50,13 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
     """Return a run with a lower sampling rate, and a note about both rates, if the run is long and its rate is much higher than
     the `highest` frequency (rad/s) of the machine and its rotors; otherwise return the same run.
 
-    Runs with clipped readings, which are bounds, and with channels at different times are not changed.
+    A run with clipped readings, which are bounds, or with channels at different times is not changed.
     """
     channels = run.of_kind(*_KINDS)
     first = run.times[channels[0].name] if channels else np.zeros(0)
     rate = (first.size - 1) / max(first[-1] - first[0], 1e-300) if first.size > 1 else 0.0
     factor = min(math.floor(rate * 2.0 * np.pi / (SAMPLES_PER_PERIOD * highest)), first.size // _MIN_LEFT)
-    if factor < _MIN_FACTOR or first.size < MIN_LONG:
+    if factor < _MIN_FACTOR or first.size < MIN_SAMPLES:
         return run
     for channel in channels:
         time = run.times[channel.name]
@@ -85,7 +85,9 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
 
 
 def filtered(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
-    """Return every `factor`-th filtered reading without the ends, and the number of outliers; NaN near longer gaps.
+    """Return every `factor`-th filtered reading without the ends, and the number of outliers.
+
+    Results near gaps of more than `factor` / 2 readings are NaN.
 
     >>> t = 1e-3 * np.arange(40000)
     >>> value = np.sin(20.0 * t) + 0.1 * np.sin(3000.0 * t)

@@ -67,7 +67,8 @@ class Drive(Part):
     def torque_and_inertia(self, t: Array, speed: Array, states: tuple[Array, ...] = ()) -> tuple[Array, Array] | None:
         """Return the torque T (N m) at time `t` (s) and the rotor's `speed` (rad/s), and the rotor's inertia J (kg m^2).
 
-        None if no torque changes the speed. `states` of the motor, see `Motor.state_units`; without them the steady torque.
+        `states` are those of the motor, see `state_units`; without them T is the steady torque. Return None if no torque
+        changes the speed.
         """
 
     def state_units(self) -> tuple[Array, ...]:

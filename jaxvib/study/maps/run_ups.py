@@ -128,7 +128,7 @@ def run_ups(
 
     **Arguments**
 
-    - `scene`, with a drive that starts from rest for a run-up
+    - `scene`; a run-up needs a drive that starts from rest
     - `until`: end time, s or text; the regime is that of the last turns of the run (see `simulate`); typical: 5 to 20
     - `drag`: values of the drag b_W of all loads, N s/m; default: the value of the scene; typical: 5 to 20 values from 0.05 to
       5
@@ -188,8 +188,8 @@ def run_ups(
         return _run_batch(scene, end, drags, angles, stepsize_controller, max_steps)
 
     cases = np.repeat(drags, len(sets)), np.tile(np.asarray(sets, drags.dtype), (len(drags), 1))
-    named, omega, finished = in_chunks(size, run_batch, *cases)
-    (code,) = jax.tree.leaves(named.name)
+    regime, omega, finished = in_chunks(size, run_batch, *cases)
+    (code,) = jax.tree.leaves(regime.name)
     kind = np.where(finished, np.asarray(REGIMES)[code], _FAILED)
 
     def folded(leaf: np.ndarray) -> np.ndarray:
@@ -198,7 +198,7 @@ def run_ups(
     return RunUps(
         drag=np.asarray(drags),
         angle=sets,
-        regime=jax.tree.map(lambda leaf: jnp.asarray(folded(leaf)), named),
+        regime=jax.tree.map(lambda leaf: jnp.asarray(folded(leaf)), regime),
         kind=kind.reshape(shape),
         omega=folded(omega),
         finished=folded(finished),
