@@ -55,7 +55,8 @@ def runs(values: np.ndarray, _batch: int) -> Call:
 
 def sweep(values: np.ndarray, _batch: int) -> Call:
     """Return a call that computes a sweep of runs from rest, with its store."""
-    axes, measures = {"drive.speed": (3.0 + 3.0 * values).tolist()}, ["run.load_speed", "run.amplitude", "run.foundation_force"]
+    axes: Any = {"drive.speed": {"from": 3.0, "to": 6.0, "count": len(values)}}
+    measures = ["run.load_speed", "run.amplitude", "run.foundation_force"]
 
     def call() -> Any:
         with tempfile.TemporaryDirectory() as folder:
