@@ -297,7 +297,8 @@ def rules() -> dict[Primitive, Rule]:
         (lambda x: jnp.array(x, copy=True), (v,), lambda x, **_: x),
     ]
     one = (lax.abs, lax.sign, lax.sqrt, lax.rsqrt, lax.cbrt, lax.exp, lax.exp2, lax.expm1, lax.log, lax.log1p, lax.logistic)
-    one += (lax.tan, lax.asin, lax.acos, lax.atan, lax.sinh, lax.cosh, lax.tanh, lax.erf, lax.floor, lax.ceil, lax.round)
+    one += (lax.tan, lax.asin, lax.acos, lax.atan, lax.sinh, lax.cosh, lax.tanh, lax.asinh, lax.acosh, lax.atanh)
+    one += (lax.erf, lax.floor, lax.ceil, lax.round)
     two = (lax.max, lax.min, lax.atan2, lax.pow, lax.rem, lax.lt, lax.le, lax.gt, lax.ge, lax.eq, lax.ne)
     direct = [(f, (x,)) for f in (*one, lax.is_finite)] + [(f, (x, x)) for f in two]
     direct += [(f, (yes, yes)) for f in (lax.bitwise_and, lax.bitwise_or)]
