@@ -32,7 +32,8 @@ WATCH = """
 window.seen = new WeakSet(); window.pressed = 0; window.changed = 0;
 function watch(root) {
   if (seen.has(root)) return; seen.add(root);
-  const observer = new MutationObserver(changes => { changed = performance.now();
+  const observer = new MutationObserver(changes => {
+    if (changes.some(change => change.target.nodeName !== 'LINK')) changed = performance.now();  // LINK: icon of the tab
     for (const change of changes) for (const node of change.addedNodes) search(node); });
   observer.observe(root, {subtree: true, childList: true, attributes: true, characterData: true});
   search(root);

@@ -50,7 +50,7 @@ def _(controls, pictures, scene, scene_at):
 @app.cell
 def _(machine, mode, pictures, scene):
     # All pictures are computed before any is sent, because a browser that draws one would slow down the next computation.
-    chart = pictures.figure(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.drive.speed)), machine)
+    chart = pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.drive.speed)), machine)
     numbers = pictures.text(lambda: pictures.readings(machine.value), machine)
     film = pictures.image(lambda: pictures.machine(machine.value, mode.value), machine)
     return chart, film, numbers
@@ -58,7 +58,7 @@ def _(machine, mode, pictures, scene):
 
 @app.cell
 def _(chart, mo):
-    mo.Html(chart) if isinstance(chart, str) else mo.ui.plotly(chart, config={"displaylogo": False})
+    mo.Html(chart)
     return
 
 

@@ -8,7 +8,7 @@ import gc
 import html
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -21,11 +21,6 @@ from jaxvib.machine.scene import Scene
 from jaxvib.steady.branches import branches
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
-
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
-
-_Made = TypeVar("_Made")
 
 ABOUT = """The sliders of springs, dampers, masses and drags of loads range from a tenth to ten times the value in the file. The
 arrow keys move a slider by one step. Each number of loads needs its own compiled program. The programs for the seven numbers
@@ -68,17 +63,12 @@ def image(draw: Callable[[], str], scene: SceneOrProblem) -> str:
     return _shown(made, scene)
 
 
-def figure(draw: Callable[[], Figure], scene: SceneOrProblem) -> Figure | str:
-    """Return a plotly figure, or the message of the error as HTML."""
-    return _shown(draw, scene)
-
-
 def text(read: Callable[[], str], scene: SceneOrProblem) -> str:
     """Return preformatted text as HTML, or the message of the error."""
     return _shown(lambda: f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>', scene)
 
 
-def _shown(make: Callable[[], _Made], scene: SceneOrProblem) -> _Made | str:
+def _shown(make: Callable[[], str], scene: SceneOrProblem) -> str:
     problem = scene.problem
     if not problem:
         try:
@@ -124,7 +114,7 @@ def prepare_counts(scene: Scene) -> None:
 def _draw_all(scene: Scene) -> None:
     most = 4.0 / 3.0 * float(scene.drive.speed)
     given = SceneOrProblem(scene, "")
-    figure(lambda: diagram(scene, most), given)
+    image(lambda: diagram(scene, most), given)
     text(lambda: readings(scene), given)
     image(lambda: machine(scene, next(iter(modes_of(scene)), None)), given)
 
@@ -150,26 +140,27 @@ def heading(scene: Scene) -> str:
     )
 
 
-def diagram(scene: Scene, most: float) -> Figure:
+def diagram(scene: Scene, most: float) -> str:
     """Draw the branch diagram with the force chart for a machine that moves up and down, or the Campbell diagram of a rotor.
 
     **Arguments**: `most`, the highest rotor speed in the diagram, rad/s; it is at least 1.15 times the scene's rotor speed.
 
-    **Returns** a plotly figure. **Raises** `InputError` for a scene without such a diagram; the message names the part of the
-    scene that prevents it.
+    **Returns** the text of an SVG file. **Raises** `InputError` for a scene without such a diagram; the message names the part
+    of the scene that prevents it.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
-    >>> diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0).layout.yaxis.title.text
-    'whirl speed, rpm'
+    >>> "whirl speed, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0)
+    True
     """
-    from jaxvib.explore.charts import branch_chart, campbell_chart  # slow import
+    from jaxvib.explore.campbell import campbell  # slow import
+    from jaxvib.explore.chart import chart
 
     speed = float(scene.drive.speed)
     most = max(most, 1.15 * speed)
     if has_branches(scene):
-        return branch_chart(jax.device_get(branches(scene, most=most)), most)
-    return campbell_chart(jax.device_get(whirl(scene, np.linspace(0.0, most, _SPEEDS))), speed)
+        return chart(jax.device_get(branches(scene, most=most)), most)
+    return campbell(jax.device_get(whirl(scene, np.linspace(0.0, most, _SPEEDS))), speed)
 
 
 def readings(scene: Scene) -> str:

@@ -32,9 +32,6 @@ _VARIABLE = "JAXVIB_EXPLORE"
 _HOST = "127.0.0.1"
 """Loopback address, which other computers cannot reach."""
 
-_POLICY = b"default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
-"""Content security policy: the browser loads nothing from other computers for the page."""
-
 
 def served_path() -> Path:
     """Return the path of the scene file of the page. **Raises** `InputError` if no page is being served."""
@@ -44,13 +41,12 @@ def served_path() -> Path:
     return Path(path)
 
 
-def require_libraries() -> None:
-    """Require marimo and plotly, which show the page. **Raises** `InputError` if one of them is not installed."""
-    for name in ("marimo", "plotly"):
-        if importlib.util.find_spec(name) is None:
-            raise InputError(
-                "explore", f"needs {name}; install it with: pip install '.[explore]' (in the folder of jaxvib's sources)"
-            )
+def require_marimo() -> None:
+    """Require marimo, which shows the page. **Raises** `InputError` if it is not installed."""
+    if importlib.util.find_spec("marimo") is None:
+        raise InputError(
+            "explore", "needs marimo; install it with: pip install '.[explore]' (in the folder of jaxvib's sources)"
+        )
 
 
 def require_free(port: int) -> None:
@@ -68,8 +64,6 @@ def require_free(port: int) -> None:
 
 def guarded(page: _Page, token: str, port: int) -> _Page:
     """Return an ASGI application that forwards only requests of the page at `/token/` to `page`; others receive an empty 404.
-
-    A content security policy keeps the browser from loading anything from other computers; libraries of the page would do so.
 
     The header Host must be this computer with `port`; this rejects sites whose name was made to point here (DNS rebinding). The
     header Origin, which browsers add to requests of other sites and to all websockets, must agree with Host if it is present.
@@ -89,13 +83,8 @@ def guarded(page: _Page, token: str, port: int) -> _Page:
         )
 
     async def application(scope: _Message, receive: _Receive, send: _Send) -> None:
-        async def send_with_policy(message: _Message) -> None:
-            if message["type"] == "http.response.start":
-                message = {**message, "headers": [*message.get("headers", []), (b"content-security-policy", _POLICY)]}
-            await send(message)
-
         if scope["type"] == "lifespan" or is_own(scope):
-            await page(scope, receive, send_with_policy)
+            await page(scope, receive, send)
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 1008})
         else:
@@ -111,9 +100,9 @@ def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]
     **Arguments**: `scene` file; `port` of this computer; `browser`: True to open the page; `announce`, a function that is
     called with its address.
 
-    **Raises** `InputError` if marimo or plotly is not installed, or if the port is taken.
+    **Raises** `InputError` if marimo is not installed or the port is taken.
     """
-    require_libraries()
+    require_marimo()
     require_free(port)
     import marimo  # optional and slow import
     import uvicorn  # marimo's own server

@@ -13,7 +13,8 @@ from scenes import TWO_MASS
 
 import jaxvib as jv
 from jaxvib.cli.app import run
-from jaxvib.explore import charts, pictures, serve
+from jaxvib.explore import pictures, serve
+from jaxvib.explore.panel import TALL, WIDE, Panel
 from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
 from jaxvib.machine.files import TEMPLATES
@@ -107,10 +108,17 @@ def test_a_rotor_has_a_campbell_diagram_and_a_sentence_why():
 def test_what_cannot_be_shown_is_said(one_mass):
     stop = jv.Stop(platform=1, stiffness=1e6, gap=1e-3)
     bent = jv.Scene(one_mass.machine, one_mass.loads, one_mass.drive, (stop,))
-    said = pictures.figure(lambda: pictures.diagram(bent, 100.0), SceneOrProblem(bent, ""))
+    said = pictures.image(lambda: pictures.diagram(bent, 100.0), SceneOrProblem(bent, ""))
     assert "<b>No figure:</b> effects.stop" in said
     no_room = scene_or_problem(lambda: jv.Scene(one_mass.machine, jv.balls(count=0, mass=1, radius=1, drag=1), one_mass.drive))
     assert pictures.toml(no_room) == "" and "loads.count" in pictures.text(lambda: "", no_room)
+
+
+def _drawn_lines(picture: str) -> list[list[str]]:
+    """The outlines in an SVG file, each the list of its points."""
+    return [
+        re.findall(r"[ML] ?[-.0-9]+ [-.0-9]+", path.get("d", "")) for path in ElementTree.fromstring(picture).iter(f"{SVG}path")
+    ]
 
 
 HOSTILE = "<img src=x onerror=alert(1)> **bold** .toml"
@@ -134,9 +142,9 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
 
     outputs, found = app.run()
     shown = "".join(str(getattr(output, "text", "")) for output in outputs)
-    (machine,) = (base64.b64decode(image).decode() for image in re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', shown))
-    diagram = found["chart"]
-    assert "yes, if they stay together" in shown and "<marimo-plotly" in shown and "foundation force, N" in shown
+    images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', shown)
+    diagram, machine = (base64.b64decode(image).decode() for image in images)
+    assert "yes, if they stay together" in shown and "foundation force, N" in diagram
     assert found["mode"].value == 1 and "jam mode 1, stable by slope" in machine
     assert found["controls"].value == {each.name: each.start for each in sliders_of(one_mass)}
     assert jv.scene_to_toml(found["machine"].value) == jv.scene_to_toml(one_mass)
@@ -147,66 +155,90 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     resonance = f"{30.0 / np.pi * float(after.resonances[0]):.5g} rpm"
     assert resonance in pictures.text(lambda: pictures.readings(moved), SceneOrProblem(moved, ""))
     drawn = pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed))
-    before, after = (_traces(figure, "stable")[0] for figure in (diagram, drawn))
-    assert len(before) > 40 and (len(before) != len(after) or not np.array_equal(before, after, equal_nan=True))
+    assert max(map(len, _drawn_lines(diagram))) > 40 and _drawn_lines(drawn) != _drawn_lines(diagram)
     again = jv.scene_from_toml(pictures.toml(SceneOrProblem(moved, "")))
     assert float(again.machine.stiffness[0]) == 2e5
 
 
-def _traces(figure, name, panel=1):
-    """Return the points (n, 2) of the traces with this name in one chart."""
-    own = [t for t in figure.data if t.name == name and t.xaxis == ("x" if panel == 1 else f"x{panel}")]
-    return [np.stack([t.x, t.y], axis=1).astype(float) for t in own]
+def _texts(drawn):
+    """The texts of a picture: where each stands, what it says, its element."""
+    return [(float(t.get("x")), float(t.get("y")), t.text, e) for e in drawn.iter(f"{SVG}text") for t in e.iter(f"{SVG}tspan")]
+
+
+def _axes(spans, log=False):
+    """Both axes of a chart from the numbers at its ticks: polynomials of the dots."""
+    ticks = [(x, y, float(text), e.get("text-anchor")) for x, y, text, e in spans if re.fullmatch(r"[-+.e0-9]+", text or "")]
+    across = np.polyfit(*zip(*[(x, value) for x, _, value, anchor in ticks if anchor == "middle"], strict=True), 1)
+    # The base of a text stands 0.35 of its size below its middle.
+    levels = [(y - 0.35 * 11.5, np.log(value) if log else value) for _, y, value, anchor in ticks if anchor == "end"]
+    return across, np.polyfit(*zip(*levels, strict=True), 1)
+
+
+def _lines(drawn, color, filled=False):
+    """The lines of a colour, in dots, with the figures of their dashes, or the outlines of what is filled."""
+    paths = [p for p in drawn.iter(f"{SVG}path") if p.get("stroke") == color and (p.get("fill") != "none") == filled]
+    return [(np.array(re.findall(r"[ML]([-.0-9]+) ([-.0-9]+)", p.get("d")), float), p.get("stroke-dasharray")) for p in paths]
+
+
+def test_the_middle_of_the_limits_is_that_of_a_panel():
+    middle = (1.0 + 0.5 * WIDE, 0.5 * TALL)
+    assert Panel(1.0, "", (0.0, 10.0), (2.0, 6.0)).at(5.0, 4.0) == pytest.approx(middle)
+    assert Panel(1.0, "", (0.0, 10.0), (1.0, 100.0), log=True).at(5.0, 10.0) == pytest.approx(middle)
 
 
 @pytest.mark.parametrize("kind", ["two_mass", "network"])
-def test_lines_of_the_chart_are_the_branches(kind):
+def test_the_charts_lines_are_the_branches(kind):
+    """Read back by the numbers at the ticks, every point of the picture's lines lies on a branch, and every jam is marked."""
     scene = jv.scene_from_toml(TEMPLATES[kind])
     most = 1.4 * float(scene.drive.speed)
     found = jax.device_get(jv.branches(scene, most=most))
-    figure = pictures.diagram(scene, most)
-    for panel, values in ((1, RPM * found.omega), (2, found.foundation_force)):
-        drawn = np.concatenate([points for name in ("stable", "unstable") for points in _traces(figure, name, panel)])
-        drawn = drawn[np.isfinite(drawn[:, 0])]
-        there = {(x, y): stable for x, y, stable in zip(RPM * found.rotor_speed, values, found.stable, strict=True)}
-        assert len(drawn) > 100 and all((x, y) in there for x, y in drawn.tolist())
-        for name, stable in (("stable", True), ("unstable", False)):
-            (points,) = _traces(figure, name, panel)
-            same = [there[x, y] == stable for x, y in points.tolist() if np.isfinite(x)]
-            assert np.mean(same) > 0.9  # a line begins and ends at points of the neighbouring line
-        limits = figure.layout[f"yaxis{panel}"].range
-        inside = np.log10(drawn[:, 1]) if panel == 2 else drawn[:, 1]
-        assert limits[0] <= np.median(inside) <= limits[1]
+    drawn = ElementTree.fromstring(pictures.diagram(scene, most))
+    spans = _texts(drawn)
+    wide, tall = float(drawn.get("width")), float(drawn.get("height"))
+    assert all(0.0 <= x < wide and 0.0 < y < tall for x, y, _, _ in spans)  # the legend too
+    titles = {text: x for x, _, text, _ in spans if text in ("speed of loads, rpm", "foundation force, N, zero to peak")}
+    middle = titles["foundation force, N, zero to peak"]
+    for right, values, log in ((False, RPM * found.omega, False), (True, found.foundation_force, True)):
+        across, up = _axes([span for span in spans if (span[0] > middle - 1.0) == right], log)
+        lines = [line for line, _ in _lines(drawn, "#004488")]
+        points = np.concatenate([line for line in lines if (line[0, 0] > middle - 1.0) == right])
+        assert len(points) > 200
+        heights = np.log(np.maximum(values, 1e-300)) if log else values
+        there = np.stack([found.rotor_speed * RPM / across[0], heights / up[0]], axis=1)  # in dots
+        line = np.stack([np.polyval(across, points[:, 0]) / across[0], np.polyval(up, points[:, 1]) / up[0]], axis=1)
+        a, b = there[:-1], there[1:]
+        with np.errstate(invalid="ignore"):
+            share = np.clip(((line[:, None] - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1), 0.0, 1.0)
+            away = np.nanmin(np.hypot(*np.moveaxis(line[:, None] - a - share[..., None] * (b - a), -1, 0)), axis=1)
+        assert np.max(away) < 0.5
     modes = jv.jam_modes(scene).mode_numbers()
-    marked = [text for trace in figure.data if trace.name == "jam mode" for text in trace.text]
-    assert sorted(marked) == sorted(2 * [f"jam mode {mode}" for mode in modes])
-
-
-def test_points_of_a_line_are_drawn_without_near_neighbours():
-    kept = charts._kept(np.stack([np.linspace(0.0, 1.0, 2001), np.zeros(2001)], axis=1))
-    assert 190 <= kept.sum() <= 202 and kept[0] and kept[-1]
-    gap = np.array([[0.0, 0.0], [1e-6, 0.0], [np.nan, 0.0], [2e-6, 0.0], [3e-6, 0.0], [4e-6, 0.0]])
-    assert charts._kept(gap).tolist() == [True, True, True, True, False, True]
+    told = [int(number) for _, _, text, e in spans if e.get("font-weight") == "bold" for number in text.split(", ")]
+    assert sorted(told) == sorted(2 * modes)
 
 
 @pytest.mark.parametrize("kind", ["rotor", "planar_rotor"])
-def test_lines_of_the_campbell_diagram_are_the_whirls(kind):
+def test_the_campbell_diagram_is_the_rotors_whirl(kind):
+    """Read back by the numbers at the ticks, lines are the whirls of each sense, and every critical speed is written."""
     scene = jv.scene_from_toml(TEMPLATES[kind])
     most = 1.4 * float(scene.drive.speed)
     found = jax.device_get(jv.whirl(scene, np.linspace(0.0, most, pictures._SPEEDS)))
-    figure = pictures.diagram(scene, most)
-    for name, own in (("forward whirl", found.forward), ("backward whirl", ~found.forward)):
-        (points,) = _traces(figure, name)
-        drawn = points[np.isfinite(points).all(axis=1)]
-        expected = RPM * np.stack([np.broadcast_to(found.rotor_speed[:, None], own.shape)[own], found.speed[own]], axis=1)
-        order = [np.lexsort(values.T[::-1]) for values in (drawn, expected)]
-        np.testing.assert_allclose(drawn[order[0]], expected[order[1]], rtol=1e-12)
-        critical = RPM * found.critical.speed[np.asarray(found.critical.forward) == (name == "forward whirl")]
-        (places,) = _traces(figure, f"critical, {name}")
-        shown = np.sort(critical[np.isfinite(critical) & (critical <= RPM * 1.05 * most)])
-        np.testing.assert_allclose(np.sort(places, axis=0), np.stack([shown, shown], axis=1))
-    said = " ".join(text for trace in figure.data if trace.mode == "text" for text in trace.text)
-    assert all(f"{RPM * w:.4g}" in said for w in found.critical.speed[np.isfinite(found.critical.speed)])
+    drawn = ElementTree.fromstring(pictures.diagram(scene, most))
+    across, up = _axes(_texts(drawn))
+    for color, dashes, own in (("#004488", None, found.forward), ("#d55e00", "4 2", ~found.forward)):
+        whirls = np.sort(RPM * np.where(own, found.speed, np.inf), axis=1)
+        lines = [(line, dash) for line, dash in _lines(drawn, color) if len(line) > 2]
+        assert len(lines) == np.max(own.sum(axis=1)) and {dash for _, dash in lines} == {dashes}
+        for k, (line, _) in enumerate(lines):
+            right = np.interp(np.polyval(across, line[:, 0]), RPM * found.rotor_speed, whirls[:, k])
+            np.testing.assert_allclose(np.polyval(up, line[:, 1]), right, atol=0.6 * abs(up[0]))
+    said = " ".join(text for *_, text, _ in _texts(drawn) if text)
+    speeds = [(w, way) for w, way in zip(RPM * found.critical.speed, found.critical.forward, strict=True) if np.isfinite(w)]
+    assert all(f"{w:.4g} {'forward' if way else 'backward'}" in said for w, way in speeds) and len(speeds) >= 2
+    marks = [outline for outline, _ in _lines(drawn, "#004488", filled=True) + _lines(drawn, "#d55e00", filled=True)]
+    middles = np.array([(np.min(outline, axis=0) + np.max(outline, axis=0)) / 2.0 for outline in marks])
+    places = np.stack([np.polyval(across, middles[:, 0]), np.polyval(up, middles[:, 1])], axis=1)
+    marked = np.array([[w, w] for w, _ in speeds if w <= RPM * 1.05 * most])
+    np.testing.assert_allclose(places[np.argsort(places[:, 0])], np.sort(marked, axis=0), atol=0.6 * abs(up[0]))
 
 
 def test_the_machine_moves_as_its_jam_says(two_platforms):

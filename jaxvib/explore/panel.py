@@ -1,0 +1,124 @@
+"""Axes, lines and legend of a chart as outlines and texts of an SVG picture, which take a tenth of the time of matplotlib."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from jaxvib.draw.machine.parts import Part, Text, box, circle
+from jaxvib.draw.style import GUIDE, Look, log_places
+
+WIDE, TALL, FIRST, APART, LAST = 6.3, 3.6, 0.75, 1.1, 0.25
+"""Width and height of a panel; space to the left of the first panel, between two panels and to the right of the last one; in
+units of the drawing."""
+
+ROTOR = {"color": GUIDE, "lw": 0.8}
+OPERATING = {"color": "black", "lw": 1.0, "ls": "-."}
+"""Styles of the line on which a speed is equal to the rotor speed, and of the operating speed."""
+
+_MAX_TICKS = 5
+"""Maximum number of ticks of an axis."""
+
+_MIN_POINT_DISTANCE = 0.03
+"""Minimum distance between two points of a line, in units of the drawing: about two pixels. Nearer points are omitted."""
+
+_COLUMNS = (0.05, 1.9, 4.6)
+"""Positions of the left ends of the columns of the legend."""
+
+_GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """Chart over the rotor speed.
+
+    **Attributes**: `left`, position of its left end; `title` above it; `x` and `y`, the limits of its axes; `log`: True for a
+    logarithmic vertical axis; `wide`, its width.
+    """
+
+    left: float
+    title: str
+    x: tuple[float, float]
+    y: tuple[float, float]
+    log: bool = False
+    wide: float = WIDE
+
+    def place(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the positions of points in the drawing."""
+        x, y, (left, right), (low, high) = np.asarray(x, float), np.asarray(y, float), self.x, self.y
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.log(y / low) / math.log(high / low) if self.log else (y - low) / (high - low)
+        return self.left + self.wide * (x - left) / (right - left), TALL * share
+
+    def at(self, x: float, y: float) -> tuple[float, float]:
+        """Return the position of one point in the drawing."""
+        across, up = self.place(x, y)
+        return float(across), float(up)
+
+    def line(self, x: ArrayLike, y: ArrayLike, look: Look) -> Part:
+        """Return a line through points, without those below or above the chart."""
+        points = np.stack(self.place(x, y), axis=1)
+        inside = (points[:, 1] >= 0.0) & (points[:, 1] <= TALL)
+        return Part(_thinned(np.where(inside[:, None], points, np.nan)), look)
+
+    def frame(self) -> list[Part]:
+        """Return the axes and the grid lines at their ticks."""
+        (left, right), (low, high) = self.x, self.y
+        upright = [self.line([x, x], self.y, _GRID) for x, _ in self._x_ticks()]
+        level = [self.line(self.x, [y, y], _GRID) for y, _ in self._y_ticks()]
+        edge = np.array([self.place(left, high), self.place(left, low), self.place(right, low)], float)
+        return [*upright, *level, Part(edge, {"color": "black", "lw": 0.8})]
+
+    def texts(self) -> list[Text]:
+        """Return the numbers at the ticks and the names of the axes."""
+        small = {"fontsize": "small"}
+        across = [Text(self.at(x, self.y[0])[0], -0.18, text, {**small, "ha": "center"}) for x, text in self._x_ticks()]
+        up = [Text(self.left - 0.08, self.at(self.x[0], y)[1], text, {**small, "ha": "right"}) for y, text in self._y_ticks()]
+        below = Text(self.left + 0.5 * self.wide, -0.46, "rotor speed, rpm", {**small, "ha": "center"})
+        return [*across, *up, below, Text(self.left - FIRST + 0.05, TALL + 0.22, self.title, small)]
+
+    def _x_ticks(self) -> list[tuple[float, str]]:
+        return _ticks(MaxNLocator(_MAX_TICKS).tick_values(*self.x), self.x)
+
+    def _y_ticks(self) -> list[tuple[float, str]]:
+        locator = log_places(*self.y, most=_MAX_TICKS) if self.log else MaxNLocator(_MAX_TICKS)
+        return _ticks(locator.tick_values(*self.y), self.y)
+
+
+def _ticks(places: ArrayLike, limits: tuple[float, float]) -> list[tuple[float, str]]:
+    """Return the ticks between the limits, with their numbers."""
+    return [(x, f"{x:g}") for x in np.asarray(places, float).tolist() if limits[0] <= x <= limits[1]]
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """Return a line (n, 2) without points that are too close to others; its ends and the points beside a gap (NaN) stay."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    gone = np.floor(np.concatenate([[0.0], np.nancumsum(steps)]) / _MIN_POINT_DISTANCE)
+    gap = np.isnan(np.concatenate([[np.nan], steps, [np.nan]]))
+    keep = gap[1:] | gap[:-1]
+    keep[1:] |= gone[1:] != gone[:-1]
+    return points[keep]
+
+
+def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
+    """Return a round or a square dot with the given style."""
+    outline = box(x - 0.045, x + 0.045, y - 0.045, y + 0.045) if square else circle((x, y), 0.05, 13)
+    return Part(outline, look, filled=True)
+
+
+def legend(looks: Mapping[str, Look]) -> tuple[list[Part], list[Text]]:
+    """Return the legend above the charts, with two entries in a column: samples of lines and dots with their names.
+
+    A style with a fill colour ("fc") is that of a dot.
+    """
+    parts, texts = [], []
+    for k, (name, look) in enumerate(looks.items()):
+        x, y = _COLUMNS[k // 2], TALL + (0.95, 0.68)[k % 2]
+        parts.append(dot(x + 0.2, y, look) if "fc" in look else Part(np.array([[x, y], [x + 0.4, y]]), look))
+        texts.append(Text(x + 0.5, y, name, {"fontsize": "small"}))
+    return parts, texts
