@@ -291,6 +291,7 @@ def display_unit(store: Store, name: str) -> tuple[str, float]:
 
 
 def axis_label(store: Store, axis: str) -> str:
+    """Return the label of an axis with its display unit: "rotor speed, rpm"."""
     unit, _ = display_unit(store, axis)
     words = _axis_words(store, axis)
     return f"{words}, {unit}" if unit else words
@@ -319,6 +320,7 @@ def _measure(store: Store, name: str | None) -> str:
 
 
 def measure_label(store: Store, name: str) -> str:
+    """Return the label of a measure with its display unit, as text for matplotlib."""
     attributes = store.group[name].attrs
     words, (unit, _) = str(attributes.get("long_name", name)), display_unit(store, name)
     return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # otherwise matplotlib typesets a formula
@@ -335,6 +337,7 @@ def _has_labels(store: Store) -> bool:
 
 
 def is_label(store: Store, name: str) -> bool:
+    """Return True for a measure whose values are names (regimes) or numbers of jam modes."""
     return name == "mode" or "flag_meanings" in store.group[name].attrs
 
 

@@ -16,7 +16,6 @@ _MAX_CASES = 40
 _MAX_ENTRIES = 4
 """Number of entries of a measure up to which all are shown; of a longer one the range is shown."""
 
-
 _MAX_READ = 1_000_000
 """Number of cases up to which a store is read as a whole."""
 

@@ -75,9 +75,9 @@ class RunUps(Result):
 
     def summary(self) -> str:
         """Return a line of text for each drag: shares of the regimes at the end with intervals of 95 %, speeds of jams, and
-        failed runs. A single start is no share."""
+        failed runs. A single start has no shares."""
         n = len(self.angle)
-        single = "one start at each drag, which is no share: a small change of it may change the outcome; give more starts"
+        single = "one start at each drag; a small change of the start may change the outcome: give more starts for shares"
         lines = [single if n == 1 else f"of {n} starts at each drag (in brackets: 95 % intervals)"]
         for k, drag in enumerate(self.drag):
             portions = []

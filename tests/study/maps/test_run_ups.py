@@ -54,7 +54,7 @@ def test_run_ups_that_fail_are_no_motion():
     assert found.finished.tolist() == [[True], [False]]
     assert found.fraction("failed").tolist() == [0.0, 1.0] and found.kind[1, 0] == "failed"
     assert found.summary().splitlines()[2] == "drag 1e+12 N s/m: failed"
-    assert "%" not in found.summary() and "one start at each drag, which is no share" in found.summary()
+    assert "%" not in found.summary() and "one start at each drag; a small change" in found.summary()
     assert len(found.plot().axes) == 2
     with pytest.raises(jv.InputError, match=r"kind is 'lost'; allowed: swinging, .*unsettled, failed"):
         found.fraction("lost")
