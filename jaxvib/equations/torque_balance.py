@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -26,17 +27,21 @@ from jax import Array
 from jaxvib.equations.averaged import LATE, Averaged, averaged_model, mean_torque
 from jaxvib.equations.linear import ExcitedModel, LinearModel, linear_model, rotating_direction
 from jaxvib.machine.carrier import Mount
-from jaxvib.machine.drives.drive import ConstantSpeed, Drive
+from jaxvib.machine.drives.drive import ConstantSpeed, Drive, Motor
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Exciter, Scene
 from jaxvib.machine.validation import lifting_torques
 from jaxvib.numerics.linalg import small_solve, times
+from jaxvib.numerics.roots import bracketed_root
 from jaxvib.runtime.programs import cached
 
 _TORQUE_POINTS = 33
 """Number of speeds from 0 to the working speed at which the largest torque of a motor is read."""
+
+_COMMON_SPEEDS = 513
+"""Number of speeds at which the sum of the torques of several motors is computed."""
 
 
 class TorqueBalance(eqx.Module):
@@ -139,11 +144,13 @@ class UnbalancedModel(ExcitedModel):
         Y = Omega^2 D(Omega)^-1 f,      f = sum_k S_k exp(i alpha_k) B_k^T e_k,     braking torque = -(Omega^4/2) Im(f^H D^-1 f)
 
     **Attributes**, in addition to those of `ExcitedModel`: the `balance` of torques; `turn` (count,), the complex numbers
-    exp(i alpha_k); `resultant` (np,) kg m, complex: sum_k S_k exp(i alpha_k) e_k, the force per Omega^2 in each direction.
-    Here `unbalance` is 1 and `force_direction` is f.
+    exp(i alpha_k); `resultant` (np,) kg m, complex: sum_k S_k exp(i alpha_k) e_k, the force per Omega^2 in each direction;
+    `shaft`: the balance of one mass in place of all masses, which turn as one because their phases are fixed. Here `unbalance`
+    is 1 and `force_direction` is f.
     """
 
     balance: TorqueBalance
+    shaft: TorqueBalance
     turn: Array
     resultant: Array
     unbalance: Array
@@ -169,7 +176,7 @@ class UnbalancedModel(ExcitedModel):
         """No-load speed, up to a small distance; None if an ideal drive turns an unbalance."""
         if any(self.balance.is_prescribed):
             return None
-        return self.balance.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
+        return self.shaft.speed * (1.0 - float(jnp.finfo(self.mass.dtype).eps) ** 0.5)
 
     def motor_torque(self, omega: Array) -> Array:
         """Return the sum of the torques of all motors at the speed `omega`, N m, at least a tiny positive value."""
@@ -182,13 +189,24 @@ class UnbalancedModel(ExcitedModel):
         forward = omega**2 * (self.balance.direction.conj() @ displacement)
         return mean_torque(self.balance.unbalance, jnp.conj(self.turn) * forward)
 
+    def drive_torque(self, omega: Array, required: Array) -> Array:
+        """Return the torque of each drive, (count,) N m, from the torques that the rotors need, `required_torque`.
+
+        An ideal drive supplies what its own rotor needs, and an equal share of what the motors of the others lack.
+        """
+        prescribed, driving = self.balance.is_prescribed, self.balance.driving_torque(omega)
+        if prescribed.all() or not prescribed.any():
+            return jnp.where(prescribed, required, driving)
+        lack = jnp.sum(jnp.where(prescribed, 0.0, required - driving))
+        return jnp.where(prescribed, required + lack / np.sum(prescribed), driving)
+
 
 def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
     """Assemble the model of a scene whose exciters have unbalances with `phases` (count,), rad."""
     model, turn = linear_model(scene), jnp.exp(1j * phases)
     resultant = resultant_of(model, turn)
     balance = balance_of(with_imbalances(model))
-    model = balance.model
+    model, force = balance.model, (balance.unbalance * turn) @ balance.direction
     return UnbalancedModel(
         scene=model.scene,
         carrier=model.carrier,
@@ -196,11 +214,76 @@ def unbalanced_model(scene: Scene, phases: Array) -> UnbalancedModel:
         supports=model.supports,
         mass=model.mass,
         balance=balance,
+        shaft=balance if len(scene.exciters) == 1 else _on_one_shaft(balance, force),
         turn=turn,
         resultant=resultant,
         unbalance=jnp.ones((), model.mass.dtype),
-        force_direction=(balance.unbalance * turn) @ balance.direction,
+        force_direction=force,
     )
+
+
+class _Shaft(Motor):
+    """Motor in place of several motors whose rotors turn as one: it has the sums of their torques and inertias."""
+
+    drives: tuple[Drive, ...]
+    speed: Array
+    inertia: Array
+    kind: str = eqx.field(static=True, default="shaft", kw_only=True)
+
+    def torque(self, speed: Array) -> Array:
+        """Return the sum of the torques at the rotors' `speed`, N m."""
+        return _sum_of_torques(self.drives, speed)
+
+
+def _sum_of_torques(drives: Sequence[Drive], speed: Array) -> Array:
+    motors = (drive.torque_and_inertia(jnp.full_like(speed, LATE), speed) for drive in drives)
+    return jnp.sum(jnp.stack([motor[0] for motor in motors if motor is not None]), axis=0)
+
+
+def common_speeds(drives: Sequence[Drive]) -> Array:
+    """Return a grid of speeds from 0 to the largest no-load speed of several motors, (points,) rad/s."""
+    return jnp.linspace(0.0, 1.0, _COMMON_SPEEDS) * jnp.max(jnp.stack([drive.speed for drive in drives]))
+
+
+def common_torques(drives: Sequence[Drive]) -> Array:
+    """Return the sum of the torques of several motors at `common_speeds`, (points,) N m."""
+    return jax.vmap(partial(_sum_of_torques, drives))(common_speeds(drives))
+
+
+def _common_no_load_speed(drives: tuple[Drive, ...]) -> Array:
+    """Return the largest speed at which the sum of the torques of several motors falls to 0, rad/s."""
+    speeds, total = jax.lax.stop_gradient((common_speeds(drives), common_torques(drives)))
+    falls = (total[:-1] > 0.0) & (total[1:] <= 0.0)
+    last = falls.size - 1 - jnp.argmax(falls[::-1])
+    root = bracketed_root(partial(_sum_of_torques, drives), speeds[last], speeds[last + 1], (total[last], total[last + 1]))
+    return jnp.where(jnp.any(falls), root, speeds[-1])
+
+
+def _on_one_shaft(balance: TorqueBalance, force: Array) -> TorqueBalance:
+    """Return the balance of one mass in place of all masses, with their force f (nd,) per Omega^2, torques and inertias."""
+    model, drives = balance.model, balance.averaged.drives
+    first, ideal = model.scene.exciters[0], [drive for drive in drives if drive.ideal]
+    if ideal:
+        drive: Drive = ideal[0]
+    else:
+        inertia = jnp.sum(balance.averaged.inertia)
+        drive = _Shaft(drives=drives, speed=_common_no_load_speed(drives), inertia=inertia)
+    gyroscopic = model.mounts[0].gyroscopic
+    if gyroscopic is not None:
+        gyroscopic = float(np.mean(balance.averaged.directions)) * first.direction * gyroscopic
+    mount = _mount_of_force(force, first.direction, dataclasses.replace(model.mounts[0], gyroscopic=gyroscopic))
+    one = eqx.tree_at(lambda each: (each.unbalance, each.drive), first, (jnp.ones_like(model.mass[0, 0]), drive))
+    scene = eqx.tree_at(lambda each: each.exciters, model.scene, (one,))
+    return balance_of(dataclasses.replace(model, scene=scene, mounts=(mount,)))
+
+
+def _mount_of_force(force: Array, direction: int, mount: Mount) -> Mount:
+    """Return a mount on which an unbalance of 1 kg m causes the `force` (nd,) D per w^2.
+
+    Its point moves by P q with P^T e = D: P = (Re D, -Im D) for the direction e = (1, -i).
+    """
+    rows = jnp.stack([force.real, -direction * force.imag])
+    return Mount(rows=(rows,), axes=(0, 1), gyroscopic=mount.gyroscopic, turn=mount.turn)
 
 
 def _imbalances(exciter: Exciter, *, about_tilts: bool) -> list[Array]:
@@ -212,8 +295,7 @@ def _imbalances(exciter: Exciter, *, about_tilts: bool) -> list[Array]:
 def with_imbalances(model: LinearModel) -> LinearModel:
     """Return the model with one equivalent unbalance in place of the unbalance and the imbalances of each rotor.
 
-    The force per w^2 on the coordinates, D = S B^T e + those of the imbalances, is that of an unbalance of 1 kg m whose point
-    moves by P q, with P^T e = D: P = (Re D, -Im D) for the direction e = (1, -i).
+    The force per w^2 on the coordinates is D = S B^T e + those of the imbalances.
     """
     if not has_term(model.scene.all_effects, RotorImbalance):
         return model
@@ -225,8 +307,7 @@ def with_imbalances(model: LinearModel) -> LinearModel:
         force = force + sum(_imbalances(exciter, about_tilts=False)) * turning @ mount.rotor_rows()
         if mount.tilt is not None:
             force = force + sum(_imbalances(exciter, about_tilts=True)) * turning @ mount.tilt
-        rows = jnp.stack([force.real, -exciter.direction * force.imag])
-        mounts.append(Mount(rows=(rows,), axes=(0, 1), gyroscopic=mount.gyroscopic, turn=mount.turn))
+        mounts.append(_mount_of_force(force, exciter.direction, mount))
         exciters.append(eqx.tree_at(lambda each: each.unbalance, exciter, jnp.ones_like(model.mass[0, 0])))
     scene = eqx.tree_at(lambda each: each.exciters, model.scene, tuple(exciters))
     return dataclasses.replace(model, scene=scene, mounts=tuple(mounts))

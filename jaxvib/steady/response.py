@@ -16,7 +16,7 @@ from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit, quantity_text, speed_text
 from jaxvib.equations.averaged import AVERAGED_TERMS, require_rotating_masses
 from jaxvib.equations.linear import peak_force
-from jaxvib.equations.torque_balance import UnbalancedModel, unbalanced_model
+from jaxvib.equations.torque_balance import UnbalancedModel, common_speeds, common_torques, unbalanced_model
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.scene import Scene
@@ -30,7 +30,9 @@ from jaxvib.steady.jams.folds import Pieces, branch_pieces, branch_root, fold_po
 from jaxvib.steady.measures import Vibration, acceleration_of, rms_velocity_of
 from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.regimes.local import decays, regime_growth
+from jaxvib.steady.regimes.synchronous import require_one_speed
 from jaxvib.units import Number, Numbers, count, number, numbers
+from jaxvib.units.known import is_known
 
 _POINTS_PER_SIDE = 64
 """Number of speeds on each side of a resonance in the default range."""
@@ -58,7 +60,8 @@ class AbstractResponse(eqx.Module):
       in two directions: the root of the sum of the squares of their peaks (for a rotating force sqrt 2 times its magnitude)
     - `transmissibility`: `foundation_force` divided by `exciter_force`; inf if the centrifugal forces cancel
     - `torque` (exciter,), N m: mean torque that each rotor needs to sustain the vibration; `power` (exciter,), W
-    - `motor_torque` (exciter,), N m: torque of each motor at this speed; that of an ideal drive is equal to `torque`
+    - `motor_torque` (exciter,), N m: torque of each motor at this speed. That of an ideal drive is equal to `torque`, plus an
+      equal share of what the motors of other exciters lack
     - `torque_share`: the sum of `torque` divided by that of `motor_torque`
 
     Values at an undamped resonance are infinite.
@@ -90,12 +93,13 @@ class AbstractResponse(eqx.Module):
 
 
 class OperatingPoints(AbstractResponse):
-    """Speeds at which the torque of the drive equals the torque that the vibration needs, of a machine with one exciter.
+    """Speeds at which the torques of the drives equal the torque that the vibration needs.
 
     **Additional attributes**, ascending in `speed`; entries whose `exists` is False are NaN
 
     - `exists`: True for an operating point
-    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative
+    - `growth`, 1/s, of the fastest growing small disturbance of the averaged motion, and `stable`: True if it is negative;
+      the differences of the phases stay fixed
     """
 
     outer_axes = ("operating_point",)
@@ -134,8 +138,8 @@ class Response(AbstractResponse, Result):
     **Additional attributes**
 
     - `status`: a `ResponseStatus` for each speed
-    - `operating`: the `OperatingPoints`; no entries for several exciters, see `synchronous_regimes`
-    - `folds`: the `TorqueFolds`; no entries for an ideal drive and for several exciters
+    - `operating`: the `OperatingPoints`
+    - `folds`: the `TorqueFolds`; no entries for an ideal drive
     - `resonances` (nd,), rad/s: natural frequencies, ascending
     - `scene`
     """
@@ -227,22 +231,25 @@ def response(
 
     S, alpha, e, B: see `synchronous_regimes`. The curve of the torque over the speed has a peak at each resonance (Sommerfeld
     effect). A motor turns at the speeds at which its torque equals that of the curve, `operating`. If the torque of the motor
-    changes, operating points appear and merge at the `folds` of the curve.
+    changes, operating points appear and merge at the `folds` of the curve. The phases of several exciters are fixed, by gears or
+    a common shaft: their torques are added, and they turn as one rotor with the sum of their inertias. For motors without gears
+    use `synchronous_regimes`.
 
     **Arguments**
 
     - `scene`, whose exciters have an unbalance and no loads; its effects may be gravity, and static and moment imbalances of
       the rotors, which excite the machine as well
     - `speeds`, rad/s, one or a list; typical: 100 to 1000 values; default: `points` from 0 to `most`, denser near resonances
-    - `phases` (exciter,), rad or text, of the unbalances in their directions of rotation, which gears or an ideal
-      synchronisation keep; default: 0
+    - `phases` (exciter,), rad or text, of the unbalances in their directions of rotation, which do not change with the speed;
+      default: 0
     - `points`: typical: 200 to 2000 (default: 500), and `most`, rad/s or text: number and highest of the default speeds;
       default: 4/3 of the working speed
 
     **Returns** `Response`. Derivatives with respect to all parameters of the scene are exact, except for `growth`, `stable` and
     `lands_at`, which have none. An undamped resonance has the status `unbounded` and infinite values.
 
-    **Raises** `InputError` for exciters with loads and for effects that this function does not include.
+    **Raises** `InputError` for exciters with loads, for effects that this function does not include, for ideal drives of
+    different speeds, and for several motors whose torques have the sum 0 at several speeds.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -258,6 +265,8 @@ def response(
     """
     scene = validate_scene(scene)
     require_unbalances(scene)
+    require_one_speed(scene)
+    _require_one_no_load_speed(scene)
     n = len(scene.exciters)
     angles = jnp.zeros(n, scene.top_speed.dtype) if phases is None else numbers(phases, "rad", "phases", n)
     if speeds is None:
@@ -275,6 +284,18 @@ def require_unbalances(scene: Scene) -> None:
             problem = "turn at a speed of their own; this function needs exciters with an unbalance and no loads, use branches"
             raise InputError(f"{scene.prefix_of(k)}loads", problem)
     require_rotating_masses(scene, (*AVERAGED_TERMS, RotorImbalance))
+
+
+def _require_one_no_load_speed(scene: Scene) -> None:
+    """**Raises** `InputError` for several motors whose torques have the sum 0 at several speeds, if they are known."""
+    drives = tuple(exciter.drive.settled() for exciter in scene.exciters)
+    if len(drives) == 1 or any(drive.ideal for drive in drives) or not is_known(drives):
+        return
+    total, speeds = np.asarray(common_torques(drives)), np.asarray(common_speeds(drives))
+    rises = np.flatnonzero((total[:-1] < 0.0) & (total[1:] > 0.0))
+    if rises.size:
+        problem = f"brake each other at {speed_text(speeds[rises[0]])}, and drive again at a higher speed"
+        raise InputError("exciters.drive", f"{problem}; give motors on one shaft similar speeds, or compute one of them alone")
 
 
 @cached
@@ -304,7 +325,7 @@ def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dic
     amplitude = magnitude(z)
     exciter, force = peak_force(model.resultant * omega**2), peak_force(model.carrier.foundation_force(z, 1j * omega * z))
     torque = model.required_torque(omega, z)
-    motor = jnp.where(model.balance.is_prescribed, torque, model.balance.driving_torque(omega))
+    motor = model.drive_torque(omega, torque)
     forced = exciter > 0.0
     ratio = jnp.where(forced, force / jnp.where(forced, exciter, 1.0), jnp.where(omega > 0.0, jnp.inf, 0.0))
     share = jnp.sum(torque) / model.motor_torque(omega) if model.highest_speed is not None else jnp.ones_like(omega)
@@ -326,13 +347,11 @@ def motion_at(model: UnbalancedModel, omega: Array) -> tuple[ResponseStatus, dic
 
 
 def operation_of(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
-    """Return the operating points and the folds of a machine with one exciter."""
+    """Return the operating points and the folds."""
     none = jnp.zeros(0, model.mass.dtype)
     no_folds = TorqueFolds(none, none, none, none, none.astype(bool))
-    if len(model.scene.exciters) > 1:
-        return _operating_points(model, none, none.astype(bool)), no_folds
     if model.highest_speed is None:
-        working = model.balance.speed[None]
+        working = model.shaft.speed[None]
         return _operating_points(model, working, jnp.ones(1, bool)), no_folds
     pieces = branch_pieces(model)
     speed, exists = _balanced_speeds(model, pieces)
@@ -344,7 +363,7 @@ def operation_of(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
 
 def _balanced_speeds(model: UnbalancedModel, pieces: Pieces) -> tuple[Array, Array]:
     """Return the speed on each piece of the curve at which the motor supplies the required torque, and if it exists."""
-    top = model.balance.speed
+    top = model.shaft.speed
     # The torque of the motor vanishes at the end of the last piece, whose root can be closer to it than the end of the grid.
     high = jax.lax.stop_gradient(jnp.where(pieces.high < pieces.high[-1], pieces.high, top))
     gaps = (jax.vmap(partial(_torque_gap, model))(w) for w in (pieces.low, high))
@@ -394,9 +413,9 @@ def _operating_points(model: UnbalancedModel, speed: Array, exists: Array) -> Op
     """Return the operating points at speeds, rad/s, of which those `exists` are True."""
     order = jnp.argsort(jnp.where(exists, speed, jnp.inf))
     speed, exists = speed[order], exists[order]
-    safe = jnp.where(exists, speed, model.balance.speed)
+    safe = jnp.where(exists, speed, model.shaft.speed)
     fields = jax.vmap(partial(motion_at, model))(safe)[1]
-    frozen, at = jax.lax.stop_gradient((model.balance, safe))
+    frozen, at = jax.lax.stop_gradient((model.shaft, safe))
     growth = jax.vmap(lambda w: regime_growth(frozen, w, jnp.zeros(1, w.dtype), 0))(at) if at.size else at
 
     def kept(value: Array) -> Array:

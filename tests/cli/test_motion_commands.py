@@ -255,6 +255,17 @@ def test_help_imports_nothing_slow_and_lists_the_choices():
     assert options["new", "kind"] == (*machines, *DESIGNS, "identification", "measurement", "sweep")
 
 
+def test_response_of_several_exciters_lists_each_torque(typed, tmp_path):
+    (tmp_path / "screen.toml").write_text(SCREENS["linear_screen"])
+    document = json.loads(typed("response", "screen.toml", "--phases", "0 deg, -90 deg", "--json")[1])
+    point = document["operating_points"][0]
+    assert document["phases_from"] == "given" and point["stable"]
+    np.testing.assert_allclose(sum(point["motor_torque"]), sum(point["torque"]), rtol=1e-8)
+    assert "torques at the operating points" in typed("response", "screen.toml", "--phases", "0 deg, -90 deg")[1]
+    code, _, err = typed("response", "screen.toml", "--phases", "0 deg")
+    assert code == 2 and err.strip() == "jaxvib: --phases has 1 values; 2 are needed"
+
+
 def test_response_lists_operating_points_peaks_and_folds(typed, tmp_path):
     (tmp_path / "table.toml").write_text(UNBALANCED)
     code, out, err = typed("response", "table.toml", "--csv", "curve.csv")

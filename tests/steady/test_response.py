@@ -71,7 +71,7 @@ def test_a_body_under_two_exciters_is_a_dense_solution():
     damping = np.asarray(scene.machine.carrier().damping)
     lost = SPEEDS**2 / 2.0 * np.einsum("sa,ab,sb->s", exact.conj(), damping, exact).real
     np.testing.assert_allclose(np.sum(found.power, axis=1), lost, rtol=1e-9)
-    assert found.operating.speed.size == 0 and "jaxvib" not in found.summary()
+    assert found.operating.speed.tolist() == [80.0] and not found.folds.exists.size
 
 
 def test_many_platforms_are_a_dense_solution():
@@ -196,6 +196,88 @@ def test_a_caught_motor_runs_at_the_operating_point():
     speed = float(np.mean(run.window.rotor_speeds[0]))
     np.testing.assert_allclose(speed, found.operating.speed[0], rtol=2e-3)  # the torque of light unbalances, first order
     np.testing.assert_allclose(run.amplitude[0], found.operating.amplitude[0, 0], rtol=1e-2)
+
+
+FIRST = jv.DCMotor("1000 rpm", stall_torque=1.0, inertia=0.05)
+SECOND = jv.DCMotor("1200 rpm", stall_torque=0.3, inertia=0.09)
+
+
+def sum_of_both():
+    slope = 1.0 / float(FIRST.speed) + 0.3 / float(SECOND.speed)
+    return jv.DCMotor(1.3 / slope, stall_torque=1.3, inertia=0.14)
+
+
+def same_operation(one, other):
+    """Compare operating points and folds; entries without a point are NaN in both."""
+    names = ("speed", "displacement", "foundation_force", "torque_share", "growth")
+    for name in names:
+        np.testing.assert_allclose(getattr(one.operating, name), getattr(other.operating, name), rtol=1e-8, atol=1e-10)
+    assert one.operating.exists.tolist() == other.operating.exists.tolist()
+    assert one.operating.stable.tolist() == other.operating.stable.tolist()
+    for name in ("speed", "factor", "torque", "lands_at"):
+        np.testing.assert_allclose(getattr(one.folds, name), getattr(other.folds, name), rtol=1e-8)
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_two_motors_on_one_shaft_are_one_motor(way):
+    def exciter(drive, unbalance):
+        return jv.Exciter(drive=drive, unbalance=unbalance, at=(0.1, 0.3), direction=way)
+
+    two = jv.response(body([exciter(FIRST, 0.1), exciter(SECOND, 0.3)]))
+    same_operation(two, jv.response(body([exciter(sum_of_both(), 0.4)])))
+    operating, there = two.operating, np.asarray(two.operating.exists)
+    assert there.sum() >= 3
+    np.testing.assert_allclose(operating.torque[there].sum(axis=1), operating.motor_torque[there].sum(axis=1), rtol=1e-10)
+    own = np.stack([np.asarray(motor.torque(operating.speed[there])) for motor in (FIRST, SECOND)], axis=1)
+    np.testing.assert_allclose(operating.motor_torque[there], own, rtol=1e-12)
+
+
+def test_geared_exciters_in_one_line_are_one_mass():
+    springs = [jv.support(at=(x, 0.0), stiffness=(5e5, 4e5), damping=(100.0, 300.0)) for x in (-0.5, 0.5)]
+    machine = jv.plane_body(mass=MASS, inertia=40.0, supports=springs)
+    pair = [jv.Exciter(drive=motor(6.0), unbalance=0.1, at=(0.0, 0.0), direction=way) for way in (1, -1)]
+    geared = jv.response(jv.Scene(machine, exciters=pair), phases=["0 deg", "180 deg"])  # forces across cancel
+    single = jv.DCMotor("1500 rpm", stall_torque=12.0, inertia=0.2)
+    alone = jv.response(one_mass(drive=single))
+    there = np.asarray(alone.operating.exists)
+    points = np.asarray(geared.operating.exists)
+    assert points.sum() == there.sum() == 3
+    for name in ("speed", "foundation_force", "growth"):
+        values = (np.asarray(getattr(each.operating, name))[at] for each, at in ((geared, points), (alone, there)))
+        np.testing.assert_allclose(*values, rtol=1e-7)
+    folds = (np.asarray(each.folds.factor)[np.asarray(each.folds.exists)] for each in (geared, alone))
+    np.testing.assert_allclose(*folds, rtol=1e-7)
+
+
+def test_an_ideal_drive_supplies_the_lack_of_a_motor():
+    exciters = [jv.Exciter(drive=drive, unbalance=0.2, at=(0.1, 0.3)) for drive in (jv.ConstantSpeed(80.0), FIRST)]
+    found = jv.response(body(exciters)).operating
+    assert found.speed.tolist() == [80.0]
+    np.testing.assert_allclose(found.motor_torque[0, 1], FIRST.torque(80.0), rtol=1e-12)
+    np.testing.assert_allclose(jnp.sum(found.motor_torque[0]), jnp.sum(found.torque[0]), rtol=1e-12)
+
+
+def test_motors_without_a_common_speed_are_refused():
+    slow = jv.InductionMotor("500 rpm", breakdown_torque=60.0, breakdown_slip=0.05, inertia=0.05)
+    fast = jv.InductionMotor("1500 rpm", breakdown_torque=60.0, breakdown_slip=0.05, inertia=0.05)
+    exciters = [jv.Exciter(drive=drive, unbalance=0.2, at=(0.1, 0.3)) for drive in (slow, fast)]
+    with pytest.raises(jv.InputError, match=r"^exciters.drive brake each other at .*give motors on one shaft similar speeds"):
+        jv.response(body(exciters))
+    ideal = [jv.Exciter(drive=jv.ConstantSpeed(speed), unbalance=0.2, at=(0.1, 0.3)) for speed in (60.0, 61.0)]
+    with pytest.raises(jv.InputError, match="give the same speed to all ideal drives"):
+        jv.response(body(ideal))
+
+
+def test_derivatives_of_a_shaft_are_finite_differences():
+    def values(stall):
+        drives = jv.DCMotor("1000 rpm", stall_torque=stall, inertia=0.05), SECOND
+        found = jv.response(body([jv.Exciter(drive=each, unbalance=0.2, at=(0.1, 0.3)) for each in drives]), [55.0])
+        return jnp.stack([found.operating.speed[2], found.operating.foundation_force[2], found.folds.factor[0]])
+
+    near = [np.asarray(values(1.0 + k * 1e-3)) for k in (-2, -1, 1, 2)]
+    difference = (near[0] - 8.0 * near[1] + 8.0 * near[2] - near[3]) / (12.0 * 1e-3)
+    np.testing.assert_allclose(jax.jacfwd(values)(1.0), difference, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacrev(values)(1.0), difference, rtol=1e-6)
 
 
 def test_derivatives_are_finite_differences():

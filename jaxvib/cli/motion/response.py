@@ -21,26 +21,31 @@ if TYPE_CHECKING:
 @app.command("response")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--most", type=SPEED_TYPE, help="Highest speed, such as '2000 rpm' [4/3 of the working speed].")
+@click.option(
+    "--phases",
+    help="Phases of the unbalances of several exciters, which gears keep, such as '0 deg, 180 deg' [those of the first stable "
+    "synchronous regime].",
+)
 @click.option("--points", type=int, default=500, show_default=True, help="Number of speeds.")
 @WITHOUT
 @deck_options
 @csv_options
 @shared
-def response(scene: Path, most: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
+def response(
+    scene: Path, most: str | None, phases: str | None, points: int, without: tuple[str, ...], csv: Path | None, output: Output
+) -> None:
     """Compute the vibration of SCENE under the unbalances of its exciters over their speed, and the torque that it needs; --out
     adds a figure.
 
     The operating points are the speeds at which the torque of the motor is equal to the torque that the vibration needs.
-    Several exciters have the phases of their first stable synchronous regime (`jaxvib regimes`), or equal phases."""
+    Several exciters turn as if gears connected them: with fixed phases, and the sum of their torques. Motors without gears
+    choose other phases at other speeds (`jaxvib regimes`)."""
     import jax  # slow imports, which --help does not need
     import numpy as np
 
     loaded = loaded_scene(scene, without)
-    phases = np.zeros(len(loaded.exciters))
-    if len(loaded.exciters) > 1 and not any(exciter.loads or exciter.effects for exciter in loaded.exciters):
-        regimes = jv.synchronous_regimes(loaded)
-        phases = np.asarray(regimes.phases[0]) if np.any(regimes.stable) else phases
-    found = jax.device_get(jv.response(loaded, phases=phases, points=points, most=most))
+    angles, origin = _phases(loaded, phases)
+    found = jax.device_get(jv.response(loaded, phases=angles, points=points, most=most))
     output.picture("response.png", found.plot)
     output.csv(csv, found, "speed")
     operating = np.flatnonzero(found.operating.exists).tolist()
@@ -55,7 +60,8 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
 
     document = {
         "resonances": found.resonances,
-        "phases": phases,
+        "phases": angles,
+        "phases_from": origin,
         "operating_points": [
             row | ({} if own is None else {"measures": own.document()})
             for row, own in zip(rows_of(found.operating, operating, *measures, *rest, "growth", "stable"), sizes, strict=True)
@@ -63,11 +69,29 @@ def response(scene: Path, most: str | None, points: int, without: tuple[str, ...
         "peaks": rows_of(found, found.peaks(), *measures, *rest),
         "folds": rows_of(found.folds, folds, "speed", "factor", "torque", "lands_at"),
     }
-    output.done(document, lambda: _text(found, phases, sizes, operating, folds), "response", found)
+    output.done(document, lambda: _text(found, (angles, origin), sizes, operating, folds), "response", found)
+
+
+def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
+    """Return the phases of the unbalances, rad, and their origin in words, from the option --phases or a synchronous regime."""
+    import numpy as np  # slow imports, which --help does not need
+
+    from jaxvib.units import numbers
+
+    count = len(scene.exciters)
+    if given is not None:
+        return np.asarray(numbers([part.strip() for part in given.split(",")], "rad", "--phases", count)), "given"
+    if count == 1:
+        return np.zeros(1), "of one exciter"
+    if not any(exciter.loads or exciter.effects for exciter in scene.exciters):
+        regimes = jv.synchronous_regimes(scene)
+        if np.any(regimes.stable):
+            return np.asarray(regimes.phases[0]), "those of the first stable regime"
+    return np.zeros(count), "equal, because there is no stable regime"
 
 
 def _text(
-    found: jv.Response, phases: np.ndarray, sizes: list[jv.VibrationMeasures | None], operating: list[int], folds: list[int]
+    found: jv.Response, phases: tuple[np.ndarray, str], sizes: list[jv.VibrationMeasures | None], operating: list[int], folds: list[int]
 ) -> str:
     """Return the operating points, peaks and folds as tables; `sizes`: measures at the stable operating points."""
     import numpy as np  # slow import, which --help does not need
@@ -84,17 +108,25 @@ def _text(
         last = [f"{of.foundation_force[k]:.4g}", f"{np.sum(of.torque[k]):.4g}"]
         return [f"{scale * of.speed[k]:.5g}", *texts, *moved, *last]
 
-    lines = [f"natural frequencies {speed_text(found.resonances)}"]
+    lines, several = [f"natural frequencies {speed_text(found.resonances)}"], len(found.scene.exciters) > 1
+    if several:
+        written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases[0]))
+        lines.append(f"phases of the unbalances {written} deg ({phases[1]}), at all speeds")
     end = ["force, N", "torque, N m"]
     if operating:
         points = found.operating
         rows = [motion(points, k, "yes" if points.stable[k] else "no") for k in operating]
         lines.append(table("operating points (zero to peak)", [unit, "stays", *moves, *end], rows))
+        if several:
+            rows = [
+                [f"{scale * points.speed[k]:.5g}", str(number), f"{needed:.4g}", f"{own:.4g}", f"{points.speed[k] * own:.4g}"]
+                for k in operating
+                for number, (needed, own) in enumerate(zip(points.torque[k], points.motor_torque[k], strict=True))
+            ]
+            head = [unit, "exciter", "torque of its vibration, N m", "of its motor, N m", "power of its motor, W"]
+            lines.append(table("torques at the operating points", head, rows))
         stable = [(k, own) for k, own in zip(operating, sizes, strict=True) if own is not None]
         lines += [indented(f"at {speed_text(points.speed[k])}:", own) for k, own in stable]
-    elif len(found.scene.exciters) > 1:
-        written = ", ".join(f"{a:.4g}" for a in np.rad2deg(phases))
-        lines.append(f"phases of the unbalances {written} deg; for speeds and stability use: jaxvib regimes")
     else:
         lines.append("the motor supplies the torque that the vibration needs at no speed")
     if peaks := found.peaks():
