@@ -231,9 +231,9 @@ def response(
 
     S, alpha, e, B: see `synchronous_regimes`. The curve of the torque over the speed has a peak at each resonance (Sommerfeld
     effect). A motor turns at the speeds at which its torque equals that of the curve, `operating`. If the torque of the motor
-    changes, operating points appear and merge at the `folds` of the curve. The phases of several exciters are fixed, by gears or
-    a common shaft: their torques are added, and they turn as one rotor with the sum of their inertias. For motors without gears
-    use `synchronous_regimes`.
+    changes, operating points appear and merge at the `folds` of the curve. The phases of several exciters are fixed, by gears
+    or a common shaft: their torques are added, and they turn as one rotor with the sum of their inertias. For motors without
+    gears use `synchronous_regimes`.
 
     **Arguments**
 

@@ -91,7 +91,11 @@ def _phases(scene: jv.Scene, given: str | None) -> tuple[np.ndarray, str]:
 
 
 def _text(
-    found: jv.Response, phases: tuple[np.ndarray, str], sizes: list[jv.VibrationMeasures | None], operating: list[int], folds: list[int]
+    found: jv.Response,
+    phases: tuple[np.ndarray, str],
+    sizes: list[jv.VibrationMeasures | None],
+    operating: list[int],
+    folds: list[int],
 ) -> str:
     """Return the operating points, peaks and folds as tables; `sizes`: measures at the stable operating points."""
     import numpy as np  # slow import, which --help does not need
