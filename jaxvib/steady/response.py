@@ -32,7 +32,7 @@ from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.steady.regimes.local import decays, regime_growth
 from jaxvib.steady.regimes.synchronous import require_one_speed
 from jaxvib.units import Number, Numbers, count, number, numbers
-from jaxvib.units.known import is_known
+from jaxvib.units.known import when_known
 
 _POINTS_PER_SIDE = 64
 """Number of speeds on each side of a resonance in the default range."""
@@ -288,14 +288,24 @@ def require_unbalances(scene: Scene) -> None:
 
 def _require_one_no_load_speed(scene: Scene) -> None:
     """**Raises** `InputError` for several motors whose torques have the sum 0 at several speeds, if they are known."""
-    drives = tuple(exciter.drive.settled() for exciter in scene.exciters)
-    if len(drives) == 1 or any(drive.ideal for drive in drives) or not is_known(drives):
+    if len(scene.exciters) == 1 or any(exciter.drive.ideal for exciter in scene.exciters):
         return
-    total, speeds = np.asarray(common_torques(drives)), np.asarray(common_speeds(drives))
-    rises = np.flatnonzero((total[:-1] < 0.0) & (total[1:] > 0.0))
-    if rises.size:
-        problem = f"brake each other at {speed_text(speeds[rises[0]])}, and drive again at a higher speed"
-        raise InputError("exciters.drive", f"{problem}; give motors on one shaft similar speeds, or compute one of them alone")
+
+    def check(speeds: np.ndarray, total: np.ndarray) -> None:
+        rises = np.flatnonzero((total[:-1] < 0.0) & (total[1:] > 0.0))
+        if rises.size:
+            problem = f"brake each other at {speed_text(speeds[rises[0]])}, and drive again at a higher speed"
+            advice = "give motors on one shaft similar speeds, or compute one of them alone"
+            raise InputError("exciters.drive", f"{problem}; {advice}")
+
+    when_known(check, *_common_torques(scene))
+
+
+@cached
+def _common_torques(scene: Scene) -> tuple[Array, Array]:
+    """Return a grid of speeds, rad/s, and the sum of the torques of all motors, N m."""
+    drives = tuple(exciter.drive for exciter in scene.exciters)
+    return common_speeds(drives), common_torques(drives)
 
 
 @cached
