@@ -27,7 +27,7 @@ import numpy.typing as np_typing
 from jaxvib.errors import InputError, quoted, require_path
 
 _MAX_ENTRIES = 10**7
-"""Largest length of a list; longer lists are refused, because each entry is checked."""
+"""Largest length of a list. Longer lists are refused, because the check of each entry takes time."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -85,11 +85,11 @@ def validated(function: F) -> F:
         for name, value in bound.arguments.items():
             kind = checks[name]
             if kind is not Any and value is not signature.parameters[name].default:
-                several = signature.parameters[name].kind
-                if several is inspect.Parameter.VAR_POSITIONAL:
+                parameter_kind = signature.parameters[name].kind
+                if parameter_kind is inspect.Parameter.VAR_POSITIONAL:
                     for index, each in enumerate(value):
                         _require(each, kind, f"{name}[{index}]")
-                elif several is not inspect.Parameter.VAR_KEYWORD:
+                elif parameter_kind is not inspect.Parameter.VAR_KEYWORD:
                     _require(value, kind, name)
                     if isinstance(value, (list, tuple, Decimal)) and _has_array(kind):
                         bound.arguments[name] = np.asarray(value, dtype=float)
@@ -108,14 +108,14 @@ def _require_known(arguments: Mapping[str, Any]) -> None:
     """Raise `InputError` for the first argument that contains a traced number."""
     for name, value in arguments.items():
         if any(map(_is_traced, jax.tree.leaves(value))):
-            holder = type(value).__name__ if name == "self" else name
+            field = type(value).__name__ if name == "self" else name
             problem = "contains a value that JAX traces, but the value is needed here; call this outside of jit, grad and vmap"
-            raise InputError(holder, problem)
+            raise InputError(field, problem)
 
 
 def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> dict[str, Any]:
     """Return the annotations of the parameters, with `Any` for annotations that only type checkers can resolve."""
-    found = {}
+    annotations = {}
     for name, parameter in signature.parameters.items():
         kind = Any if parameter.annotation is parameter.empty else parameter.annotation
         names = dict(inspect.unwrap(function).__globals__)
@@ -128,9 +128,8 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
                 names[error.name or ""] = Any
             except (TypeError, AttributeError):
                 kind = Any
-        kind = Any if isinstance(kind, str) else kind
-        found[name] = kind
-    return found
+        annotations[name] = Any if isinstance(kind, str) else kind
+    return annotations
 
 
 class _ByName(type):
@@ -141,11 +140,11 @@ class _ByName(type):
 
 
 class Axes(metaclass=_ByName):
-    """matplotlib's class in annotations, without the import of matplotlib, which is slow."""
+    """Stand-in for matplotlib's class of the same name in annotations, without the slow import of matplotlib."""
 
 
 class Figure(metaclass=_ByName):
-    """matplotlib's class in annotations, without the import of matplotlib, which is slow."""
+    """Stand-in for matplotlib's class of the same name in annotations, without the slow import of matplotlib."""
 
 
 def is_real(value: object) -> bool:
@@ -172,6 +171,8 @@ _NEEDS_VALUE = (
 def call_user(function: Callable[..., Any], field: str, *arguments: object) -> Any:
     """Return the result of a user's function.
 
+    **Arguments**: `function`; `field`: name of the argument that contains it, for messages; `arguments` of the function.
+
     **Raises** `InputError` if the function cannot be called with these arguments, or if it needs the value of a traced number.
     Other errors of the function pass unchanged.
 
@@ -188,8 +189,8 @@ def call_user(function: Callable[..., Any], field: str, *arguments: object) -> A
         inside = error.__traceback__ and error.__traceback__.tb_next
         if inside is not None:  # raised inside the function, not by the call itself
             raise
-        several = f"{len(arguments)} values" if len(arguments) != 1 else quoted(*arguments)
-        raise InputError(field, f"cannot be called with {several} ({error})") from error
+        values = f"{len(arguments)} values" if len(arguments) != 1 else quoted(*arguments)
+        raise InputError(field, f"cannot be called with {values} ({error})") from error
 
 
 def is_whole(value: object) -> bool:
@@ -220,12 +221,12 @@ def _require(value: Any, kind: Any, field: str) -> None:
         if problem is None:
             return
         problems.append(problem)
-    inner = [problem for problem in problems if isinstance(problem, InputError)]
-    if inner:
-        raise InputError(f"{field}{inner[0].field}", inner[0].problem)
-    words = [problem for problem in problems if problem != "None"] or ["None"]
+    of_entries = [problem for problem in problems if isinstance(problem, InputError)]
+    if of_entries:
+        raise InputError(f"{field}{of_entries[0].field}", of_entries[0].problem)
+    allowed = [problem for problem in problems if problem != "None"] or ["None"]
     example = f", {_EXAMPLES[field]}" if field in _EXAMPLES else ""
-    raise InputError(field, f"is {quoted(value)}; it must be {' or '.join(dict.fromkeys(words))}{example}")
+    raise InputError(field, f"is {quoted(value)}; it must be {' or '.join(dict.fromkeys(allowed))}{example}")
 
 
 def _alternatives(kind: Any) -> tuple[Any, ...]:
@@ -254,7 +255,8 @@ def _accepts_all(kind: Any) -> bool:
 
 
 def _problem(value: Any, kind: Any) -> str | InputError | None:
-    """Return None for a value that matches the annotation, otherwise the allowed values in words or the error of an entry."""
+    """Return None for a value that matches the annotation, otherwise a description of the allowed values or the error of an
+    entry."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if kind is None or kind is type(None):
         return None if value is None else "None"
@@ -284,11 +286,11 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
             return None if callable(value) else "a function"
         if kind.__module__ == "jaxtyping":
             return _problem_of_tree(value)
-        return None if isinstance(value, kind) else _words(kind.__name__)
+        return None if isinstance(value, kind) else _describe_class(kind.__name__)
     return None
 
 
-def _words(name: str) -> str:
+def _describe_class(name: str) -> str:
     article = "an" if name[0] in "AEIOU" else "a"
     return f"{article} {name}" + (f", {_EXAMPLES[name]}" if name in _EXAMPLES else "")
 
@@ -313,9 +315,9 @@ def _is_list(kind: Any) -> bool:
     kinds = _alternatives(kind)
     origins = [typing.get_origin(each) for each in kinds]
     lists = any(isinstance(each, type) and issubclass(each, (Sequence, list, tuple)) for each in origins)
-    inner = [each for one in kinds for each in typing.get_args(one) or (one,)]
-    inner = [each for one in inner for each in typing.get_args(one) or (one,)]
-    return lists and not any(_is_array(each) or _is_number_with_unit(each) or _accepts_all(each) for each in inner)
+    members = [member for each in kinds for member in typing.get_args(each) or (each,)]
+    members = [member for each in members for member in typing.get_args(each) or (each,)]
+    return lists and not any(_is_array(each) or _is_number_with_unit(each) or _accepts_all(each) for each in members)
 
 
 def _is_array(kind: Any) -> bool:
@@ -368,14 +370,14 @@ def _problem_of_container(value: Any, origin: type, inner: tuple[Any, ...]) -> s
                 return problem
         return None
     if issubclass(origin, (Sequence, list, tuple)):
-        several = isinstance(value, (Sequence, np.ndarray, jax.Array))
+        has_entries = isinstance(value, (Sequence, np.ndarray, jax.Array))
         if any(_is_number_with_unit(each) for kind in inner for each in (typing.get_args(kind) or (kind,))) and not isinstance(
             value, Mapping
         ):
-            return None if several or is_real(value) else "a list of numbers"
+            return None if has_entries or is_real(value) else "a list of numbers"
         if isinstance(value, Sequence) and not isinstance(value, str) and len(value) > _MAX_ENTRIES:
             return f"a list of at most {_MAX_ENTRIES} entries"
-        if not several or isinstance(value, (str, bytes, bytearray)) or getattr(value, "ndim", 1) == 0:
+        if not has_entries or isinstance(value, (str, bytes, bytearray)) or getattr(value, "ndim", 1) == 0:
             names = {float: "numbers", int: "whole numbers", str: "texts"}
             return f"a list of {names.get(inner[0], 'values') if inner else 'values'}"
         if origin is tuple and inner and Ellipsis not in inner:
@@ -391,7 +393,7 @@ def _problem_of_container(value: Any, origin: type, inner: tuple[Any, ...]) -> s
                 return _problem_of_array(value)
             value = np.asarray(value).tolist()
         return _problem_of_entries(((f"[{index}]", each) for index, each in enumerate(value)), inner[:1])
-    return None if isinstance(value, origin) else _words(origin.__name__)
+    return None if isinstance(value, origin) else _describe_class(origin.__name__)
 
 
 def _problem_of_entries(entries: Any, kinds: tuple[Any, ...]) -> InputError | None:

@@ -35,7 +35,10 @@ _Stamp: TypeAlias = "tuple[int, int, int] | None"
 
 
 class CodeState(NamedTuple):
-    """State of the code: `number` increases with each change; `is_on_disk` is True if the code equals the source files."""
+    """State of the code.
+
+    **Attributes**: `number`, which increases with each change; `is_on_disk`: True if the code equals the source files.
+    """
 
     number: int
     is_on_disk: bool
@@ -67,7 +70,7 @@ class _Code:
         self.members: dict[type, dict[str, object]] = {}
         self.doubtful: list[ModuleType] = []
         self.was_set = False
-        self.state, self.seen = CodeState(0, is_on_disk=True), []
+        self.state, self.last_differences = CodeState(0, is_on_disk=True), []
         self.lock = threading.RLock()
 
     def record(self, module: ModuleType, name: str) -> None:
@@ -80,23 +83,26 @@ class _Code:
             if (value := vars(module).get(name, _ABSENT)) is not original:
                 yield module, name, value
         for owner, members in list(self.members.items()):
-            found = _members(owner)
-            for name in found.keys() | members.keys():
-                if found.get(name) is not members.get(name):
-                    yield owner, name, found.get(name)
+            current = _members(owner)
+            for name in current.keys() | members.keys():
+                if current.get(name) is not members.get(name):
+                    yield owner, name, current.get(name)
         yield from ((file,) for file, stamp in self.stamps.items() if _stamp(file) != stamp)
         yield from ((module,) for module in self.doubtful)
 
     def update(self) -> None:
         with self.lock:
             was_set, self.was_set = self.was_set, False
-            found = list(self.differences())
-            if was_set or {tuple(map(id, each)) for each in found} != {tuple(map(id, each)) for each in self.seen}:
-                self.seen, self.state = found, CodeState(self.state.number + 1, not found)
+            now, last = list(self.differences()), self.last_differences
+            if was_set or {tuple(map(id, each)) for each in now} != {tuple(map(id, each)) for each in last}:
+                self.last_differences, self.state = now, CodeState(self.state.number + 1, not now)
 
 
 def watch(module: ModuleType) -> None:
-    """Watch a module at the end of its import, the submodules that it has imported, and those that it will import."""
+    """Watch a module from the end of its import, with the submodules that it has imported or will import.
+
+    The package jaxvib itself is watched from the beginning of its import.
+    """
     module.__class__ = _WatchedModule
     if module.__file__ not in _code.stamps or _is_stale(module.__file__):
         _code.doubtful.append(module)
@@ -113,14 +119,17 @@ def _members(owner: type) -> dict[str, object]:
 
 def _stamp(file: str | Path) -> _Stamp:
     try:
-        found = os.stat(file)
+        status = os.stat(file)
     except OSError:
         return None
-    return found.st_mtime_ns, found.st_size, found.st_ino
+    return status.st_mtime_ns, status.st_size, status.st_ino
 
 
 def _is_stale(file: str) -> bool:
-    """Return True if Python used outdated bytecode: it does not detect an edit within the same second that keeps the size."""
+    """Return True if Python used outdated bytecode.
+
+    Python does not detect an edit that keeps the size of the file and is made within the same second.
+    """
     source, bytecode = _stamp(file), _stamp(importlib.util.cache_from_source(file))
     if source is None or bytecode is None:
         return False

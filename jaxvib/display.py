@@ -30,8 +30,8 @@ SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
 _SPEED_FACTORS = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
 
 
-class _Chosen:
-    """Display units of this process."""
+class _CurrentUnits:
+    """Display units of this process: that of speeds, and True in `si` for SI units of all other quantities."""
 
     speed: SpeedUnit = "rpm"
     si = False
@@ -62,7 +62,7 @@ def display_units(*, speed: SpeedUnit = "rpm", si: bool = False) -> None:
     4.45723 Hz: y1 +1.000
     >>> jv.display_units()
     """
-    _Chosen.speed, _Chosen.si = speed_unit(speed)[0], si
+    _CurrentUnits.speed, _CurrentUnits.si = speed_unit(speed)[0], si
 
 
 def speed_unit(unit: SpeedUnit | None = None) -> tuple[SpeedUnit, float]:
@@ -74,7 +74,7 @@ def speed_unit(unit: SpeedUnit | None = None) -> tuple[SpeedUnit, float]:
     >>> round(factor, 3)
     9.549
     """
-    unit = _Chosen.speed if unit is None else unit
+    unit = _CurrentUnits.speed if unit is None else unit
     if not isinstance(unit, str) or unit not in _SPEED_FACTORS:
         raise InputError("unit", f"is {quoted(unit)}; it must be one of 'rad/s', 'rpm', 'Hz'")
     return unit, _SPEED_FACTORS[unit]
@@ -88,7 +88,7 @@ def shown_unit(unit: str, size: float) -> tuple[str, float]:
     """
     if unit == "rad/s":
         return speed_unit()
-    if _Chosen.si:
+    if _CurrentUnits.si:
         return unit, 1.0
     if unit == "N/m" and size >= 1e3:
         return "N/mm", 1e-3

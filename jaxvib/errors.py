@@ -19,7 +19,7 @@ CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 """Characters that control a terminal or change the direction of writing, except line breaks and tabs."""
 
 _MAX_WORD, _MAX_MESSAGE = 300, 2000
-"""Largest numbers of characters of a word and of a message; the middle of longer ones is left out."""
+"""Largest numbers of characters of a word and of a message. In longer ones, the middle is replaced by " ... "."""
 
 
 def legible(text: object) -> str:
@@ -112,8 +112,10 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
 
 
 def require_path(value: object, field: str) -> Path:
-    """Return a path. **Raises** `InputError` for a value that is not a path, for an empty path and for one with the character
-    NUL.
+    """Return a path.
+
+    **Raises** `InputError` for a value that is not a path, for an empty path, for a path of more than 4096 characters, and for
+    one with the character NUL or a lone surrogate.
 
     >>> require_path(3, "path")
     Traceback (most recent call last):
@@ -143,13 +145,13 @@ def written(path: Path) -> Iterator[Path]:
     """
     part = None
     try:
-        home = path.resolve()  # the target of a symbolic link is replaced, not the link
-        if home.exists() and not home.is_file():  # a device such as /dev/null must not be replaced
+        target = path.resolve()  # the target of a symbolic link is replaced, not the link
+        if target.exists() and not target.is_file():  # a device such as /dev/null must not be replaced
             yield path
             return
-        part = home.with_name(f".{os.getpid()}-{threading.get_ident()}.part{path.suffix}")
+        part = target.with_name(f".{os.getpid()}-{threading.get_ident()}.part{path.suffix}")
         yield part
-        os.replace(part, home)
+        os.replace(part, target)
     except (OSError, ValueError) as error:
         if isinstance(error, ValueError) and "null" not in str(error):
             raise
@@ -158,11 +160,14 @@ def written(path: Path) -> Iterator[Path]:
     finally:
         if part is not None:
             with contextlib.suppress(OSError):
-                part.unlink()  # raises an error if the file has replaced the one at `path`
+                part.unlink()  # fails, without effect, if this file has already replaced the one at `path`
 
 
 def optional_module(name: str, extra: str) -> Any:
-    """Import a module of an optional package. If it is missing, **raises** `InputError` with the command that installs it."""
+    """Import the module `name` of an optional package.
+
+    **Raises** `InputError` if the package is missing, with the command that installs it by the `extra` of this project.
+    """
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -203,9 +208,11 @@ def open_regular(path: str | Path) -> IO[bytes]:
 
 
 def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
-    """Return the text of a file; `what` describes the expected file in error messages, such as "a TOML file".
+    """Return the text of a file.
 
-    **Raises** `InputError` for a file that cannot be read, is not UTF-8 text, or has more than `most` bytes.
+    **Arguments**: `path`; `what`: expected file, for messages, such as "a TOML file"; `most`: largest size, bytes.
+
+    **Raises** `InputError` for a file that cannot be read, is not UTF-8 text, or is larger than `most`.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError("path", f"is {quoted(path)}; give the path of {what}")

@@ -8,17 +8,19 @@ from typing import Any
 
 
 def _package() -> ModuleType:
-    """Return the package beside `jaxvib`, not the first `optimize` on the path. **Raises** `ImportError` if another module has
-    its name."""
+    """Return the package beside `jaxvib`, not the first `optimize` on the path.
+
+    **Raises** `ImportError` if another module of this name was imported.
+    """
     source = Path(__file__).parents[1] / "optimize" / "__init__.py"
-    found = sys.modules.get("optimize")
-    if found is not None:
-        if Path(getattr(found, "__file__", None) or "").resolve() != source.resolve():
+    imported = sys.modules.get("optimize")
+    if imported is not None:
+        if Path(getattr(imported, "__file__", None) or "").resolve() != source.resolve():
             raise ImportError(
-                f"the module 'optimize' is {getattr(found, '__file__', found)}, not the package of jaxvib; "
+                f"the module 'optimize' is {getattr(imported, '__file__', imported)}, not the package of jaxvib; "
                 "import jaxvib.optimize before it, or rename it"
             )
-        return found
+        return imported
     spec = importlib.util.spec_from_file_location("optimize", source, submodule_search_locations=[str(source.parent)])
     assert spec is not None and spec.loader is not None
     package = sys.modules["optimize"] = importlib.util.module_from_spec(spec)

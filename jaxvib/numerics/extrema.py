@@ -38,35 +38,40 @@ def _hermite() -> tuple[np.ndarray, np.ndarray]:
 _EVEN, _ODD = _hermite()
 
 
-def _beyond() -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrices (2, 8) that give, from values and slopes of four samples, the value and the slope of the polynomial
-    through them one step before the first and one step after the last sample."""
+def _extrapolation() -> tuple[np.ndarray, np.ndarray]:
+    """Return two matrices (2, 8) for extrapolation from the values and slopes of four samples.
+
+    They give the value and the slope of the polynomial through the samples, the first one step before the first sample, the
+    second one step after the last sample.
+    """
     powers = np.arange(2 * NODES)
 
-    def rows(places: np.ndarray) -> np.ndarray:
-        s = places[:, None]
+    def rows(positions: np.ndarray) -> np.ndarray:
+        s = positions[:, None]
         return np.concatenate([s**powers, powers * s ** np.maximum(powers - 1, 0)])
 
     weights = rows(np.asarray([-1.0, 1.0]) * (_MIDDLE + 1.0)) @ np.linalg.inv(rows(np.arange(NODES) - _MIDDLE))
     return weights[0::2], weights[1::2]
 
 
-_BEFORE, _AFTER = _beyond()
+_BEFORE, _AFTER = _extrapolation()
 
 
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
     """Locate the extrema of an evenly sampled motion over its first half, its second half and all of it.
 
-    Between two samples the motion is the polynomial p of degree 7 through the values and slopes of four samples. The two
-    samples are the middle ones of the four; at the ends the outermost four samples are used. The error is
+    Between two samples the motion is approximated by the polynomial p of degree 7 through the values and slopes of four
+    samples. The two samples are the middle ones of the four; at the ends the outermost four samples are used. The error is
 
         |x - p| <= 0.32 / 8! max |d^8 x/ds^8|        (at the ends 1 / 8!)
 
     with s the time in steps: 4e-9 of the amplitude for 16 samples a period, and 256 times less for twice as many.
 
-    **Arguments**: x, v (n,), n >= 4: samples, and their slopes times the sampling step. **Returns** the extrema, the index of
-    the first of the four samples, and the place relative to it, in steps from 0 to 3; each is (2, 3): the minimum and the
-    maximum, over the first half, the second half and all samples.
+    **Arguments**: x, v (n,), n >= 4: samples, and their slopes times the sampling step.
+
+    **Returns** three arrays (2, 3): the extrema, the index of the first of the four samples, and the position relative to this
+    sample, in steps from 0 to 3. The rows are the minimum and the maximum; the columns are the first half, the second half and
+    all samples.
     """
     n, half = len(x), len(x) // 2
     first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
@@ -78,56 +83,62 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
         Of equal maxima the first is returned.
         """
         samples, between = sign * x, sign * inner
-        reached = jnp.maximum(between, samples[:-1])
+        largest = jnp.maximum(between, samples[:-1])
         spans = (0, half), (half, n), (half - 1, half + 1)
-        top = jnp.stack([jnp.max(reached[start : stop - 1]) for start, stop in spans])
+        top = jnp.stack([jnp.max(largest[start : stop - 1]) for start, stop in spans])
         steps = np.arange(n - 1)
         where = [
-            jnp.min(jnp.where(reached[start : stop - 1] == high, steps[start : stop - 1], stop - 2))
+            jnp.min(jnp.where(largest[start : stop - 1] == high, steps[start : stop - 1], stop - 2))
             for (start, stop), high in zip(spans, top, strict=True)
         ]
         ends = np.asarray([stop - 1 for _, stop in spans])
         last = samples[ends]
         k = jnp.where(last > top, ends - 1, jnp.stack(where))
         begin = jnp.asarray(first)[k]
-        place = (k - begin) + jnp.where(last > top, 1.0, jnp.where(between[k] > samples[k], share[k], 0.0))
+        position = (k - begin) + jnp.where(last > top, 1.0, jnp.where(between[k] > samples[k], share[k], 0.0))
         value = jnp.maximum(top, last)
-        place = jnp.where(jnp.isnan(value), jnp.nan, place)  # later results that depend on it are NaN as well
-        return value, begin, place
+        position = jnp.where(jnp.isnan(value), jnp.nan, position)  # results that depend on the position are then NaN as well
+        return value, begin, position
 
     signs = jnp.asarray([-1.0, 1.0], x.dtype)
-    value, k, place = jax.vmap(maxima)(signs)
+    value, k, position = jax.vmap(maxima)(signs)
     best = jnp.argmax(value, axis=1)[:, None]
-    value, k, place = (
-        jnp.concatenate([row[:, :2], jnp.take_along_axis(row, best, 1)], axis=1) for row in (value * signs[:, None], k, place)
+    value, k, position = (
+        jnp.concatenate([row[:, :2], jnp.take_along_axis(row, best, 1)], axis=1)
+        for row in (value * signs[:, None], k, position)
     )
-    return value, k, place
+    return value, k, position
 
 
-def extremum_value(x: Array, v: Array, place: Array) -> Array:
-    """Return the value at an extremum. Its derivatives include the change of the place between samples.
+def extremum_value(x: Array, v: Array, position: Array) -> Array:
+    """Return the value at an extremum. Its derivatives include the change of the position between samples.
 
-    x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` is counted from the first sample, in steps.
+    **Arguments**: x, v (4,): four samples and their slopes as in `locate_extrema`; `position`: that of the extremum, in steps
+    from the first of the four samples.
     """
-    polynomial, s = _polynomial(x, v), place - _MIDDLE
+    polynomial, s = _polynomial(x, v), position - _MIDDLE
     slope = _derivative(polynomial)
     curved = _at(_derivative(slope), s)
-    inside = (place != jnp.round(place)) & (curved != 0.0)
+    inside = (position != jnp.round(position)) & (curved != 0.0)
     move = jnp.where(inside, _at(slope, s), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
     return _at(polynomial, s - move + jax.lax.stop_gradient(move))
 
 
 def greatest(values: Array) -> Array:
-    """Return the maximum of numbers (n,) with derivatives. The derivatives of `jnp.max` are 0/0 if the compiler recomputes
-    equal numbers with other rounding."""
+    """Return the maximum of numbers (n,), with the derivatives of the largest one.
+
+    The derivatives of `jnp.max` are 0/0 if the compiler recomputes the maximum with another rounding, because none of the
+    numbers then equals it.
+    """
     return values[jnp.argmax(values)]
 
 
 def _extrema_between(x: Array, v: Array) -> tuple[Array, Array]:
-    """Return the place of the extremum in each step between two samples, from 0 to 1, and the value at this place. In a step
-    without an extremum it is the value of the first sample.
+    """Return the position of the extremum in each step between two samples, from 0 to 1, and the value at this position.
 
-    **Arguments**: x, v (n,): samples and slopes.
+    In a step without an extremum the value is that of the first sample. **Arguments**: x, v (n,): samples and slopes.
+
+    **Returns** two arrays (n - 1,).
     """
     n, rise, begin, end, origin = len(x), x[1:] - x[:-1], v[:-1], v[1:], -0.5
     # A sample beyond each end, on the polynomial of the outermost four. The samples of each step are then slices, which are
@@ -166,12 +177,12 @@ def _polynomial(x: Sequence[Array] | Array, v: Sequence[Array] | Array) -> list[
     even = x[0] + x[3] - inner, v[2] - v[1], v[3] - v[0]
     odd = x[2] - x[1], x[3] - x[0], v[1] + v[2], v[0] + v[3]
     parts = zip(_products(_EVEN, even), _products(_ODD, odd), strict=True)
-    constant, *found = [coefficient for pair in parts for coefficient in pair]
-    return [constant + 0.5 * inner, *found]
+    constant, *others = [coefficient for pair in parts for coefficient in pair]
+    return [constant + 0.5 * inner, *others]
 
 
 def _products(matrix: np.ndarray, vector: Sequence[Array]) -> list[Array]:
-    """Return the product as unrolled sums. The compiler cannot fuse a matrix product with other operations."""
+    """Return matrix times vector as unrolled sums, because the compiler cannot fuse a matrix product with other operations."""
     return [functools.reduce(operator.add, [float(m) * y for m, y in zip(row, vector, strict=True)]) for row in matrix]
 
 

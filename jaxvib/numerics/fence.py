@@ -23,21 +23,23 @@ def fence(value: Array, one: Array) -> Array:
 
 
 def hidden_one(value: Array) -> Array:
-    """A 1 computed from a floating-point value by bit operations that XLA does not simplify.
+    """Return a 1 that is computed from a floating-point value by bit operations, which XLA does not simplify.
 
     >>> float(hidden_one(jnp.asarray(jnp.nan)))
     1.0
     """
     dtype = np.dtype(value.dtype)
     bits = np.dtype(f"uint{8 * dtype.itemsize}").type
-    nothing = (jax.lax.bitcast_convert_type(jax.lax.stop_gradient(value), bits) & bits(1)) >> bits(1)
-    return jax.lax.bitcast_convert_type(nothing | np.ones((), dtype).view(bits), dtype)
+    zero = (jax.lax.bitcast_convert_type(jax.lax.stop_gradient(value), bits) & bits(1)) >> bits(1)
+    return jax.lax.bitcast_convert_type(zero | np.ones((), dtype).view(bits), dtype)
 
 
 @jax.custom_jvp
 def entries(vector: Array, one: Array) -> list[Array]:
-    """Entries of a floating-point vector, read by their bits: if they were read as numbers, the compiler would replace each by
-    its computation. Tangents are read as numbers and fenced; `one` is a `hidden_one`.
+    """Return the entries of a floating-point vector (n,), read as bits.
+
+    If the entries were read as numbers, the compiler would replace each of them by its computation. Tangents are read as
+    numbers and fenced; `one` is a `hidden_one`.
 
     >>> [float(x) for x in entries(jnp.asarray([2.0, 3.0]), hidden_one(jnp.asarray(3.0)))]
     [2.0, 3.0]

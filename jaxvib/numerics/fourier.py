@@ -46,11 +46,11 @@ class Grid(NamedTuple):
 
 
 def grid_of(points: int, symmetric: bool) -> Grid:
-    """Return the grid of `points` points on half a period if the motion has the half-turn symmetry, otherwise on a period.
+    """Return the grid of `points` points, on half a period if `symmetric` is True, otherwise on a period.
 
-    `points` is rounded to an even number for half a period and to an odd number for a period, so that the grid represents both
-    the cosine and the sine of the highest harmonic of e. Each precision has its own grid, because JAX caches an array with the
-    precision of its first use.
+    `points` is rounded up to an even number for half a period and to an odd number for a period, so that the grid represents
+    both the cosine and the sine of the highest harmonic of e. Each precision has its own grid, because JAX caches an array with
+    the precision of its first use.
     """
     return _grid_of(points, symmetric, jnp.result_type(float).itemsize == 8)
 
@@ -89,15 +89,19 @@ def _synthesis(orders: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def analyzed(values: Array, matrix: np.ndarray) -> Array:
-    """Return the harmonics (..., K) of values (..., M) at the points.
+    """Return the complex harmonics (..., K) of real values (..., M) at the points.
 
-    A real matrix product computes them, with a quarter of the operations of a complex one.
+    **Arguments**: `matrix` (M, 2K): `Grid.analysis` or `deviation_analysis`. A product of real matrices needs a quarter of the
+    operations of a complex product.
     """
     return jax.lax.complex(*jnp.split(values @ matrix, 2, -1))
 
 
 def synthesized(harmonics: Array, matrix: np.ndarray) -> Array:
-    """Return the values (..., M) at the points of harmonics (..., K): Re sum_k c_k exp(i k theta_l)."""
+    """Return the values (..., M) at the points from harmonics c (..., K): Re sum_k c_k exp(i k theta_l).
+
+    **Arguments**: `matrix` (2K, M): `Grid.synthesis` or `deviation_synthesis`.
+    """
     return jnp.concatenate([harmonics.real, harmonics.imag], -1) @ matrix
 
 
@@ -113,8 +117,8 @@ def resampling(grid: Grid, to: Grid) -> np.ndarray:
     """Return the matrix (M, M') from values of psi on `grid` to those on the grid `to`, by the harmonics that both grids
     have."""
     orders = min(grid.deviation_orders.size, to.deviation_orders.size)
-    keep = np.tile(np.arange(grid.deviation_orders.size) < orders, 2)
-    return deviation_analysis(grid)[:, keep] @ _synthesis(grid.deviation_orders[:orders], to.theta)
+    is_common = np.tile(np.arange(grid.deviation_orders.size) < orders, 2)
+    return deviation_analysis(grid)[:, is_common] @ _synthesis(grid.deviation_orders[:orders], to.theta)
 
 
 def deviation_synthesis(grid: Grid) -> np.ndarray:

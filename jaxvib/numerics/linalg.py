@@ -19,14 +19,14 @@ MAX_EIGENVALUE_ERROR = 1e-2
 """Largest relative error of a valid eigenvalue; beyond it, its digits are lost to rounding."""
 
 _compiled = functools.partial(jax.jit, inline=True)
-"""Compilation of functions with loops, which JAX would otherwise trace and compile at every call outside a program."""
+"""Decorator that compiles functions with loops. Without it, JAX would trace and compile them at each call outside a program."""
 
 _Entry: TypeAlias = Array | float
 """Entry of a matrix: a number, or an array of the entries of many matrices."""
 
 
 def times(matrix: Array, vector: Array) -> Array:
-    """Return a matrix times a vector: for small matrices as a sum, because a product in a time loop prevents fusion."""
+    """Return matrix (m, n) times vector (n,), for small matrices as a sum, because a product in a time loop prevents fusion."""
     if max(matrix.shape) <= _MAX_UNROLLED_EQUATIONS:
         return jnp.sum(matrix * vector[None, :], axis=-1)
     return jnp.matmul(matrix, vector, precision="highest")
@@ -45,7 +45,7 @@ def small_inverse(a: Sequence[Sequence[_Entry]]) -> Callable[[tuple[Array, ...]]
 
 
 def _eliminate(a: Sequence[Sequence[_Entry]], b: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Gaussian elimination with the largest entry of each column as pivot."""
+    """Solve a x = b by Gaussian elimination with the largest entry of each column as pivot."""
     rows = [[*line, right] for line, right in zip(a, b, strict=True)]
     n = len(rows)
     for k in range(n):
@@ -60,13 +60,15 @@ def _eliminate(a: Sequence[Sequence[_Entry]], b: tuple[Array, ...]) -> tuple[Arr
             rows[i] = [y - factor * x if j > k else y for j, (x, y) in enumerate(zip(rows[k], rows[i], strict=True))]
     x: list[Array] = []
     for i in reversed(range(n)):
-        x.insert(0, (rows[i][n] - sum(rows[i][j] * known for j, known in enumerate(x, i + 1))) / rows[i][i])
+        x.insert(0, (rows[i][n] - sum(rows[i][j] * solved for j, solved in enumerate(x, i + 1))) / rows[i][i])
     return tuple(x)
 
 
 def relative_to(metric: Array, matrix: Array) -> tuple[Array, Array]:
-    """L^-1 A L^-T (nd, nd) and L^-1 for a positive definite metric L L^T; the eigenvalues of the first matrix solve A x =
-    value L L^T x."""
+    """Return L^-1 A L^-T (n, n) and L^-1 for the `matrix` A and a positive definite `metric` L L^T.
+
+    The eigenvalues of the first result are those of A x = value L L^T x; the eigenvectors x are L^-T times its eigenvectors.
+    """
     n = metric.shape[0]
     if n > 3:
         eye = jnp.eye(n, dtype=metric.dtype)
@@ -77,7 +79,7 @@ def relative_to(metric: Array, matrix: Array) -> tuple[Array, Array]:
 
 
 def _small_factor_inverse(metric: Array) -> Array:
-    """L^-1 of L L^T up to 3 x 3, written out: see `_small_modes`."""
+    """Return L^-1 of a metric L L^T up to 3 x 3 without a library call, see `_small_modes`."""
     n = metric.shape[0]
     zero = jnp.zeros_like(metric[0, 0])
     factor: list[list[Array]] = [[zero] * n for _ in range(n)]
@@ -93,32 +95,34 @@ def _small_factor_inverse(metric: Array) -> Array:
 
 
 def root_or_zero(values: Array) -> Array:
-    """Square roots of nonnegative eigenvalues; values within rounding of 0 are 0, with derivative 0."""
-    there = values > 4.0 * values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
-    return jnp.where(there, jnp.sqrt(jnp.where(there, values, 1.0)), 0.0)
+    """Return the square roots of nonnegative eigenvalues (n,); the root of a value within rounding of 0 is 0, with derivative
+    0."""
+    is_positive = values > 4.0 * values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, values, 1.0)), 0.0)
 
 
 def hermitian_error(pencil: tuple[Array, Array], values: Array, shapes: Array) -> Array:
-    """Relative errors (k,) of eigenvalues of A x = value B x, both Hermitian, by Rayleigh's quotient x^H A x / x^H B x.
+    """Return the relative errors (k,) of eigenvalues of A x = value B x with Hermitian A and B.
 
-    The error of the quotient is of second order in the error of the shape. The rounding of its terms, which cancel for soft
-    springs next to stiff ones, is included.
+    The error is the difference from Rayleigh's quotient x^H A x / x^H B x, whose own error is of second order in the error of
+    the shape x. The rounding of the terms of the quotient, which cancel for soft springs next to stiff ones, is included. The
+    error of an eigenvalue 0 is infinite.
 
     **Arguments**: `pencil` A and B (n, n), B positive definite; `values` (k,); `shapes` (n, k).
     """
     sizes, eps = jnp.abs(shapes), jnp.finfo(values.dtype).eps
     top, bottom = (jnp.sum(shapes.conj() * (matrix @ shapes), axis=0).real for matrix in pencil)
-    rough, base = (jnp.sum(sizes * (jnp.abs(matrix) @ sizes), axis=0) for matrix in pencil)
-    rounding = shapes.shape[0] * eps * (rough + jnp.abs(values) * base) / bottom
+    top_terms, bottom_terms = (jnp.sum(sizes * (jnp.abs(matrix) @ sizes), axis=0) for matrix in pencil)
+    rounding = shapes.shape[0] * eps * (top_terms + jnp.abs(values) * bottom_terms) / bottom
     length = jnp.abs(values)
     return jnp.where(length > 0.0, (jnp.abs(top / bottom - values) + rounding) / jnp.where(length > 0.0, length, 1.0), jnp.inf)
 
 
 @jax.custom_jvp
 def hermitian_modes(square: Array) -> tuple[Array, Array]:
-    """Ascending eigenvalues (..., n) and eigenvectors (..., n, n) of Hermitian matrices.
+    """Return the ascending eigenvalues (..., n) and the eigenvectors (..., n, n), as columns, of Hermitian matrices.
 
-    The vectors of equal eigenvalues, which are not unique, have derivative 0 relative to each other instead of NaN.
+    The eigenvectors of equal eigenvalues are not unique; their derivative relative to each other is 0 instead of NaN.
     """
     if square.shape[-1] > 3 or jnp.iscomplexobj(square):
         values, vectors = jnp.linalg.eigh(square)  # a plain tuple, because a derivative rule cannot return a named pair
@@ -128,10 +132,10 @@ def hermitian_modes(square: Array) -> tuple[Array, Array]:
 
 @_compiled
 def _small_modes(square: Array) -> tuple[Array, Array]:
-    """Eigenvalues and vectors of real symmetric matrices up to 3 x 3 by unrolled Jacobi rotations.
+    """Return eigenvalues and eigenvectors of real symmetric matrices up to 3 x 3, by unrolled Jacobi rotations.
 
-    The reason is not only speed: on two cores, library calls for large batches in one program can deadlock (jaxlib 0.10).
-    Large batches occur for machines of up to three platforms.
+    Rotations are faster than library calls, and on two cores, library calls for large batches in one program can deadlock
+    (jaxlib 0.10). Large batches occur for machines of up to three platforms.
     """
     n = square.shape[-1]
     entries = tuple(tuple(square[..., i, j] for j in range(n)) for i in range(n))
@@ -166,12 +170,12 @@ def _small_modes(square: Array) -> tuple[Array, Array]:
 def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     values, vectors = hermitian_modes(*primals)
     change = (tangents[0] + tangents[0].conj().mT) / 2.0
-    turned = vectors.conj().mT @ change @ vectors
+    modal_change = vectors.conj().mT @ change @ vectors
     gap = values[..., None, :] - values[..., :, None]
     top = jnp.max(jnp.abs(values), axis=-1)[..., None, None]
-    apart = jnp.abs(gap) > values.shape[-1] * jnp.finfo(values.dtype).eps * top
-    mixing = jnp.where(apart, turned / jnp.where(apart, gap, 1.0), 0.0)
-    return (values, vectors), (jnp.diagonal(turned, axis1=-2, axis2=-1).real, vectors @ mixing)
+    is_distinct = jnp.abs(gap) > values.shape[-1] * jnp.finfo(values.dtype).eps * top
+    mixing = jnp.where(is_distinct, modal_change / jnp.where(is_distinct, gap, 1.0), 0.0)
+    return (values, vectors), (jnp.diagonal(modal_change, axis1=-2, axis2=-1).real, vectors @ mixing)
 
 
 def magnitude(value: Array) -> Array:
@@ -182,8 +186,12 @@ def magnitude(value: Array) -> Array:
 
 
 def small_solve(a: Array, b: Array) -> Array:
-    """Return x of a x = b; unrolled for 1, 2 and 3 equations (many times faster than a library call under `vmap`), by
-    `eliminate` up to 8 equations, otherwise by the library, for a batch one system after the other, see `solve_in_turn`."""
+    """Return x of a x = b; b (n,) or (n, m).
+
+    - 1 to 3 equations are solved in unrolled form, many times faster than a library call under `vmap`
+    - up to 8 equations are solved by `eliminate`
+    - larger systems are solved by the library, those of a batch one after the other, see `solve_in_turn`
+    """
     n = b.shape[0]
     if n == 1:
         return b / a[0, 0]
@@ -206,7 +214,10 @@ def _unrolled_solve(a: Array, b: Array) -> Array:
 
 @_unrolled_solve.defjvp
 def _unrolled_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
-    """a x' = b' - a' x, from the same adjugate, with half the operations of an automatic derivative of `_unrolled_solve`."""
+    """Return x and its tangent x', the solution of a x' = b' - a' x.
+
+    Both are computed from the same adjugate, with half the operations of an automatic derivative of `_unrolled_solve`.
+    """
     (a, b), (da, db) = primals, tangents
     adjugate, determinant = _adjugate(a)
     x = _times(adjugate, b) / determinant
@@ -214,7 +225,7 @@ def _unrolled_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Arr
 
 
 def _adjugate(a: Array) -> tuple[Array, Array]:
-    """adj(a) and det(a) of 2 or 3 equations: a adj(a) = det(a) 1."""
+    """Return adj(a) and det(a) of a matrix 2 x 2 or 3 x 3: a adj(a) = det(a) 1."""
     if a.shape[0] == 2:
         cofactors = a[::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]], a.dtype)
     else:
@@ -230,9 +241,11 @@ def _times(a: Array, b: Array) -> Array:
 
 @custom_vmap
 def solve_in_turn(a: Array, b: Array) -> Array:
-    """Return x of a x = b by the library, without derivatives. On a CPU it is called for one system of a batch after the
-    other. A batched call can deadlock on a CPU: the same threads run such calls and compute their systems, and if all of them
-    wait, none can compute (jaxlib before 0.11.2). For about 20 equations and more, calls one after the other are also faster.
+    """Return x of a x = b by the library, without derivatives.
+
+    On a CPU the library is called for one system of a batch after the other. A batched call can deadlock on a CPU: the same
+    threads run such calls and compute their systems, and if all of them wait, none can compute (jaxlib before 0.11.2). For
+    about 20 equations and more, calls one after the other are also faster.
     """
     return jnp.linalg.solve(a, b)
 
@@ -244,17 +257,19 @@ def _solve_one_by_one(size: int, is_mapped: list[bool], a: Array, b: Array) -> t
         x = solve_in_turn(a, columns.reshape(a.shape[0], -1))
         return jnp.moveaxis(x.reshape(columns.shape), -1, 0), True
 
-    def each(a: Array, b: Array) -> Array:
-        return jax.lax.map(lambda one: solve_in_turn(*one), (a, b))
+    def solve_each(a: Array, b: Array) -> Array:
+        return jax.lax.map(lambda system: solve_in_turn(*system), (a, b))
 
     right = b if is_mapped[1] else jnp.broadcast_to(b, (size, *b.shape))
-    return jax.lax.platform_dependent(a, right, cpu=each, default=jax.vmap(jnp.linalg.solve)), True
+    return jax.lax.platform_dependent(a, right, cpu=solve_each, default=jax.vmap(jnp.linalg.solve)), True
 
 
 @custom_vmap
 def eigenvalues_in_turn(matrix: Array) -> Array:
-    """Eigenvalues (n,), complex, of a matrix (n, n), without eigenvectors. The library is called for one matrix of a batch
-    after the other, see `solve_in_turn`."""
+    """Return the complex eigenvalues (n,) of a matrix (n, n), without eigenvectors.
+
+    The library is called for one matrix of a batch after the other, see `solve_in_turn`.
+    """
     return jnp.linalg.eigvals(matrix)
 
 
@@ -265,7 +280,7 @@ def _eigenvalues_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tup
 
 @custom_vmap
 def eigenvectors_in_turn(matrix: Array) -> tuple[Array, Array]:
-    """Eigenvalues (n,) and eigenvectors (n, n), complex, of a matrix (n, n), see `eigenvalues_in_turn`."""
+    """Return the complex eigenvalues (n,) and eigenvectors (n, n) of a matrix (n, n), see `eigenvalues_in_turn`."""
     values, vectors = jnp.linalg.eig(matrix)
     return values, vectors
 
@@ -277,7 +292,7 @@ def _eigenvectors_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tu
 
 @custom_vmap
 def svd_in_turn(matrix: Array) -> tuple[Array, Array, Array]:
-    """Singular value decomposition U, s, V^T of a matrix (n, n), see `eigenvalues_in_turn`."""
+    """Return the singular value decomposition U, s, V^T of a matrix (n, n), see `eigenvalues_in_turn`."""
     left, values, right = jnp.linalg.svd(matrix)
     return left, values, right
 
@@ -288,9 +303,10 @@ def _svd_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[tuple
 
 
 def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array], Array], b: Array, norm: Array) -> Array:
-    """x of A x = b, with A x = `product`(x), an approximate `inverse` of A and the row-sum `norm` of A.
+    """Return x of A x = b, with A x = `product(x)`, an approximate solution `inverse(b)` and the row-sum `norm` of A.
 
-    The solution is corrected by its residual until only rounding errors are left: usually not at all, at most 4 times.
+    The solution is corrected by its residual until only rounding errors are left: usually no correction is needed, and there
+    are at most 4.
     """
     eps = jnp.finfo(norm.dtype).eps
 
@@ -314,7 +330,8 @@ def refine_solution(product: Callable[[Array], Array], inverse: Callable[[Array]
 
 
 def solve_definite(a: Array, b: Array) -> Array:
-    """x (n,) or (n, m) of a x = b, a symmetric and positive definite, without pivots and therefore without branches."""
+    """Return x (n,) or (n, m) of a x = b for a symmetric and positive definite, without pivots and therefore without
+    branches."""
     rows = jnp.concatenate([a, b if b.ndim > 1 else b[:, None]], axis=1)
     for k in range(b.shape[0]):
         line = rows[k, 1:] / rows[k, 0]
@@ -325,29 +342,30 @@ def solve_definite(a: Array, b: Array) -> Array:
 
 @_compiled
 def eliminate(a: Array, b: Array) -> Array:
-    """x (n,) or (n, m) of a x = b, by elimination with pivots.
+    """Return x (n,) or (n, m) of a x = b, by elimination with pivots.
 
-    Library calls for large batches in one program can deadlock (jaxlib 0.10, two cores).
+    It replaces library calls, which can deadlock for large batches in one program (jaxlib 0.10, two cores).
     """
     n = a.shape[0]
-    place = jnp.arange(n)
+    row = jnp.arange(n)
 
-    def eliminated(k: int, rows: Array) -> Array:
-        pivot = jnp.argmax(jnp.where(place >= k, jnp.abs(rows[:, k]), -1.0))
-        rows = rows[jnp.where(place == k, pivot, jnp.where(place == pivot, k, place))]
+    def eliminate_column(k: int, rows: Array) -> Array:
+        pivot = jnp.argmax(jnp.where(row >= k, jnp.abs(rows[:, k]), -1.0))
+        rows = rows[jnp.where(row == k, pivot, jnp.where(row == pivot, k, row))]
         line = rows[k] / rows[k, k]
-        return jnp.where((place == k)[:, None], line[None, :], rows - rows[:, k][:, None] * line[None, :])
+        return jnp.where((row == k)[:, None], line[None, :], rows - rows[:, k][:, None] * line[None, :])
 
     rows = jnp.concatenate([a, b.reshape(n, -1).astype(a.dtype)], axis=1)
-    return jax.lax.fori_loop(0, n, eliminated, rows)[:, n:].reshape(b.shape)
+    return jax.lax.fori_loop(0, n, eliminate_column, rows)[:, n:].reshape(b.shape)
 
 
 @jax.custom_jvp
 def unrolled_inverse(matrix: Array) -> Array:
-    """Inverse by unrolled Gauss-Jordan elimination, because a library call would prevent fusion in the time loop, and large
-    batches of such calls can deadlock on few cores (jaxlib 0.10). There are no pivots; the matrix must be diagonally dominant,
-    such as 1/(gamma h) - J for small h. A step that has lost its digits is rejected by its error estimate and repeated with a
-    smaller h.
+    """Return the inverse of a matrix (n, n) by unrolled Gauss-Jordan elimination.
+
+    A library call would prevent fusion in the time loop, and large batches of such calls can deadlock on few cores (jaxlib
+    0.10). There are no pivots; the matrix must be diagonally dominant, such as 1/(gamma h) - J for small h. For larger h the
+    inverse can be inaccurate; the step is then rejected by its error estimate and repeated with a smaller h.
     """
     for i in range(matrix.shape[0]):
         here = np.arange(matrix.shape[0]) == i

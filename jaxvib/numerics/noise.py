@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 _MAX_ORDER = 40
+"""Largest order of an autoregressive model."""
 
 _EXPECTATIONS = 40
 """Number of iterations of expectation and maximization for the distribution of outliers."""
@@ -29,8 +30,15 @@ _NEIGHBORS = 2
 
 
 class Noise(NamedTuple):
-    """Noise of the readings of a channel: the filter `taps` (1, a_1, ...) that turns it into white noise of the standard
-    `deviation`, but for a share of `outliers` whose standard deviation is larger by the factor `width`."""
+    """Noise of the readings of a channel: an autoregressive process driven by white noise, a part of which are outliers.
+
+    **Attributes**
+
+    - `taps` (1, a_1, ...): coefficients of the filter that turns the noise into white noise
+    - `deviation`: standard deviation of the white noise without outliers
+    - `outliers`: share of outliers among the white noise, 0 to 1
+    - `width`: standard deviation of the outliers divided by `deviation`
+    """
 
     taps: np.ndarray
     deviation: float
@@ -39,15 +47,15 @@ class Noise(NamedTuple):
 
 
 def noise_of(residual: np.ndarray) -> Noise:
-    """Return the noise of residuals (n,), NaN for samples to leave out.
+    """Return the noise of residuals (n,); samples that are NaN are left out.
 
     >>> rng = np.random.default_rng(0)
     >>> noise = rng.normal(size=8000)
     >>> noise_of(noise).outliers
     0.0
     >>> noise[::50] += rng.normal(size=160) * 20.0
-    >>> found = noise_of(noise)
-    >>> found.taps.tolist(), round(found.outliers, 2), bool(0.95 < found.deviation < 1.05)
+    >>> estimate = noise_of(noise)
+    >>> estimate.taps.tolist(), round(estimate.outliers, 2), bool(0.95 < estimate.deviation < 1.05)
     ([1.0], 0.02, True)
     """
     taps, deviation = autoregression(residual, ~is_outlier(residual))
@@ -65,12 +73,12 @@ def is_outlier(residual: np.ndarray) -> np.ndarray:
     >>> np.flatnonzero(is_outlier(residual)).tolist()
     [200, 500]
     """
-    known = np.where(np.isfinite(residual), residual, 0.0)
-    if np.max(np.abs(known), initial=0.0) <= _OUTLIER_DISTANCE * _spread(known):
+    finite = np.where(np.isfinite(residual), residual, 0.0)
+    if np.max(np.abs(finite), initial=0.0) <= _OUTLIER_DISTANCE * _spread(finite):
         return np.zeros(residual.size, bool)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(known, _NEIGHBORS, mode="edge"), 2 * _NEIGHBORS + 1)
-    away = known - np.median(around, axis=1)
-    return np.abs(away) > _OUTLIER_DISTANCE * max(_spread(away), 1e-300)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(finite, _NEIGHBORS, mode="edge"), 2 * _NEIGHBORS + 1)
+    distance = finite - np.median(around, axis=1)
+    return np.abs(distance) > _OUTLIER_DISTANCE * max(_spread(distance), 1e-300)
 
 
 def _spread(values: np.ndarray) -> float:
@@ -79,8 +87,11 @@ def _spread(values: np.ndarray) -> float:
 
 
 def outliers_of(white: np.ndarray) -> tuple[float, float, float]:
-    """Return the standard deviation of white noise without outliers, the share of the outliers, and their standard deviation
-    relative to that of the others; a share of 0 if the normal distribution is as probable.
+    """Return the distribution of outliers in white noise (n,).
+
+    **Returns** the standard deviation of the noise without outliers, the share of outliers, and the standard deviation of the
+    outliers divided by that of the others. The share is 0 if a distribution with outliers is not more probable than the normal
+    distribution.
 
     >>> rng = np.random.default_rng(0)
     >>> white = rng.normal(size=4000)
@@ -95,7 +106,7 @@ def outliers_of(white: np.ndarray) -> tuple[float, float, float]:
     variance = float(np.mean(white**2)) if white.size else 0.0
     if variance == 0.0 or float(np.mean(white**4)) < (3.0 + 3.0 * math.sqrt(24.0 / white.size)) * variance**2:
         return math.sqrt(variance), 0.0, 1.0
-    plain = -0.5 * white.size * (1.0 + math.log(variance)) + math.log(white.size)
+    likelihood_of_normal = -0.5 * white.size * (1.0 + math.log(variance)) + math.log(white.size)
     core, share, width = max(_spread(white), 1e-3 * math.sqrt(variance)), 0.05, 5.0
     for _ in range(_EXPECTATIONS):
         outlying = _outlying(white / core, share, width)
@@ -104,7 +115,7 @@ def outliers_of(white: np.ndarray) -> tuple[float, float, float]:
         width = max(math.sqrt(float(np.sum(outlying * white**2)) / (white.size * max(share, 1e-12))) / core, 1.5)
     square = (white / core) ** 2
     mixed = np.logaddexp(math.log(1.0 - share) - 0.5 * square, math.log(max(share, 1e-300) / width) - 0.5 * square / width**2)
-    if float(np.sum(mixed)) - white.size * math.log(core) < plain:
+    if float(np.sum(mixed)) - white.size * math.log(core) < likelihood_of_normal:
         return math.sqrt(variance), 0.0, 1.0
     return core, share, width
 
@@ -116,7 +127,8 @@ def _outlying(relative: np.ndarray, share: float, width: float) -> np.ndarray:
 
 
 def limited(relative: np.ndarray, used: np.ndarray, share: float, width: float) -> tuple[np.ndarray, float]:
-    """Return residuals (n,) for a least-squares fit in which outliers have little influence, and their standard deviation.
+    """Return residuals (n,) for a least-squares fit in which outliers have little influence, and their standard deviation,
+    relative to that of the residuals without outliers.
 
         psi(e) = e (1 - c P(e)),      c = 1 - 1/width^2
 
@@ -144,7 +156,7 @@ def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     phi and Phi are the density and the distribution function of the standard normal distribution. The residuals are
     psi/(-psi') and the weights sqrt(-psi'); psi' is here the derivative with respect to z.
 
-    **Arguments**: `excess` of the bound over the model, in standard deviations of the normal noise.
+    **Arguments**: `excess` (n,): the bound minus the value of the model, in standard deviations of the normal noise.
 
     >>> moved, weight = bounded(np.array([-8.0, 0.0, 40.0]))
     >>> np.round(moved * weight**2, 1).tolist(), np.round(weight, 2).tolist()    # scores and weights
@@ -154,8 +166,8 @@ def bounded(excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     z = -np.maximum(np.asarray(excess, float), -30.0)
     ratio = np.exp(-0.5 * z**2 - 0.5 * math.log(2.0 * math.pi) - log_ndtr(z))
-    sum_of = np.where(z < -20.0, 1.0 / np.maximum(-z, 1.0), ratio + z)
-    return 1.0 / sum_of, np.sqrt(ratio * sum_of)
+    ratio_plus_z = np.where(z < -20.0, 1.0 / np.maximum(-z, 1.0), ratio + z)
+    return 1.0 / ratio_plus_z, np.sqrt(ratio * ratio_plus_z)
 
 
 def autoregression(residual: np.ndarray, used: np.ndarray | None = None, most: int = _MAX_ORDER) -> tuple[np.ndarray, float]:

@@ -14,15 +14,17 @@ from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.loops import repeat
 
 _STAGES = 6
+"""Number of collocation points in a step; the method then has the order 11."""
 
 _PHASE = 1.0
 """Phase of the fastest oscillation in a step, rad. The relative error of a step of order 11 is then 5e-12."""
 
 
 def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes c of Radau's right quadrature on [0, 1] and the matrix a, integrals of the Lagrange polynomials up to each node.
+    """Return the nodes c (s,) of Radau's right quadrature on [0, 1] and the matrix a (s, s) of collocation.
 
-    Both follow from Legendre polynomials, whose matrices are well conditioned; powers in their place would lose five digits.
+    a_ij is the integral of the j-th Lagrange polynomial from 0 to the node i. Both are computed from Legendre polynomials,
+    whose matrices are well conditioned; with powers in place of these polynomials, five digits would be lost.
     """
     ends = np.zeros(stages + 1)
     ends[-2:] = -1.0, 1.0  # the nodes are the roots of P_s - P_(s-1), 1 is one of them
@@ -34,43 +36,45 @@ def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 NODES, _WEIGHTS = _radau(_STAGES)
-"""Parts of a step at which the equations are evaluated; the last one is its end."""
+"""Fractions of the step at which the equations are evaluated, the last one at the end of the step, and the matrix a of
+collocation."""
 
 
 def _forms() -> np.ndarray:
-    """Coefficients (power of h, 2, stages, stages + 2) by which x_i and x'_i depend on the k_j of the stages and on x and x'
-    at the start."""
-    found, one, place = np.zeros((3, 2, _STAGES, _STAGES + 2)), np.ones(_STAGES), slice(0, _STAGES)
-    found[2, 0, :, place], found[0, 0, :, -2], found[1, 0, :, -1] = _WEIGHTS @ _WEIGHTS, one, NODES
-    found[1, 1, :, place], found[0, 1, :, -1] = _WEIGHTS, one
-    return found
+    """Return the coefficients (power of h, 2, stages, stages + 2) of the k_j of the stages, of x and of x' at the start in the
+    equations of x_i and x'_i."""
+    forms, ones, stages = np.zeros((3, 2, _STAGES, _STAGES + 2)), np.ones(_STAGES), slice(0, _STAGES)
+    forms[2, 0, :, stages], forms[0, 0, :, -2], forms[1, 0, :, -1] = _WEIGHTS @ _WEIGHTS, ones, NODES
+    forms[1, 1, :, stages], forms[0, 1, :, -1] = _WEIGHTS, ones
+    return forms
 
 
 _FORMS = _forms()
 
 
 def steps_for(radians: Array) -> Array:
-    """Number of steps for the given phase of the fastest oscillation, rad. Decay of any rate does not need more steps."""
+    """Return the number of steps for the total phase of the fastest oscillation, rad; decay of any rate needs no more steps."""
     return jnp.ceil(radians / _PHASE).astype(int)
 
 
 def transition(slopes: Array, h: float | Array) -> Array:
-    """Transition matrix (2 m, 2 m) of (x, x') over a step `h` of x'' = P x + R x', by Radau's collocation of order 11.
+    """Return the transition matrix (2 m, 2 m) of (x, x') over a step `h` of x'' = P x + R x', by Radau's collocation.
 
         x_i = x + h c_i x' + h^2 sum_j (a a)_ij k_j,   x'_i = x' + h sum_j a_ij k_j,   k_i = P_i x_i + R_i x'_i
 
-    The method is L-stable: motions that decay within a step, such as the slip of a load with strong drag, vanish at the end of
-    the step. An explicit method would have to resolve the decay.
+    The order is 11. The method is L-stable: motions that decay fast compared with the step, such as the motion of a load with
+    strong drag relative to the rotor, vanish at the end of the step. An explicit method would have to resolve the decay.
 
-    **Arguments**: `slopes` [P, R] (6, m, 2 m) at `NODES`. **Returns** the matrix, which is differentiable.
+    **Arguments**: `slopes` [P, R] (6, m, 2 m) at `NODES`; `h`: length of the step, s. **Returns** the matrix, which is
+    differentiable.
     """
     stages, m, _ = slopes.shape
     constant, linear, square = jnp.asarray(_FORMS, slopes.dtype)
     forms = constant + h * (linear + h * square)
     rows = jnp.einsum("kil,iakb->ialb", forms, slopes.reshape(stages, m, 2, m)).reshape(stages * m, -1)
     matrix, right = jnp.split(rows, [stages * m], axis=1)
-    found = small_solve(jnp.eye(stages * m, dtype=slopes.dtype) - matrix, right)
-    whole = jnp.concatenate([found, jnp.eye(2 * m, dtype=slopes.dtype)]).reshape(stages + 2, m, 2 * m)
+    accelerations = small_solve(jnp.eye(stages * m, dtype=slopes.dtype) - matrix, right)
+    whole = jnp.concatenate([accelerations, jnp.eye(2 * m, dtype=slopes.dtype)]).reshape(stages + 2, m, 2 * m)
     return jnp.tensordot(forms[:, -1], whole, 1).reshape(2 * m, 2 * m)
 
 
@@ -82,10 +86,10 @@ def flow(
     dtype: jnp.dtype,
     max_steps: int | None = None,
 ) -> Array:
-    """Transition matrix (2 m, 2 m) of (x, x') over a `duration` of x'' = P(t) x + R(t) x', in equal steps of `transition`.
+    """Return the transition matrix (2 m, 2 m) of (x, x') over a `duration` of x'' = P(t) x + R(t) x', in equal steps.
 
-    **Arguments**: `slopes(t)`: [P, R] (m, 2 m); `size` m; `steps`, a Python number or a scalar array; `max_steps`: see
-    `repeat`.
+    **Arguments**: `slopes(t)`: [P, R] (m, 2 m); `size` m; `duration`, s; `steps`: their number, a Python number or a scalar
+    array; `max_steps`: the `limit` of `repeat`.
     """
     h = jnp.asarray(duration / steps, dtype)
 

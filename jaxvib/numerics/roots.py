@@ -25,18 +25,21 @@ def bracketed_root(
 ) -> Array:
     """Return the root of `f` between `low` and `high` (scalars) up to rounding; f must change sign once between them.
 
-    **Arguments**: `ends`: f(low) and f(high) if they are known; `fast`: the same function at lower cost, for the search. `f`
-    is then used only for derivatives and, if `polish` is True (scalar), for final steps of Newton's method.
+    Each step is an inverse quadratic interpolation if its result is reliable, otherwise a bisection (Chandrupatla, Adv. Eng.
+    Software 28, 1997). Derivatives of any order follow from the implicit function theorem.
 
-    Each step is inverse quadratic interpolation where that is safe, otherwise bisection (Chandrupatla, Adv. Eng. Software 28,
-    1997). Derivatives of any order follow from the implicit function theorem.
+    **Arguments**
+
+    - `ends`: f(low) and f(high) if they are known
+    - `fast`: the same function at lower cost, for the search; `f` is then used for derivatives only, and for `polish`
+    - `polish`: Boolean scalar; if it is True, three steps of Newton's method on `f` follow the search
     """
 
     def solve(exact: Callable[[Array], Array], _: Array) -> Array:
         g = exact if fast is None else fast
         tolerance = 2.0 * jnp.finfo(low.dtype).eps
 
-        def open_(carry: tuple[Array, ...]) -> Array:
+        def is_open(carry: tuple[Array, ...]) -> Array:
             steps, a, fa, b, fb, *_ = carry
             width = tolerance * jnp.maximum(jnp.abs(a), jnp.abs(b))
             bracketed = ((fa > 0.0) != (fb > 0.0)) & (fa != 0.0) & (fb != 0.0)
@@ -49,22 +52,22 @@ def bracketed_root(
             steps, a, fa, b, fb, share, best, least = carry
             x = a + share * (b - a)
             fx = g(x)
-            found = size(fx)
-            best, least = jnp.where(found < least, x, best), jnp.minimum(found, least)
+            size_at_x = size(fx)
+            best, least = jnp.where(size_at_x < least, x, best), jnp.minimum(size_at_x, least)
             same = (fx > 0.0) == (fa > 0.0)
             c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
             b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
             a, fa = x, fx
             return steps + 1, a, fa, b, fb, next_share(jnp, (a, fa), (b, fb), (c, fc), tolerance), best, least
 
-        # Both ends are evaluated at once, because the program then contains one copy of g, not two.
+        # Both ends are evaluated in one `vmap`, so that the program contains one copy of g, not two.
         f_low, f_high = jax.vmap(g)(jnp.stack([low, high])) if ends is None else ends
         # The compiler may recompute g(x) for each use with other rounding. Near the root the signs of two copies can differ,
         # and the bracket is lost. The point with the smallest |g| is then the root.
         at_low, at_high = size(f_low), size(f_high)
         best, least = jnp.where(at_low < at_high, low, high), jnp.minimum(at_low, at_high)
         start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
-        root = jax.lax.while_loop(open_, step, start)[6]
+        root = jax.lax.while_loop(is_open, step, start)[6]
         return root if polish is None else polished(exact, g, root, polish)
 
     def polished(exact: Callable[[Array], Array], g: Callable[[Array], Array], root: Array, needed: Array) -> Array:
@@ -99,10 +102,10 @@ def next_share(
     before: tuple[Numbers, Numbers],
     tolerance: float | np.floating,
 ) -> Numbers:
-    """Return the next point of the search for a root between `newest` and `other`, as a fraction of the way; `before` is the
-    point before these.
+    """Return the next point of the search for a root, as a fraction of the way from `newest` to `other`.
 
-    Points are (x, f(x)), numbers or arrays of the library `xp`, numpy or jax.numpy; `tolerance` is relative.
+    **Arguments**: `xp`: the library, numpy or jax.numpy; `newest`, `other`: ends (x, f(x)) of the bracket, numbers or arrays;
+    `before`: the point that was removed from the bracket last; `tolerance` of x, relative.
     """
     (a, fa), (b, fb), (c, fc) = newest, other, before
     xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
@@ -113,7 +116,9 @@ def next_share(
 
 
 def _nonzero(slope: Array) -> Array:
-    """Replace a slope of 0 by a tiny one. At a fold the slope is 0 and the derivative does not exist, which the status states;
-    the replacement prevents an overflow."""
+    """Replace a slope of 0 by a tiny one, which prevents an overflow.
+
+    At a fold the slope is 0 and the derivative does not exist; the status of the result states this.
+    """
     tiny = jnp.finfo(slope.dtype).tiny ** 0.5
     return jnp.where(jnp.abs(slope) < tiny, tiny, slope)

@@ -33,22 +33,25 @@ _TERMS = {np.dtype(np.float64): 8, np.dtype(np.float32): 5}
 
 
 def _parts(dtype: np.dtype) -> tuple[float, float, float]:
-    """pi as a sum of three numbers, the first two short enough that multiples of them up to 2^bits are exact."""
+    """Return pi as a sum of three numbers.
+
+    The first two have 22 unused bits (single precision: 11), so that their products with numbers up to 2^22 (2^11) are exact.
+    """
     digits, spare = (53, 22) if dtype == np.float64 else (24, 11)
-    parts, left = [], _PI
+    parts, rest = [], _PI
     for _ in range(2):
-        scale = 2 ** (digits - spare - math.frexp(float(left))[1])
-        part = Fraction(math.floor(left * scale), scale)
+        scale = 2 ** (digits - spare - math.frexp(float(rest))[1])
+        part = Fraction(math.floor(rest * scale), scale)
         parts.append(float(part))
-        left -= part
-    return parts[0], parts[1], float(left)
+        rest -= part
+    return parts[0], parts[1], float(rest)
 
 
 @functools.cache
 def _polynomial(terms: int) -> tuple[float, ...]:
-    """Coefficients of P(z), lowest power first, with sin r = r + r z P(z), z = r^2 up to (pi/2)^2.
+    """Return the coefficients of P(z), lowest power first, with sin r = r + r z P(z), z = r^2 up to (pi/2)^2.
 
-    Taylor's series with its highest powers removed one after another by Chebyshev polynomials (economization); the error
+    The highest powers of Taylor's series are removed one after another by Chebyshev polynomials (economization). The error
     exceeds that of the best polynomial by a few per cent.
     """
     scale = 2 / (_PI / 2) ** 2
@@ -70,7 +73,7 @@ def _polynomial(terms: int) -> tuple[float, ...]:
 
 
 def _summed(z: Array, coefficients: Sequence[float]) -> Array:
-    """Polynomial sum_k coefficients_k z^k in pairs (Estrin), with a third of the successive products of Horner's form."""
+    """Return sum_k coefficients_k z^k, added in pairs (Estrin), with a third of the successive products of Horner's form."""
     parts: list[Array | float] = list(coefficients)
     while len(parts) > 1:
         parts = [parts[k] + parts[k + 1] * z if k + 1 < len(parts) else parts[k] for k in range(0, len(parts), 2)]
@@ -79,7 +82,7 @@ def _summed(z: Array, coefficients: Sequence[float]) -> Array:
 
 
 def _sine(x: Array, ahead: float) -> Array:
-    """sin(x + pi ahead), `ahead` 0 or 1/2."""
+    """Return sin(x + pi ahead); `ahead` is 0 or 1/2."""
     dtype = np.dtype(x.dtype)
     first, second, third = _parts(dtype)
     whole = jnp.round(x * float(1 / _PI) + ahead) if ahead else jnp.round(x * float(1 / _PI))
@@ -100,7 +103,7 @@ def _sine(x: Array, ahead: float) -> Array:
 
 @jax.custom_jvp
 def sine_and_cosine(x: Array) -> tuple[Array, Array]:
-    """sin x and cos x; x in rad, any shape.
+    """Return sin x and cos x; x in rad, any shape.
 
     >>> import jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)

@@ -64,8 +64,8 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
 
 def default_folder() -> Path:
     """Return the folder in which programs are cached by default."""
-    set_already = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    return Path(set_already or user_folder())
+    folder_of_jax = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    return Path(folder_of_jax or user_folder())
 
 
 def set_program_folder(folder: Path | None) -> None:
@@ -80,8 +80,10 @@ def program_folder() -> Path | None:
 
 @contextlib.contextmanager
 def compiled_anew() -> Iterator[None]:
-    """Disable both caches within the context, in order to measure the compile times of programs that this process has not
-    used."""
+    """Disable both caches within the context, in order to measure compile times.
+
+    A program that this process has already used is in memory and is not compiled again.
+    """
     folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
     set_program_folder(None)
     jax.config.update("jax_enable_compilation_cache", False)
@@ -97,10 +99,10 @@ def require_own(folder: Path) -> None:
     if not hasattr(os, "geteuid"):  # on Windows only the owner can write to a home folder
         return
     for place in (folder, *folder.resolve().parents):
-        found = place.stat()
-        mode = stat.S_IMODE(found.st_mode)
-        if found.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
-            raise InputError("folder", f"is '{folder}'; it must belong to you, but '{place}' belongs to user {found.st_uid}")
+        status = place.stat()
+        mode = stat.S_IMODE(status.st_mode)
+        if status.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
+            raise InputError("folder", f"is '{folder}'; it must belong to you, but '{place}' belongs to user {status.st_uid}")
         others = mode & (stat.S_IWGRP | stat.S_IWOTH if place == folder else stat.S_IWOTH)
         if others and not (mode & stat.S_ISVTX and place != folder):
             raise InputError(

@@ -74,13 +74,17 @@ except ImportError:
     if TYPE_CHECKING:
         raise
     ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
-"""Classes of traced programs. `jax.extend.core` may change at any time; without it equations are integrated on arrays."""
+"""Classes of traced programs, from `jax.extend.core`, which may change at any time. Without them, equations are integrated on
+arrays in place of scalars."""
 
 
 def rewritten(
     program: ClosedJaxpr, equations: Sequence[tuple[JaxprEqn, list[Var | Literal]]], results: list[Var | Literal]
 ) -> ClosedJaxpr:
-    """Return the program with these equations, inputs and results; return it unchanged if JAX does not allow that."""
+    """Return the program with these operations, their inputs and these results.
+
+    The program is returned unchanged if JAX does not allow the replacement.
+    """
     try:
         changed = [equation.replace(invars=inputs) for equation, inputs in equations]
         return program.replace(jaxpr=program.jaxpr.replace(eqns=changed, outvars=results))
@@ -165,31 +169,32 @@ def backend_started() -> bool:
 
 
 def accepted_flags(flags: list[str]) -> list[str]:
-    """Return those of the `flags` that this jaxlib supports, because an unknown flag in XLA_FLAGS ends the process.
+    """Return those of the `flags` that this jaxlib supports. An unknown flag in XLA_FLAGS would end the process.
 
-    For an untested version of jaxlib each flag is tried in a separate process, which takes seconds; the result is stored in a
-    file.
+    For a version of jaxlib outside `_TESTED_JAXLIB` each flag is tried in a separate process, which takes seconds; the result
+    is stored in a file.
     """
     version, number = importlib.metadata.version("jaxlib"), _jaxlib()
     if _TESTED_JAXLIB[0] <= number <= _TESTED_JAXLIB[1]:
         return [flag for flag in flags if number < _REMOVED_FLAGS.get(flag.partition("=")[0], (number[0], number[1] + 1))]
     path = user_folder() / f"flags-{version}.json"
-    answers: dict[str, bool] = {}
+    is_accepted: dict[str, bool] = {}
     with contextlib.suppress(OSError, ValueError):
-        answers = {str(flag): answer is True for flag, answer in json.loads(path.read_text()).items()}
-    asked = [flag for flag in flags if flag not in answers]
-    if asked:
-        answers |= {flag: starts_with([flag]) for flag in asked}
+        is_accepted = {str(flag): value is True for flag, value in json.loads(path.read_text()).items()}
+    untested = [flag for flag in flags if flag not in is_accepted]
+    if untested:
+        is_accepted |= {flag: starts_with([flag]) for flag in untested}
         with contextlib.suppress(OSError):
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            path.write_text(json.dumps(answers))
-    return [flag for flag in flags if answers[flag]]
+            path.write_text(json.dumps(is_accepted))
+    return [flag for flag in flags if is_accepted[flag]]
 
 
 def loops_need_a_flag() -> bool:
     """Return True for jaxlib before 0.12, which without a flag runs the body of a time loop as a chain of small functions.
 
-    Measured ratio of the time of a run without the flag to that with it: 2.4 with jaxlib 0.10.2, 0.9 to 1.1 with 0.12.0.
+    Measured ratio of the processor time of a run without the flag to that with it: 7 to 10 with jaxlib 0.10.2. The ratio of the
+    times with jaxlib 0.12.0 is 0.9 to 1.1.
     """
     return _jaxlib() < (0, 12)
 
@@ -215,12 +220,13 @@ def starts_with(flags: list[str]) -> bool:
 
 
 _patching = threading.Lock()
-_patches: dict[tuple[str, str], tuple[list[int], Any]] = {}  # threads inside, and the original attribute
+_patches: dict[tuple[str, str], tuple[list[int], Any]] = {}
+"""Replaced attributes by module and name: the threads for which they are replaced, and the original attribute."""
 
 
 @contextlib.contextmanager
 def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> Iterator[None]:
-    """Replace a function of a module in the current thread only; several threads may do so at the same time."""
+    """Replace a function of a module in the current thread only; several threads may use this context at the same time."""
     key, thread = (module.__name__, name), threading.get_ident()
     with _patching:
         if key not in _patches:
@@ -249,27 +255,29 @@ def _unpatched(module: ModuleType | None, name: str) -> Any:
 
 @contextlib.contextmanager
 def no_host_checks() -> Iterator[None]:
-    """Trace Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors. Errors need a callback into Python, and
-    a program with a callback cannot be stored on disk. Equinox's own setting, the environment variable EQX_ON_ERROR, is not
-    sufficient: it is read when Equinox is imported, and applies to the whole process. If it differs from the default, or if
-    Equinox lacks one of the two attributes, the checks are not changed.
+    """Trace Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
+
+    Errors need a callback into Python, and a program with a callback cannot be stored on disk. Equinox's own setting, the
+    environment variable EQX_ON_ERROR, is not sufficient: it is read when Equinox is imported, and applies to the whole process.
+    If the variable differs from its default, or if Equinox lacks one of the private functions that are used here, the checks
+    are not changed.
     """
     errors = sys.modules.get("equinox._errors")
-    plain = getattr(errors, "branched_error_if_impl", None)
-    known = hasattr(errors, "branched_error_if_impl_jit") and getattr(errors, "EQX_ON_ERROR", None) == "raise"
-    if errors is None or plain is None or not known:
+    unjitted = getattr(errors, "branched_error_if_impl", None)
+    is_default = hasattr(errors, "branched_error_if_impl_jit") and getattr(errors, "EQX_ON_ERROR", None) == "raise"
+    if errors is None or unjitted is None or not is_default:
         yield
         return
 
     def to_nan(*args: object, on_error: str) -> object:
-        # The function without `jit`: JAX would use the trace of the compiled function again outside of this context.
-        return plain(*args, on_error="nan" if on_error == "default" else on_error)
+        # The function without `jit` is called, because JAX would reuse the trace of the compiled one outside of this context.
+        return unjitted(*args, on_error="nan" if on_error == "default" else on_error)
 
     with _patched(errors, "branched_error_if_impl_jit", to_nan):
         yield
 
 
-class _Instead:
+class _ModuleWithReplacements:
     """Module in which some names are replaced."""
 
     def __init__(self, module: ModuleType, **names: object):
@@ -304,18 +312,18 @@ def fast_diffrax_loop_end() -> Iterator[None]:
         return
 
     def shorter(**arguments: object) -> object:
-        left, thread = _ULPS, threading.get_ident()
+        remaining, thread = _ULPS, threading.get_ident()
 
         def prevbefore(x: Array) -> Array:
-            nonlocal left
-            if left == 0 or threading.get_ident() != thread:
+            nonlocal remaining
+            if remaining == 0 or threading.get_ident() != thread:
                 return internals.prevbefore(x)
-            left -= 1
-            return x if left else ulps_below(x, _ULPS)
+            remaining -= 1
+            return x if remaining else ulps_below(x, _ULPS)
 
         with _REPLACEMENT_LOCK:  # another thread may trace another loop at the same time
             internals = integrate.eqxi
-            setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
+            setattr(integrate, "eqxi", _ModuleWithReplacements(internals, prevbefore=prevbefore))  # noqa: B010
             try:
                 return loop(**arguments)
             finally:
@@ -334,7 +342,7 @@ def _source(function: FunctionType) -> str:
 
 
 def ulps_below(x: Array, number: int) -> Array:
-    """Return the floating-point number `number` units in the last place below `x`, which is not subnormal."""
+    """Return the floating-point number that is `number` units in the last place below `x`; `x` must not be subnormal."""
     whole = jax.lax.bitcast_convert_type(x, jnp.int64 if x.dtype.itemsize == 8 else jnp.int32)
     return jax.lax.bitcast_convert_type(jnp.where(x > 0.0, whole - number, whole + number), x.dtype)
 
@@ -344,11 +352,11 @@ def enumeration_of(item: object) -> type[eqx.Enumeration]:
 
     If Equinox lacks the attribute, the name of the enumeration is read from the representation.
     """
-    found = getattr(item, "_enumeration", None)
-    if found is None:
+    enumeration = getattr(item, "_enumeration", None)
+    if enumeration is None:
         module, _, name = repr(item).split("<")[0].rpartition(".")
-        found = getattr(sys.modules[module], name)
-    return found
+        enumeration = getattr(sys.modules[module], name)
+    return enumeration
 
 
 def enumeration_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
@@ -356,9 +364,9 @@ def enumeration_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
 
     If Equinox lacks its table of names, they are read from the source of the enumeration.
     """
-    known = getattr(enumeration, "_name_to_item", None)
-    if known is not None:
-        return tuple(known)
+    members = getattr(enumeration, "_name_to_item", None)
+    if members is not None:
+        return tuple(members)
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(enumeration))).body
     assert isinstance(definition, ast.ClassDef)
     targets = [target for node in definition.body if isinstance(node, ast.Assign) for target in node.targets]

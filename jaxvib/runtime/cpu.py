@@ -14,7 +14,9 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import accepted_flags, backend_started, loops_need_a_flag, wide_vectors_are_right
 
 _EXTRA_OPTIONS_FLAG = "--xla_backend_extra_options="
-_LOOPS = "xla_cpu_small_while_loop_byte_threshold"
+_LOOP_OPTION = "xla_cpu_small_while_loop_byte_threshold"
+"""Option of XLA: size, bytes, up to which a loop is compiled into one function."""
+
 _CODE_GENERATOR_FLAG = "--xla_cpu_use_fusion_emitters=false"
 """Flag that selects XLA's older code generator: equally fast programs in two thirds of the compile time."""
 
@@ -33,8 +35,8 @@ def prepare_cpu(devices: int | None = 1) -> str:
     - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
     - `--xla_cpu_use_fusion_emitters=false`, jax before 0.11: a code generator that needs two thirds of the compile time
     - `--xla_cpu_prefer_vector_width=512` on processors with AVX-512: batches of runs take 0.9 of the time
-    - `--xla_force_host_platform_device_count` for several `devices`: your own programs may use them; jaxvib uses all cores
-      without it
+    - `--xla_force_host_platform_device_count` for several `devices`, for use in your own programs; jaxvib itself uses all
+      cores without this flag
 
     OpenBLAS, which does the linear algebra of JAX and SciPy, is limited to one thread by OPENBLAS_NUM_THREADS=1, because its
     waiting threads take the cores from all other computations.
@@ -62,18 +64,18 @@ def prepare_cpu(devices: int | None = 1) -> str:
     if backend_started():
         raise InputError("prepare_cpu", "was called after JAX had begun to compute; call it before any array is created")
     flags = os.environ.get("XLA_FLAGS", "").split()
-    ours = []
+    added = []
     if loops_need_a_flag():
-        for place, flag in enumerate(flags):
-            if flag.startswith(_EXTRA_OPTIONS_FLAG) and _LOOPS not in flag:
-                flags[place] = f"{flag},{_LOOPS}=1000000000"
-        if not any(_LOOPS in flag for flag in flags):
-            ours.append(f"{_EXTRA_OPTIONS_FLAG}{_LOOPS}=1000000000")
-    ours.append(_CODE_GENERATOR_FLAG)
+        for index, flag in enumerate(flags):
+            if flag.startswith(_EXTRA_OPTIONS_FLAG) and _LOOP_OPTION not in flag:
+                flags[index] = f"{flag},{_LOOP_OPTION}=1000000000"
+        if not any(_LOOP_OPTION in flag for flag in flags):
+            added.append(f"{_EXTRA_OPTIONS_FLAG}{_LOOP_OPTION}=1000000000")
+    added.append(_CODE_GENERATOR_FLAG)
     if devices > 1:
-        ours.append(f"--xla_force_host_platform_device_count={devices}")
+        added.append(f"--xla_force_host_platform_device_count={devices}")
     names = [flag.partition("=")[0] for flag in flags]
-    flags += accepted_flags([flag for flag in ours if flag.partition("=")[0] not in names])
+    flags += accepted_flags([flag for flag in added if flag.partition("=")[0] not in names])
     if re.search(r"\bavx512f\b", processor()) and _VECTOR_WIDTH_FLAG not in names and wide_vectors_are_right(flags):
         flags += accepted_flags([f"{_VECTOR_WIDTH_FLAG}=512"])
     os.environ["XLA_FLAGS"] = " ".join(flags)
@@ -82,17 +84,18 @@ def prepare_cpu(devices: int | None = 1) -> str:
 
 
 def limit_blas_threads() -> None:
-    """Let the linear algebra of JAX, which is SciPy's OpenBLAS, use one thread, unless OPENBLAS_NUM_THREADS is set.
+    """Limit the linear algebra of JAX, which is SciPy's OpenBLAS, to one thread, unless OPENBLAS_NUM_THREADS is set.
 
     The threads of OpenBLAS wait for work in a busy loop and take the cores from all other computations: the solution of 50
-    equations needs 14 ms of processor time instead of 0.3 ms. There is no effect if SciPy's linear algebra was imported before.
+    equations needs 14 ms of processor time instead of 0.3 ms. If SciPy's linear algebra was imported before, this function has
+    no effect.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def has_flags() -> bool:
-    """Return True if time loops run as one function: this jaxlib needs no flag, or the environment has it."""
-    return not loops_need_a_flag() or _LOOPS in os.environ.get("XLA_FLAGS", "")
+    """Return True if time loops are compiled into one function: this jaxlib needs no flag, or XLA_FLAGS contains the flag."""
+    return not loops_need_a_flag() or _LOOP_OPTION in os.environ.get("XLA_FLAGS", "")
 
 
 @functools.cache

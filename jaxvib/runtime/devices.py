@@ -31,9 +31,9 @@ def shared_devices() -> list[object]:
 
     The CPU counts as a single device, even if XLA divides it into several, because threads share its cores.
     """
-    found = jax.local_devices()
+    devices = jax.local_devices()
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    return list(found) if chosen is None and len(found) > 1 and found[0].platform != "cpu" else [None]
+    return list(devices) if chosen is None and len(devices) > 1 and devices[0].platform != "cpu" else [None]
 
 
 def is_processor() -> bool:
@@ -58,7 +58,9 @@ def numpy_of(tree: PyTree) -> ModuleType:
 
 
 def on_device(tree: PyTree) -> PyTree:
-    """Copy NumPy's arrays and numbers in a tree to JAX's device; `jnp.asarray` would compile a program for each shape.
+    """Copy NumPy's arrays and numbers in a tree to JAX's device.
+
+    `jnp.asarray` is not used because it compiles a program for each shape.
 
     >>> on_device({"a": np.arange(2.0), "b": None})
     {'a': Array([0., 1.], dtype=float64), 'b': None}
@@ -69,7 +71,10 @@ def on_device(tree: PyTree) -> PyTree:
 
 
 def arrays_on_device(leaves: Sequence[Any]) -> list[Any]:
-    """Copy NumPy's arrays among the leaves of a tree to JAX's device; leave Python's numbers, which are part of programs."""
+    """Copy NumPy's arrays among the leaves of a tree to JAX's device.
+
+    Python's numbers are returned unchanged, because they are constants of programs.
+    """
     arrays = [leaf for leaf in leaves if isinstance(leaf, np.ndarray)]
     moved = iter(jax.device_put(arrays) if arrays else ())
     return [next(moved) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
@@ -82,12 +87,12 @@ def take_a_device() -> None:
     devices = jax.local_devices()
     if len(devices) > 1:
         with _DEVICE_LOCK:
-            place = _place()
-        jax.config.update("jax_default_device", devices[place % len(devices)])
+            index = _worker_index()
+        jax.config.update("jax_default_device", devices[index % len(devices)])
 
 
 @functools.cache
-def _place() -> int:
+def _worker_index() -> int:
     """Return the index of this process among the workers on this machine that see the same accelerators.
 
     A process reserves an index by locking a file. The system releases the lock when the process ends for any reason; the
@@ -95,13 +100,13 @@ def _place() -> int:
     """
     import fcntl  # does not exist on Windows, where JAX has no accelerators
 
-    seen = hashlib.sha256(repr([os.environ.get(name) for name in _VISIBILITY_VARIABLES]).encode()).hexdigest()[:16]
-    for place in itertools.count():
-        path = os.path.join(tempfile.gettempdir(), f"jaxvib-worker-{os.getuid()}-{seen}-{place}")
+    visible = hashlib.sha256(repr([os.environ.get(name) for name in _VISIBILITY_VARIABLES]).encode()).hexdigest()[:16]
+    for index in itertools.count():
+        path = os.path.join(tempfile.gettempdir(), f"jaxvib-worker-{os.getuid()}-{visible}-{index}")
         file = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)  # stays open until the process ends
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return place
+            return index
         except BlockingIOError:
             os.close(file)
     raise AssertionError

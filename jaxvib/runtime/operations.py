@@ -28,10 +28,10 @@ def operations(function: Callable[..., Any], *arguments: Any) -> int:
 
 def _walk(jaxpr: Any) -> Iterator[Any]:
     for equation in jaxpr.eqns:
-        inner = [each for value in equation.params.values() for each in _programs(value)]
-        if inner:
-            for each in inner:
-                yield from _walk(each)
+        called = [program for value in equation.params.values() for program in _programs(value)]
+        if called:
+            for program in called:
+                yield from _walk(program)
         else:
             yield equation
 
@@ -123,16 +123,16 @@ def _text(value: Any, inner: list[Any] | None = None) -> str:
 
 
 def pruned(function: Callable[..., Sequence[Array]], *like: Array) -> Callable[..., list[Array]]:
-    """Return the traced function of arrays like `like`, without the operations on which no result depends.
+    """Trace a function of arrays like `like`, and return it without the operations on which no result depends.
 
-    Call it before a derivative, which would otherwise include these operations.
+    Prune a function before it is differentiated; its derivative would otherwise include these operations.
     """
     if not HAS_JAXPRS:
         return lambda *arrays: list(function(*arrays))
     program = jax.make_jaxpr(function)(*like)
-    needed, kept = {id(result) for result in program.jaxpr.outvars}, []
+    needed, remaining = {id(result) for result in program.jaxpr.outvars}, []
     for equation in reversed(program.jaxpr.eqns):
         if equation.effects or any(id(result) in needed for result in equation.outvars):
             needed |= {id(atom) for atom in equation.invars}
-            kept.append((equation, equation.invars))
-    return jaxpr_as_fun(rewritten(program, kept[::-1], program.jaxpr.outvars))
+            remaining.append((equation, equation.invars))
+    return jaxpr_as_fun(rewritten(program, remaining[::-1], program.jaxpr.outvars))

@@ -25,7 +25,7 @@ from jaxvib.runtime.devices import shared_devices
 from jaxvib.runtime.stored import is_debugging
 
 Item = TypeVar("Item")
-Found = TypeVar("Found")
+Outcome = TypeVar("Outcome")
 
 _OPTIONS = {
     "jax_enable_x64": jax.enable_x64,
@@ -42,7 +42,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Generator[tuple[Item, Found], None, None]:
+def in_parallel(function: Callable[[Item], Outcome], items: Iterable[Item]) -> Generator[tuple[Item, Outcome], None, None]:
     """Evaluate a function of many items in threads, on all cores and accelerators; yield each item with its result.
 
     Results come in the order in which they are finished. Threads that need the same new program wait for the thread that
@@ -53,14 +53,14 @@ def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Gen
     >>> sorted(in_parallel(lambda x: x * x, [3, 1, 2]))
     [(1, 1), (2, 4), (3, 9)]
     """
-    left, devices = iter(items), itertools.cycle(shared_devices())
+    remaining, devices = iter(items), itertools.cycle(shared_devices())
     with_options, threads = _same_options(function), cores()
     pool = ThreadPoolExecutor(threads)
-    running: dict[Future[Found], Item] = {}
+    running: dict[Future[Outcome], Item] = {}
 
     try:
         while True:
-            for item in itertools.islice(left, threads + 1 - len(running)):
+            for item in itertools.islice(remaining, threads + 1 - len(running)):
                 running[pool.submit(with_options, item, next(devices))] = item
             if not running:
                 return
@@ -71,11 +71,11 @@ def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Gen
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _same_options(function: Callable[[Item], Found]) -> Callable[[Item, object], Found]:
+def _same_options(function: Callable[[Item], Outcome]) -> Callable[[Item, object], Outcome]:
     """Return a function of an item and a device that calls `function` with the JAX options of the current thread."""
     wanted = {name: getattr(jax.config, name) for name in _OPTIONS}
 
-    def with_options(item: Item, device: object) -> Found:
+    def with_options(item: Item, device: object) -> Outcome:
         with contextlib.ExitStack() as stack:
             for name, value in (wanted if device is None else wanted | {"jax_default_device": device}).items():
                 if getattr(jax.config, name) != value:  # setting an option makes JAX trace programs again
@@ -114,22 +114,22 @@ def in_chunks(
     index = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
     if any(traced(leaf) for leaf in jax.tree.leaves((cases, shared))):
 
-        def within(which: jax.Array) -> PyTree[jax.Array]:
-            return function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], cases), *shared)
+        def evaluate_traced(rows: jax.Array) -> PyTree[jax.Array]:
+            return function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[rows], cases), *shared)
 
-        found = jax.lax.map(within, jnp.asarray(index))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
-    plain = jax.tree.map(np.asarray, cases)
+        results = jax.lax.map(evaluate_traced, jnp.asarray(index))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
+    known_cases = jax.tree.map(np.asarray, cases)
 
-    def computed(chunk: int) -> PyTree[np.ndarray]:
-        out = function(*jax.tree.map(lambda leaf: leaf[index[chunk]], plain), *shared)
-        return jax.tree.map(np.asarray, out)
+    def evaluate(chunk: int) -> PyTree[np.ndarray]:
+        result = function(*jax.tree.map(lambda leaf: leaf[index[chunk]], known_cases), *shared)
+        return jax.tree.map(np.asarray, result)
 
-    parts = in_threads(computed, chunks, shared_devices())
+    parts = in_threads(evaluate, chunks, shared_devices())
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
 
-def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[object] = (None,)) -> list[Found]:
+def in_threads(function: Callable[[int], Outcome], number: int, devices: Sequence[object] = (None,)) -> list[Outcome]:
     """Return the function's results for 0, 1, ..., `number` - 1, in this order, computed in threads.
 
     Each thread, including the caller's, takes the next number when it is free, which is faster than a submission of each item
@@ -143,16 +143,16 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
         return [function(k) for k in range(number)]
     with_options = _same_options(function)
     workers = min(max(cores(), len(devices)), number)
-    left, found, failed = iter(range(number)), [], []
+    remaining, outcomes, failures = iter(range(number)), [], []
 
     def work(worker: int) -> None:
         try:
-            for k in left:
-                if failed:
+            for k in remaining:
+                if failures:
                     break
-                found.append((k, with_options(k, devices[worker % len(devices)])))
+                outcomes.append((k, with_options(k, devices[worker % len(devices)])))
         except BaseException:
-            failed.append(True)
+            failures.append(True)
             raise
 
     others = [_threads().submit(work, k) for k in range(1, workers)]
@@ -163,7 +163,7 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
         wait(begun)
     for other in begun:
         other.result()
-    return [value for _, value in sorted(found, key=lambda each: each[0])]
+    return [value for _, value in sorted(outcomes, key=lambda outcome: outcome[0])]
 
 
 def in_background(*tasks: Callable[[], object]) -> None:

@@ -112,7 +112,10 @@ def _is_simple(tracer: object) -> bool:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class _CallSignature:
-    """Function with its arguments, arrays replaced by slots; `outputs` contains the structure of the last result."""
+    """Call of a cached function: the function, and its arguments with slots in place of arrays.
+
+    `outputs` contains the structure of the last result.
+    """
 
     function: CachedFunction
     arguments: Skeleton
@@ -228,8 +231,8 @@ def _vjp_backward(
     """Return the cotangents of the active arrays; `types` are the types of all arrays."""
     pullback, zeros = _traced_pullback(call, active, types)
     nonzero = iter(cotangents)
-    given = [next(nonzero) if is_wanted else zero for is_wanted, zero in zip(wanted, zeros, strict=True)]
-    return list(pullback.filled(residuals)(given))
+    all_cotangents = [next(nonzero) if is_wanted else zero for is_wanted, zero in zip(wanted, zeros, strict=True)]
+    return list(pullback.filled(residuals)(all_cotangents))
 
 
 @cached
@@ -259,7 +262,8 @@ def _vjp_from_solution(
 
 
 def _pullback(call: _CallSignature, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:
-    """Return the outputs and the pullback, and store the form of the pullback for `_traced_pullback`."""
+    """Return all outputs and the pullback (a function from cotangents of the floating-point outputs to those of the active
+    arrays), and store the form of the pullback for `_traced_pullback`."""
     function, active_arrays = _differentiable(call, active, arrays)
     inexact, pullback, outputs = jax.vjp(function, *active_arrays, has_aux=True)
     form = Skeleton.of(*jax.tree.flatten(pullback)), tuple(map(zero_of, inexact))
@@ -296,12 +300,12 @@ def _batched_program(call: _CallSignature, batched: tuple[bool, ...], arrays: li
     """Return the results of a batch; the first axis of each `batched` array is the axis of the batch."""
     shares = _shares_result(call, batched)
 
-    def one(*arrays: Array) -> Any:
+    def evaluate_entry(*arrays: Array) -> Any:
         result = call(arrays)
         return (call.split(result[0]), result[1]) if shares else call.split(result)
 
     axes = [0 if is_batched else None for is_batched in batched]
-    outputs = jax.vmap(one, in_axes=axes, out_axes=(None, 0) if shares else 0)(*arrays)
+    outputs = jax.vmap(evaluate_entry, in_axes=axes, out_axes=(None, 0) if shares else 0)(*arrays)
     return (call.result(outputs[0]), outputs[1]) if shares else call.result(outputs)
 
 
@@ -335,8 +339,8 @@ def _differentiate(arrays: Sequence[Array], tangents: Sequence[Any], *, call: _C
             result, residuals = _vjp_forward(call, active, list(arrays))
         types = tuple(jax.typeof(x) for x in jax.tree.leaves(result) if eqx.is_array(x) and _is_inexact(x))
         output_tangents = _linear_map(*nonzero, at=_LinearizationPoint(call, active, list(arrays), residuals, types))
-    outputs, known = call.split(result), iter(output_tangents)
-    return outputs, [next(known) if _is_inexact(x) else zero_of(x) for x in outputs]
+    outputs, inexact_tangents = call.split(result), iter(output_tangents)
+    return outputs, [next(inexact_tangents) if _is_inexact(x) else zero_of(x) for x in outputs]
 
 
 def _batch(arrays: Sequence[Array], axes: Sequence[Any], *, call: _CallSignature) -> tuple[list[Array], list[Any]]:

@@ -16,8 +16,10 @@ from jaxvib.runtime.cpu import has_flags, limit_blas_threads, prepare_cpu
 def start() -> None:
     """Call `prepare_cpu()` and `use_cache()`, unless they were called before or JAXVIB_AUTOMATIC=off in the environment.
 
-    The first use of a public name of jaxvib, other than errors and these two functions, calls it. A warning is issued if JAX
-    has already computed, because XLA's options then have no effect, and if programs cannot be cached.
+    The first use of a public name of jaxvib, other than errors and these two functions, calls `start`. It issues a warning
+
+    - if JAX has already begun to compute, because XLA's options then have no effect
+    - if programs cannot be cached
     """
     if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
         return
@@ -26,7 +28,7 @@ def start() -> None:
         if backend_started():
             warnings.warn(
                 "JAX began to compute before jaxvib was used: in this process, time integration "
-                "takes up to 50 times as long and "
+                "takes about 10 times as long and "
                 "compilation 1.5 times as long. Call jaxvib.prepare_cpu() before any array is created, "
                 "or switch this warning off by "
                 "JAXVIB_AUTOMATIC=off in the environment",

@@ -62,7 +62,7 @@ UNKNOWN_STORED_SIZE = 100_000
 
 _clock = itertools.count()
 _functions: weakref.WeakSet[StoredFunction] = weakref.WeakSet()
-_listing = threading.Lock()  # of `_functions`
+_functions_lock = threading.Lock()
 
 
 class StoredFunction(Generic[T]):
@@ -89,7 +89,7 @@ class StoredFunction(Generic[T]):
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
         self.lock = threading.RLock()  # threads that need the same program wait for the thread that compiles it
-        with _listing:
+        with _functions_lock:
             _functions.add(self)
 
     def __call__(self, leaves: Sequence[Any], treedef: Any) -> T:
@@ -102,7 +102,7 @@ class StoredFunction(Generic[T]):
 
     def compiled(self, leaves: Sequence[Any], treedef: Any) -> _Program | None:
         """Return the compiled program for these arguments, or None if it cannot be stored."""
-        call, program = self._found(leaves, treedef)
+        call, program = self._look_up(leaves, treedef)
         if program is _UNKNOWN:
             folder, *_, sharding, _ = call
             with self.lock:
@@ -110,19 +110,19 @@ class StoredFunction(Generic[T]):
                 program = self.ready.get(key, _UNKNOWN)
                 if program is _UNKNOWN:
                     with evaluating():  # inside a transformation JAX would trace these transfers
-                        moved = arrays_on_device(leaves)
-                        program = self._program(folder, moved, treedef, sharding)
+                        on_device = arrays_on_device(leaves)
+                        program = self._program(folder, on_device, treedef, sharding)
                         if program is not None:
-                            program.compile(leaf for leaf in moved if eqx.is_array(leaf))
+                            program.compile(leaf for leaf in on_device if eqx.is_array(leaf))
                     self.ready[key] = program
             _evict_least_recently_used()
         return program
 
     def is_ready(self, leaves: Sequence[Any], treedef: Any) -> bool:
         """Return True if the program for these arguments is in memory or cannot be stored."""
-        return self._found(leaves, treedef)[1] is not _UNKNOWN
+        return self._look_up(leaves, treedef)[1] is not _UNKNOWN
 
-    def _found(self, leaves: Sequence[Any], treedef: Any) -> tuple[Any, _Program | None]:
+    def _look_up(self, leaves: Sequence[Any], treedef: Any) -> tuple[Any, _Program | None]:
         """Return the key of a call and its program in memory.
 
         The program is `_UNKNOWN` if it is not in memory, and None if it cannot be stored.
@@ -206,9 +206,9 @@ class _Program:
 
     @classmethod
     def of(cls, run: Callable[..., list[Array]], structure: Description, size: int = UNKNOWN_STORED_SIZE) -> _Program:
-        places = itertools.count()
-        result = Skeleton(rebuild(structure, map(Slot, places)))
-        if result.size != next(places):
+        indices = itertools.count()
+        result = Skeleton(rebuild(structure, map(Slot, indices)))
+        if result.size != next(indices):
             raise Undescribable("an array of the result is in a static field")
         return cls(run, result, MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * size)
 
@@ -240,7 +240,9 @@ def _no_garbage_collection() -> Iterator[None]:
 
 
 _ARRAYS = (jax.Array, np.ndarray)  # a call copies NumPy's arrays to the device in a tenth of the time of `jax.device_put`
+
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
+"""Mark of a program that is not in memory."""
 
 
 def _evict_least_recently_used() -> None:
@@ -248,7 +250,7 @@ def _evict_least_recently_used() -> None:
 
     The most recently used program is never freed, even if it exceeds the limit alone.
     """
-    with _listing:
+    with _functions_lock:
         functions = list(_functions)
     programs = [
         (p.used, p, function, key) for function in functions for key, p in list(function.ready.items()) if p is not None
@@ -274,7 +276,8 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def _read(path: Path, sharding: Sharding) -> _Program | None:
-    """Read a program; return None if the file is missing, damaged or of another user; the caller then writes it again."""
+    """Read a program; return None if the file is missing, is damaged or belongs to another user. The caller then writes it
+    again."""
     try:
         with path.open("rb") as file:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
@@ -296,7 +299,7 @@ def _compiled(path: Path, exported: export.Exported, sharding: Sharding) -> Call
     # The name is part of the key in JAX's compilation cache. The name includes the processor, which JAX's key lacks. It
     # includes no digest of the sources, because a program that is the same after an edit need not be compiled again.
     run.__name__ = f"{path.stem.rpartition('-')[0]}-{_digest(processor().encode())[:16]}"
-    # Without shardings JAX compiles twice: for uncommitted arrays, which it may move, and for outputs of other programs.
+    # Without `in_shardings` JAX compiles twice: for uncommitted arrays, which it may move, and for outputs of other programs.
     return jax.jit(run, in_shardings=sharding)
 
 

@@ -27,9 +27,9 @@ versions."""
 
 @dataclasses.dataclass(frozen=True)
 class Slot:
-    """Placeholder in a tree for the array with the index `place`."""
+    """Placeholder in a tree for the array with this index."""
 
-    place: int
+    index: int
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ class Skeleton:
     @classmethod
     def of(cls, leaves: Sequence[object], treedef: Any) -> Skeleton:
         """Return the skeleton of a tree with these leaves."""
-        places = itertools.count()
-        return cls(jax.tree.unflatten(treedef, [Slot(next(places)) if eqx.is_array(x) else x for x in leaves]))
+        indices = itertools.count()
+        return cls(jax.tree.unflatten(treedef, [Slot(next(indices)) if eqx.is_array(x) else x for x in leaves]))
 
     @functools.cached_property
     def flat(self) -> tuple[tuple[object, ...], Any]:
@@ -62,8 +62,8 @@ class Skeleton:
     def filled(self, arrays: Iterable[object]) -> Any:
         """Return the tree with these arrays in its slots."""
         leaves, treedef = self.flat
-        given = tuple(arrays)
-        return jax.tree.unflatten(treedef, [given[x.place] if isinstance(x, Slot) else x for x in leaves])
+        arrays = tuple(arrays)
+        return jax.tree.unflatten(treedef, [arrays[x.index] if isinstance(x, Slot) else x for x in leaves])
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Skeleton) and self.key == other.key
@@ -89,7 +89,7 @@ class Undescribable(Exception):
 def describe(value: object, array: Callable[[Any], Description]) -> Description:
     """Return the description of a tree; the function `array` describes its arrays.
 
-    **Raises** `Undescribable`.
+    **Raises** `Undescribable` for a value without a description.
 
     >>> describe({"a": (1, None)}, lambda x: str(x.dtype))
     {'dict': [['a', {'tuple': [1, None]}]]}
@@ -156,10 +156,10 @@ def _instance(kind: object, values: list[object]) -> object:
     names = _fields(kind)
     if issubclass(kind, tuple):
         return tuple.__new__(kind, values)
-    made = object.__new__(kind)
+    instance = object.__new__(kind)
     for name, value in zip(names, values, strict=True):
-        object.__setattr__(made, name, value)
-    return made
+        object.__setattr__(instance, name, value)
+    return instance
 
 
 def _name(value: object) -> str:
@@ -176,9 +176,9 @@ def _named(name: str) -> object:
     if module.partition(".")[0] not in KNOWN_PACKAGES:
         raise Undescribable(f"{name} does not belong to a known package")
     try:
-        found = functools.reduce(getattr, path.split("."), importlib.import_module(module))
+        definition = functools.reduce(getattr, path.split("."), importlib.import_module(module))
     except (ImportError, AttributeError) as error:
         raise Undescribable(f"{name} cannot be found") from error
-    if (getattr(found, "__module__", None), getattr(found, "__qualname__", None)) != (module, path):
+    if (getattr(definition, "__module__", None), getattr(definition, "__qualname__", None)) != (module, path):
         raise Undescribable(f"{name} is not defined in {module}")  # the module only imports it
-    return found
+    return definition
