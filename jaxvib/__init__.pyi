@@ -112,7 +112,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.plan import Accuracy, EqualSteps, Tolerance
-from jaxvib.study.maps.run_ups import run_ups
+from jaxvib.study.maps.run_up_map import run_up_map
 
 # Accuracy and its cost
 from jaxvib.study.accuracy.cost import Cost
@@ -318,7 +318,7 @@ __all__ = [
     "run_up",
     "ensemble",
     "estimate_share",
-    "run_ups",
+    "run_up_map",
     "regime",
     "Tolerance",
     "Accuracy",

@@ -120,7 +120,7 @@ def test_modules_do_not_import_each_other():
         ),
         ("jaxvib.ode.control", "    from jaxvib.machine.scene import Scene", "ode.control imports jaxvib.machine.scene"),
         ("jaxvib.machine.scene", "import jaxvib", "machine.scene imports jaxvib"),
-        ("optimize.space", "from jaxvib.study.maps import run_ups", "optimize.space imports jaxvib.study.maps.run_ups"),
+        ("optimize.space", "from jaxvib.study.maps import run_up_map", "optimize.space imports jaxvib.study.maps.run_up_map"),
     ],
 )
 def test_an_import_turned_round_is_seen(module, line, says):

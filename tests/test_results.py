@@ -33,7 +33,7 @@ from jaxvib.study.audit.numbers import NumberRow
 from jaxvib.study.audit.tiers import TierRow
 from jaxvib.study.capture.capture import _summarize_captures
 from jaxvib.study.capture.curve import ThresholdCurve
-from jaxvib.study.maps.run_ups import RunUps
+from jaxvib.study.maps.run_up_map import RunUpMap
 from jaxvib.study.maps.stability_onset import StabilityMap
 from optimize.pareto import Front
 from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus
@@ -73,10 +73,10 @@ def identified():
     return jv.identify(ROD, jv.Record(run.time, np.asarray(run.angle) + noise))
 
 
-def run_ups():
+def run_up_map():
     regime = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, 3, *leaf.shape)), RESULTS["Run"]().regime)
     kind = np.asarray([["jammed"] * 3, ["failed", "jammed", "balanced"]])
-    return RunUps(np.array([0.1, 1.0]), np.zeros((3, 2)), regime, kind, np.full((2, 3), 5.0), kind != "failed")
+    return RunUpMap(np.array([0.1, 1.0]), np.zeros((3, 2)), regime, kind, np.full((2, 3), 5.0), kind != "failed")
 
 
 def tiers():
@@ -184,7 +184,7 @@ RESULTS = {
     "RunPrediction": lambda: jv.predict_run(RESULTS["MachineFit"](), measured_run()),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "Response": lambda: jv.response(SCREEN, np.linspace(50.0, 110.0, 7)),
-    "RunUps": run_ups,
+    "RunUpMap": run_up_map,
     "Capture": lambda: _summarize_captures(
         np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150, 7200
     ),
@@ -209,7 +209,7 @@ RESULTS = {
 
 # fmt: off
 SEVERAL_PANELS = ["Run", "Envelope", "MotorRunUp", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-                  "BalancedStates", "Response", "Swing", "Identified", "MachineFit", "RunPrediction", "RunUps",
+                  "BalancedStates", "Response", "Swing", "Identified", "MachineFit", "RunPrediction", "RunUpMap",
                   "SynchronousRegimes", "SynchronousOrbit"]
 # fmt: on
 

@@ -48,7 +48,7 @@ def peaks_of_run(run: jv.Run) -> np.ndarray:
 
 
 def full(scene: jv.Scene, until: float, solver: Any, tolerance: float, **given: Any) -> jv.Run:
-    asked = dict(turns=1, max_steps=2**20, estimate=False, throw=False)
+    asked = dict(window_periods=1, max_steps=2**20, estimate=False, throw=False)
     return jv.simulate(scene, until, solver=solver, stepsize_controller=jv.Tolerance(tolerance), **asked, **given)
 
 

@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from parts.common import best, first, published, say
 
 import jaxvib as jv
-from jaxvib.equations.coincident import coincident_model
+from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model, steady_displacement
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import grid_of
@@ -49,7 +49,7 @@ def chain(platforms: int) -> jv.Scene:
 @eqx.filter_jit
 def collocation(scene: jv.Scene, omega: jax.Array, points: int, multipliers: bool):
     """Batches of 100 orbits: rotor speeds, and multipliers where asked."""
-    model, grid = coincident_model(jammed_model(scene)), grid_of(points, True)
+    model, grid = jammed_bodies(jammed_model(scene)), grid_of(points, True)
 
     def one(w):
         motion = periodic_motion(model, grid, "omega", w, rotor_speed_at(model.linear, w))
@@ -246,7 +246,7 @@ def by_differentiation(scene: jv.Scene, quick: bool) -> None:
     """Multipliers alone, of 100 motions: `floquet`, whose linearised equations are written by hand, and the full equations
     differentiated along the same motions by Radau's method of order 11, both over half a period."""
     group, omega = "multipliers of an exact orbit", jnp.linspace(0.6, 0.9, 100)
-    model, grid = coincident_model(jammed_model(scene)), grid_of(16, True)
+    model, grid = jammed_bodies(jammed_model(scene)), grid_of(16, True)
     print(f"{group}; error: of the largest modulus, to many steps")
 
     @jax.jit

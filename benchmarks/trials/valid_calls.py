@@ -55,7 +55,7 @@ def torus_scene() -> jv.Scene:
 
 @functools.cache
 def run() -> jv.Run:
-    return jv.simulate(scene(), 2.0, start="jam", mode=3, samples=16, turns=4)
+    return jv.simulate(scene(), 2.0, start="jam", mode=3, samples=16, window_periods=4)
 
 
 @functools.cache
@@ -221,10 +221,12 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("whirl", scene=r, rotor_speed=(100.0, 200.0), loads="fixed")
     yield call("critical_speeds", scene=r, loads="fixed")
     # Motion
-    motion = dict(start="rest", mode=None, separation=0.0, spin_up=None, save="all", samples=16, turns=4, estimate=False)
+    motion = dict(
+        start="rest", mode=None, separation=0.0, spin_up=None, save="all", samples=16, window_periods=4, estimate=False
+    )
     more = dict(solver=None, stepsize_controller=None, adjoint=None, max_steps=None, progress_meter=None, throw=True)
     yield call("simulate", scene=s, until=0.5, **motion, **more)
-    slow = dict(start="rest", mode=None, spin_up=None, save="all", samples=16, turns=4)
+    slow = dict(start="rest", mode=None, spin_up=None, save="all", samples=16, window_periods=4)
     fewer = {k: v for k, v in more.items() if k != "progress_meter"} | {"max_steps": 999}
     yield call("envelope", scene=s, until=0.5, **slow, **fewer)
     yield call(
@@ -235,7 +237,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     batch = dict(stepsize_controller=fast, estimate=False, batch=2, equations=jv.vector_field)
     yield call("ensemble", make=make, values=drags, until=0.2, **batch)
     ups = dict(drag=[1.0, 2.0], starts=2, seed=0, angles=None, stepsize_controller=fast, batch=4, max_steps=None)
-    yield call("run_ups", scene=s, until=0.2, **ups)
+    yield call("run_up_map", scene=s, until=0.2, **ups)
     yield call("growth", scene=s, until=1.0, start="jam", mode=3, stretches=8)
     yield call("regime", scene=s, stretch=later(lambda: run().window))
     yield call("Tolerance", tolerance=1e-8)

@@ -38,9 +38,9 @@ from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import REFUSED, without_numbers
 from jaxvib.units import Number
 
-_MAX_SLIP = 0.5
-"""Largest `Ensemble.slip` of a run whose masses turn at one speed, rad. It lies between a small swing about constant phases and
-a slow drift of the phases."""
+_MAX_RELATIVE_ROTATION = 0.5
+"""Largest `Ensemble.relative_rotation` of a run whose masses turn at one speed, rad. It lies between a small swing about
+constant phases and a slow drift of the phases."""
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """Results of `_run`, for one run or for many."""
@@ -76,8 +76,9 @@ class Ensemble(Result):
     - `state`: final `State` of each run, with arrays that have a leading axis over the runs; in single precision angles are
       within one turn
     - `load_speed` (B, count), rad/s: the mean speed of each load over the last quarter of the run
-    - `slip` (B,), rad: largest difference between the angles through which two masses turn, each in its direction, in the last
-      quarter of the run. A mass is a load, or the rotor of an exciter without loads. It is 0 for a scene with one exciter
+    - `relative_rotation` (B,), rad: largest difference between the angles through which two masses turn, each in its
+      direction, in the last quarter of the run. A mass is a load, or the rotor of an exciter without loads. The difference is 0
+      for a scene with one exciter
     - `error` (B,): estimated error of the final state, as for a `Run`, with displacements relative to the largest displacement
       of the same run; typical: below 1e-6 with the default steps. NaN if no estimate was requested or the motion did not stay
       finite; infinite for 4 steps or fewer, because a run with larger steps does not exist
@@ -92,7 +93,7 @@ class Ensemble(Result):
 
     state: State = eqx.field(metadata=part("run"))
     load_speed: Array = eqx.field(metadata=in_unit("rad/s", "run", "load"))
-    slip: Array = eqx.field(metadata=in_unit("rad", "run"))
+    relative_rotation: Array = eqx.field(metadata=in_unit("rad", "run"))
     error: Array = eqx.field(metadata=in_unit("", "run"))
     allowed: Array = eqx.field(metadata=in_unit("", "run"))
     finite: Array = eqx.field(metadata=in_unit("", "run"))
@@ -114,8 +115,8 @@ class Ensemble(Result):
 
     @property
     def synchronous(self) -> Array:
-        """True for runs (B,) whose exciters turn at one speed: the motion stayed finite and `slip` is below 0.5 rad."""
-        return self.finite & (self.slip < _MAX_SLIP)
+        """True for runs (B,) whose exciters turn at one speed: the motion is finite, `relative_rotation` is below 0.5 rad."""
+        return self.finite & (self.relative_rotation < _MAX_RELATIVE_ROTATION)
 
     @property
     def synchronous_share(self) -> Share:
@@ -131,7 +132,7 @@ class Ensemble(Result):
         speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
         worst = "error not estimated" if np.all(np.isnan(error)) else f"error of the end states up to {np.nanmax(error):.1e}"
         lines = [head, f"  loads turn at {speed_text([np.min(speeds), np.max(speeds)], 6, ' .. ')}; {worst}"]
-        if np.any(np.asarray(self.slip) > 0.0):
+        if np.any(np.asarray(self.relative_rotation) > 0.0):
             lines.append(f"  all masses of a run turn at one speed: {self.synchronous_share.text}")
         return "\n".join(lines)
 
@@ -222,11 +223,13 @@ def ensemble(
     if not plan.is_allowed:
         numbers = last, load_speed, error, finite, resolved, detached
         last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
-    slip = np.zeros(plan.allowed.shape, plan.end.dtype)
+    relative_rotation = np.zeros(plan.allowed.shape, plan.end.dtype)
     if len(plan.scenes.exciters) > 1:
         turned = load_speed * turning_directions(plan.scenes) * (plan.end / ENSEMBLE_PARTS)
-        slip = jnp.max(turned, axis=1) - jnp.min(turned, axis=1)
-    found = Ensemble(*on_device((last, load_speed, slip, error, plan.allowed, finite, resolved, detached, taken[0], unknown)))
+        relative_rotation = jnp.max(turned, axis=1) - jnp.min(turned, axis=1)
+    found = Ensemble(
+        *on_device((last, load_speed, relative_rotation, error, plan.allowed, finite, resolved, detached, taken[0], unknown))
+    )
     if not plan.is_known:
         return found
     jax.block_until_ready(found)

@@ -163,7 +163,7 @@ def plan_run(
     spin_up: Number | None,
     save: Literal["all", "window"],
     samples: int | None,
-    turns: int,
+    window_periods: int,
     estimate: bool | None,
     solver: diffrax.AbstractSolver | None,
     steps: StepChoice | None,
@@ -189,7 +189,7 @@ def plan_run(
         samples = _enough_samples(speed, end)
     else:
         samples = count(samples, "samples", low=2, each=_sample_size(given_scene))
-    periods = np.asarray(count(turns, "turns"), end.dtype)
+    periods = np.asarray(count(window_periods, "window_periods"), end.dtype)
     is_estimated = isinstance(control, StepControl) and (known if estimate is None else estimate)
     if isinstance(steps, Accuracy) and not known:
         raise InputError("accuracy", "repeats the run and cannot be used inside jit, grad or vmap; use Tolerance(...)")
@@ -229,7 +229,7 @@ def _stretches(scene: Scene, end: Array, state: State, fastest: Array | np.ndarr
 def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *, throw: bool) -> RunPlan:
     """Plan one of several consecutive runs, without a trajectory and an error estimate. **Raises** `InputError`."""
     return plan_run(
-        scene, length, start=state, mode=None, separation=None, spin_up=None, save="window", samples=None, turns=20,
+        scene, length, start=state, mode=None, separation=None, spin_up=None, save="window", samples=None, window_periods=20,
         estimate=False, solver=None, steps=steps, adjoint=None, max_steps=None, progress_meter=None, throw=throw,
     )  # fmt: skip
 

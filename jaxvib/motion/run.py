@@ -356,7 +356,8 @@ def _turns(time: np.ndarray, speed: float) -> float:
 def _require_turns(time: np.ndarray, speed: float) -> None:
     if not (turns := _turns(time, speed)) >= _MIN_TURNS:
         raise InputError(
-            "run", f"has {turns:.2g} turns in its window; ellipses and measures need {_MIN_TURNS}, simulate with more turns"
+            "run",
+            f"has {turns:.2g} turns in its window; vibration measures need {_MIN_TURNS}; increase `until` or `window_periods`",
         )
 
 

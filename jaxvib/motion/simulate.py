@@ -45,7 +45,7 @@ def simulate(
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int | None = None,
-    turns: int = 20,
+    window_periods: int = 20,
     estimate: bool | None = None,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: StepChoice | None = None,
@@ -71,8 +71,8 @@ def simulate(
       trajectory
     - `samples` (default: 16384; 262144 for runs of more than 1024 turns of the rotor; 2000 under a JAX transformation);
       typical: 20 for each period of the vibration. Samples need memory, but hardly any time
-    - `turns`: length of the measuring window at the end, in periods of the lowest natural frequency (at most half the run, and
-      256 turns of the rotor); typical: 20 (the default)
+    - `window_periods`: length of the measuring window at the end, in periods of the lowest natural frequency (at most half the
+      run, and 256 turns of the rotor); typical: 20 (the default)
     - `estimate`: True to estimate the `error` of the run by a second run with larger steps, which needs about half as many
       evaluations. The default is True, but False under a JAX transformation and with a step size controller of diffrax
     - `stepsize_controller`: choice of the steps, see below
@@ -122,7 +122,7 @@ def simulate(
         spin_up=spin_up,
         save=save,
         samples=samples,
-        turns=turns,
+        window_periods=window_periods,
         estimate=estimate,
         solver=solver,
         steps=stepsize_controller,

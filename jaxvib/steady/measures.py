@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import quantity_text
-from jaxvib.equations.coincident import friction_on_light_loads
+from jaxvib.equations.jammed_bodies import friction_on_light_loads
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, peak_force, rotating_direction
 from jaxvib.equations.torque_balance import resultant_of
 from jaxvib.errors import InputError, quoted

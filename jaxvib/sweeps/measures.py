@@ -59,7 +59,9 @@ def _of_regime(name: str, unit: str, field: str, meanings: tuple[str, ...] = ())
     def read(run: BatchRun) -> Array:
         if run.regime is None:
             problem = f"is {name}, which needs a scene with one exciter and loads"
-            raise InputError("measure", f"{problem}; for other scenes use run.load_speed, run.slip or run.shaft_torque")
+            raise InputError(
+                "measure", f"{problem}; for other scenes use run.load_speed, run.relative_rotation or run.shaft_torque"
+            )
         (value,) = jax.tree.leaves(getattr(run.regime, field))
         return value
 
@@ -82,7 +84,7 @@ def _settling(run: BatchRun) -> Array:
     return jnp.where(change < _SETTLED_SPEED_SHARE, at, run.window.time[-1])
 
 
-def _slip(run: BatchRun) -> Array:
+def _relative_rotation(run: BatchRun) -> Array:
     """Return the largest difference, rad, between the angles through which two loads or rotors turn in the window."""
     angles, _ = turning_angles(run.scene, lambda: run.window.time, run.window.state)
     turned = turning_directions(run.scene) * (angles[-1] - angles[0])
@@ -120,7 +122,7 @@ RUN_MEASURES = {
         RunMeasure("run.foundation_force", "N", "measured.foundation_force"),
         _of_regime("run.ripple", "rad/s", "ripple"),
         _of_regime("run.rotor_speed", "rad/s", "rotor_speed"),
-        RunMeasure("run.slip", "rad", _slip),
+        RunMeasure("run.relative_rotation", "rad", _relative_rotation),
         RunMeasure("run.drift", "", "measured.drift"),
         RunMeasure("run.settling_time", "s", _settling),
         _of_vibration("run.stroke", "m", "stroke", "translation"),
@@ -137,10 +139,11 @@ RUN_MEASURES = {
 """Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
 foundation force (zero to peak), ripple, drift (see `AbstractMeasured`), and settling time. The settling time is the time after
 which each load speed differs from its final value by less than 1 % of the rotor speed, with a resolution of 1/64 of the time
-before the measuring window; it is the end of the run if the loads do not settle. The slip is the largest difference between the
-angles through which two loads, or rotors without loads, turn in the measuring window. Regime, jam mode, ripple and rotor speed
-need a scene with one exciter and loads. The measures from stroke to conveying speed are those of `VibrationMeasures`, for the
-centre of mass as the point. The support load is the sum of the static and the vertical dynamic load."""
+before the measuring window; it is the end of the run if the loads do not settle. The relative rotation is the largest
+difference between the angles through which two loads, or rotors without loads, turn in the measuring window. Regime, jam mode,
+ripple and rotor speed need a scene with one exciter and loads. The measures from stroke to conveying speed are those of
+`VibrationMeasures`, for the centre of mass as the point. The support load is the sum of the static and the vertical dynamic
+load."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:

@@ -112,7 +112,7 @@ def test_settle_and_growth_ask_what_is_typed(typed, tmp_path, monkeypatch):
     assert code == 2 and "--start is 'spin_up'" in err
 
 
-@pytest.mark.parametrize("command", ["simulate", "settle", "envelope", "growth", "run-ups"])
+@pytest.mark.parametrize("command", ["simulate", "settle", "envelope", "growth", "run-up-map"])
 def test_loads_start_apart_as_typed_in_every_command(typed, monkeypatch, command):
     asked = []
 
@@ -138,9 +138,9 @@ def test_motion_commands_give_the_results_of_python(typed, tmp_path):
     assert abs(json.loads((tmp_path / "o" / "envelope.json").read_text())["omega"] / document["omega"] - 1.0) < 0.05
     code, out, _ = typed("growth", "machine.toml", "--until", "20s", "--mode", str(mode), "--json")
     assert code == 0 and json.loads(out)["status"] == "regular"
-    words = ("run-ups", "machine.toml", "--until", "0.5s", "--drag", "0.05", "--drag", "5 N s/m", "--step-tolerance", "1e-5")
+    words = ("run-up-map", "machine.toml", "--until", "0.5s", "--drag", "0.05", "--drag", "5 N s/m", "--step-tolerance", "1e-5")
     code, out, err = typed(*words, "--json")
-    rows = json.loads(out)["run_ups"]
+    rows = json.loads(out)["map"]
     assert code == 0 and err == "" and [row["drag"] for row in rows] == [0.05, 5.0]
     assert all(abs(sum(row["shares"].values()) - 1.0) < 1e-12 for row in rows)
 
@@ -186,7 +186,7 @@ def test_the_map_is_that_of_the_function(monkeypatch, typed):
 
 
 def test_drags_of_run_ups_are_checked(typed):
-    code, _, err = typed("run-ups", "machine.toml", "--until", "1s", "--drag", "5 kg")
+    code, _, err = typed("run-up-map", "machine.toml", "--until", "1s", "--drag", "5 kg")
     assert code == 2 and "--drag is '5 kg', which is not in N s/m" in err
 
 
@@ -313,10 +313,10 @@ def test_run_up_command_gives_the_result_of_python(typed, tmp_path):
     document = json.loads((tmp_path / "o" / "run_up.json").read_text())
     assert document["status"] == found.status_name and document["peak_force"] == float(found.peak_force)
     assert read(tmp_path / "run_up.csv")[0][0] == "trajectory_time (s)"
-    code, _, err = typed("run-ups", "table.toml", "--until", "5s")
+    code, _, err = typed("run-up-map", "table.toml", "--until", "5s")
     assert code == 2 and "for motors with unbalances use `jaxvib run-up`" in err
     code, _, err = typed("run-up", "machine.toml", "--until", "5s")
-    assert code == 2 and "for loads use run_ups" in err
+    assert code == 2 and "for loads use run_up_map" in err
 
 
 def test_a_motor_that_cannot_start_is_named(tmp_path, capsys):

@@ -10,7 +10,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_loads
-from jaxvib.equations.coincident import require_coincident
+from jaxvib.equations.jammed_bodies import require_periodic_jams
 from jaxvib.equations.linear import jammed_loads, turning_loads
 from jaxvib.machine.effects.terms import (
     ContactFriction,
@@ -40,7 +40,7 @@ TERMS = (
 THEORIES = {
     turning_loads: "GravityField LoadPotential LoadInteraction RotorImbalance",
     jammed_loads: "GravityField LoadPotential LoadInteraction RotorImbalance ContactFriction",
-    require_coincident: "GravityField LoadPotential LoadInteraction ContactFriction",
+    require_periodic_jams: "GravityField LoadPotential LoadInteraction ContactFriction",
     averaged_loads: "GravityField LoadPotential",
     jv.criterion: "GravityField LoadInteraction RotorImbalance ContactFriction DrillingSpinRelease SlipRelease SupportForce",
 }

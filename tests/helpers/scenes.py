@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.equations.coincident import coincident_model
+from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
 
 TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
@@ -68,4 +68,4 @@ def some_state(s):
 
 def assembled(scene):
     """The scene's carrier with its coincident loads, as exact jams take it."""
-    return coincident_model(jammed_model(scene))
+    return jammed_bodies(jammed_model(scene))

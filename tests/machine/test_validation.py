@@ -59,7 +59,7 @@ QUESTIONS = {
     "balanced_states": jv.balanced_states,
     "whirl": jv.whirl,
     "natural_frequencies": jv.natural_frequencies,
-    "run_ups": lambda s: jv.run_ups(s, 1.0),
+    "run_up_map": lambda s: jv.run_up_map(s, 1.0),
 }
 
 

@@ -130,7 +130,7 @@ def test_loads_in_contact_start_in_their_order():
             lambda angles=angles: jv.initial_state(s, angles=angles),
             lambda start=start: jv.simulate(s, 1.0, start=start),
             lambda start=start: jv.ensemble(lambda k: (s, start), jnp.ones(2), 1.0),
-            lambda angles=angles: jv.run_ups(s, 1.0, angles=[angles]),
+            lambda angles=angles: jv.run_up_map(s, 1.0, angles=[angles]),
         ):
             with pytest.raises(jv.InputError, match=r"start\.angle is \[.*\] rad; loads in contact cannot pass each other"):
                 ask()

@@ -167,7 +167,7 @@ def through_time(adjoint, until, of=lambda run: jnp.append(run.amplitude, run.fo
             until,
             start=start,
             save="window",
-            turns=4,
+            window_periods=4,
             stepsize_controller=jv.Tolerance(1e-9),
             adjoint=adjoint,
             max_steps=2**15,

@@ -158,7 +158,7 @@ def test_jam_in_time_nears_leading_order_as_loads_get_light():
     def difference(eps):
         s = published(speed=1.5, damping=0.05, eps=eps).scene()
         jam = jv.jam_modes(s).select(3, throw=False)
-        run = jv.simulate(s, 3000.0, start="jam", mode=3, save="window", turns=4, max_steps=2**15, throw=False)
+        run = jv.simulate(s, 3000.0, start="jam", mode=3, save="window", window_periods=4, max_steps=2**15, throw=False)
         return jnp.append(run.amplitude / jam.amplitude, run.omega / jam.omega) - 1.0, run.settled
 
     error, settled = eqx.filter_jit(jax.vmap(difference))(jnp.asarray([8e-3, 4e-3, 2e-3]))

@@ -38,7 +38,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
         (dict(start="spin_up", spin_up=-3.0), "drive.duration is -3 s; it must be greater than 0"),
         (dict(save="none"), "save is 'none'; it must be 'all' or 'window'"),
         (dict(samples=1), "samples is 1; it must be a whole number, at least 2"),
-        (dict(turns=0), "turns is 0"),
+        (dict(window_periods=0), "window_periods is 0"),
         (dict(max_steps=0), "max_steps is 0"),
     ],
 )

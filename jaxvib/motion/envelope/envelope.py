@@ -145,7 +145,7 @@ def envelope(
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int = 256,
-    turns: int = 20,
+    window_periods: int = 20,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: Tolerance | diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -169,8 +169,8 @@ def envelope(
 
     - `scene`, without effects other than gravity
     - `until`, s; typical: 5 to 600
-    - `start`, `mode`, `separation`, `spin_up`, `turns`, `adjoint`, `throw`: as in `simulate`. Each load has its own phase:
-      loads with slightly different initial angles separate if the averaged motion at one angle is unstable
+    - `start`, `mode`, `separation`, `spin_up`, `window_periods`, `adjoint`, `throw`: as in `simulate`. Each load has its own
+      phase: loads with slightly different initial angles separate if the averaged motion at one angle is unstable
     - `save`: "all" keeps `samples` (default 256) evenly spaced states; "window" keeps only the measuring window
     - `stepsize_controller`: `Tolerance`, the allowed error of a step, both relative to the largest amplitude and absolute in
       natural units (rotor speed for rates, 1 rad for phases); typical: 1e-3 to 1e-6, default 1e-4. A step size controller of
@@ -203,13 +203,13 @@ def envelope(
     if save not in ("all", "window"):
         raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
     count(samples, "samples", low=2, each=1e3)
-    count(turns, "turns")
+    count(window_periods, "window_periods")
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if isinstance(chosen, Tolerance):
         chosen = np.asarray(validate_tolerance(chosen.tolerance, "tolerance", end.dtype, 10.0), end.dtype)
     given_scene, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
-    choices = solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
+    choices = solver, chosen, adjoint, samples if save == "all" else 0, window_periods, count(max_steps, "max_steps")
     if isinstance(start, str) and start == "jam" and scene.is_plain and not jams_of.is_ready(scene):
         rest = initial_state(scene)
         in_background(partial(_run.prepare, scene, end, rest, *choices), partial(_prepare_growth, scene, rest))
@@ -265,7 +265,7 @@ def _run(
     control: diffrax.AbstractStepSizeController | Array | np.ndarray,
     adjoint: diffrax.AbstractAdjoint | None,
     samples: int,
-    turns: int,
+    window_periods: int,
     max_steps: int,
 ) -> Envelope:
     begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
@@ -276,7 +276,7 @@ def _run(
     field, frozen = averaged_model(model), jax.lax.stop_gradient(scene)
     units = _units(jax.lax.stop_gradient(model))
     speed, frequencies = frozen.top_speed, estimated_frequencies(frozen)
-    saves = _saves(speed, frequencies, end, samples, turns)
+    saves = _saves(speed, frequencies, end, samples, window_periods)
 
     is_controller = isinstance(control, diffrax.AbstractStepSizeController)
     controller = control if is_controller else diffrax.PIDController(rtol=control, atol=control)
@@ -318,10 +318,10 @@ def _run(
     )
 
 
-def _saves(speed: Array, frequencies: Array, end: Array, samples: int, turns: int) -> list[diffrax.SubSaveAt]:
+def _saves(speed: Array, frequencies: Array, end: Array, samples: int, window_periods: int) -> list[diffrax.SubSaveAt]:
     """Return the saved times: those of the measuring window at the end, and those of the whole run if `samples` is not 0."""
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
-    window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _MAX_WINDOW_TURNS / speed)
+    window = 2.0 * jnp.pi * jnp.minimum(window_periods / slowest, _MAX_WINDOW_TURNS / speed)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW_SAMPLES))]
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))

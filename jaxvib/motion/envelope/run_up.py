@@ -174,7 +174,7 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     if all(exciter.drive.ideal for exciter in scene.exciters):
         raise InputError(
             "scene",
-            "has no motor; a run-up needs a drive of limited power, for example InductionMotor(...); for loads use run_ups",
+            "has no motor; a run-up needs a drive of limited power, for example InductionMotor(...); for loads use run_up_map",
         )
     end = number(until, "s", "until", low=0.0, open_low=True)
     resonances = np.sort(np.asarray(natural_frequencies(scene)))

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
-from jaxvib.equations.coincident import friction_on_light_loads
+from jaxvib.equations.jammed_bodies import friction_on_light_loads
 from jaxvib.equations.linear import ExcitedModel, JammedModel, LinearModel, jammed_model
 from jaxvib.equations.torque_balance import UnbalancedModel
 from jaxvib.machine.effects.base import has_term

@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, quantity_text, speed_text
-from jaxvib.equations.coincident import CoincidentModel
+from jaxvib.equations.jammed_bodies import JammedBodies
 from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, deviation_synthesis, grid_of, synthesized
@@ -233,7 +233,7 @@ def _force_peaks(orders: tuple[int, ...], force: Array) -> Array:
 
 
 def orbits(
-    model: CoincidentModel,
+    model: JammedBodies,
     value: Array,
     start: Array,
     given: Parameter,
@@ -298,7 +298,7 @@ def orbits(
 
 
 def _solve_each(
-    model: CoincidentModel, grid: Grid, given: Parameter, starts: tuple[Array, Array, Array | None]
+    model: JammedBodies, grid: Grid, given: Parameter, starts: tuple[Array, Array, Array | None]
 ) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
     """Return the periodic motions from the `starts` of `orbits`, their harmonics and quantities; the last axis is P."""
 
@@ -330,7 +330,7 @@ def _status(met: Array, separates: Array, flat: Array, resolved: Array, accurate
 
 
 def differentiable_fields(
-    model: CoincidentModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
+    model: JammedBodies, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
     """Return fields of one orbit from its known motion, with derivatives. The fields are equal to those of `orbits` for the
     same arguments, or 0 if these are NaN."""
@@ -353,7 +353,7 @@ def differentiable_fields(
     return {name: jnp.where(there, field, 0.0) for name, field in fields.items()}
 
 
-def _all_quantities(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
+def _all_quantities(model: JammedBodies, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
     """Return harmonics of one motion; slope of the branch, residual, errors of the rotor speed and of the deviation; and
     `_motion_quantities`."""
     branch = branch_tangent(model, grid, motion)
@@ -362,7 +362,7 @@ def _all_quantities(model: CoincidentModel, grid: Grid, motion: PeriodicSolution
 
 
 def _motion_quantities(
-    model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
+    model: JammedBodies, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
 ) -> tuple[Array, ...]:
     """Return amplitude, foundation force, power and contact torque between the loads of one motion.
 
@@ -382,7 +382,7 @@ def _motion_quantities(
     return (ranges[:nd], force, power, contact_torque)
 
 
-def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
+def _least_contact_torque(model: JammedBodies, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
     """Return the smallest mean torque over a period, N m, with which a load pushes the next one; the loads lie side by side.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The criterion is

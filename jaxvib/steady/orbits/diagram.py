@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Drawn, Onto, SpeedUnit
-from jaxvib.equations.coincident import coincident_model
+from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_half_turn_symmetry
@@ -223,13 +223,13 @@ def _search_grid(scene: Scene) -> tuple[Array, Array]:
 
 @cached
 def _is_stiff(scene: Scene, omega: Array) -> Array:
-    model = coincident_model(jammed_model(scene))
+    model = jammed_bodies(jammed_model(scene))
     return is_stiff(model, omega, light_rotor_speed(model.linear, omega))
 
 
 @cached
 def _values(scene: Scene, omega: Array | np.ndarray, many: int, accuracy: float, implicit: bool) -> _Values:
-    model, omega = coincident_model(jammed_model(scene)), jnp.asarray(omega)
+    model, omega = jammed_bodies(jammed_model(scene)), jnp.asarray(omega)
     start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
     steps = jnp.max(steps_for(model, omega, start, implicit=implicit))
     orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy, implicit=implicit)

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.coincident import coincident_model
+from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_half_turn_symmetry
@@ -218,7 +218,7 @@ def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
 
 @cached
 def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
-    return is_stiff(coincident_model(jammed_model(scene)), omega, speed)
+    return is_stiff(jammed_bodies(jammed_model(scene)), omega, speed)
 
 
 def _solve_accurately(plan: OrbitPlan) -> Orbit:
@@ -246,7 +246,7 @@ def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
 
 def _outputs(orbit: Orbit, problem: JamProblem, points: int, max_steps: int | None) -> Orbit:
     """Return the outputs that follow from the solved motion, without multipliers and errors."""
-    model = coincident_model(jammed_model(problem.scene))
+    model = jammed_bodies(jammed_model(problem.scene))
     fields = differentiable_fields(model, orbit, problem.value, problem.start, problem.given, points)
     return dataclasses.replace(jax.tree.map(lambda _: None, orbit), **fields)
 
@@ -258,7 +258,7 @@ def _solve_program(problem: JamProblem, points: int, max_steps: int | None) -> O
     **Arguments**: `max_steps`: limit of the steps for the multipliers, with which they have reverse derivatives.
     """
     scene, given, value, start, exists, direction, accuracy, implicit, is_start_solved = problem
-    model, deviation = coincident_model(jammed_model(scene)), None
+    model, deviation = jammed_bodies(jammed_model(scene)), None
     if is_start_solved:
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]

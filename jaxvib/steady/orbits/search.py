@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.coincident import coincident_model
+from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
@@ -101,7 +101,7 @@ def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.n
 def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
     """Return rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN without
     a jam."""
-    model = coincident_model(jammed_model(scene))
+    model = jammed_bodies(jammed_model(scene))
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 
     def one(w: Array) -> tuple[Array, Array]:

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.coincident import CoincidentModel
+from jaxvib.equations.jammed_bodies import JammedBodies
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling, synthesized
 from jaxvib.numerics.linalg import small_solve, solve_in_turn
 
 Parameter = Literal["omega", "rotor_speed"]
 
 
-def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
+def unbalance_response(model: JammedBodies, omega: Array, speed: Array, orders: np.ndarray) -> Array:
     """Return the response of the carrier to unbalance: its k-th harmonic per harmonic of sum_g S_g e(phi_g), (K, nd, p) for p
     directions.
 
@@ -33,13 +33,13 @@ def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, order
     return jax.vmap(at)(jnp.asarray(orders, dtype=omega.dtype))
 
 
-def _port_response(model: CoincidentModel, grid: Grid, omega: Array, speed: Array) -> Array:
+def _port_response(model: JammedBodies, grid: Grid, omega: Array, speed: Array) -> Array:
     """Return the response A_k (K, p, p) of the mount with p directions to unbalance: k-th harmonic of its acceleration per k-th
     harmonic of sum_g S_g e(phi_g)."""
     return _port_response_from(model, grid, omega, unbalance_response(model, omega, speed, grid.orders))
 
 
-def _port_response_from(model: CoincidentModel, grid: Grid, omega: Array, response: Array) -> Array:
+def _port_response_from(model: JammedBodies, grid: Grid, omega: Array, response: Array) -> Array:
     """Return `_port_response` from the response of the carrier, whose first orders are those of the grid."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
     return -(w**2)[:, None, None] * (model.linear.mount.rows[0] @ response[: w.size])
@@ -65,9 +65,7 @@ class _Balance(NamedTuple):
     vibration_stiffness: Array
 
 
-def _balance(
-    model: CoincidentModel, grid: Grid, port_response: Array, deviation: Array, omega: Array, speed: Array
-) -> _Balance:
+def _balance(model: JammedBodies, grid: Grid, port_response: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     point, moving = model.circle(phi)
     force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)
@@ -87,7 +85,7 @@ def _balance(
 
 
 def _jacobian(
-    model: CoincidentModel, grid: Grid, port_response: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
+    model: JammedBodies, grid: Grid, port_response: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
 ) -> Array:
     """Return the Jacobian d residual / d deviation, (G M, G M)."""
     g, m = deviation.shape
@@ -115,7 +113,7 @@ class PeriodicSolution(NamedTuple):
 
 
 def periodic_motion(
-    model: CoincidentModel,
+    model: JammedBodies,
     grid: Grid,
     given: Parameter,
     value: Array,
@@ -157,7 +155,7 @@ def _speed_pair(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]
 
 @eqx.filter_custom_jvp
 def _newton(
-    model: CoincidentModel,
+    model: JammedBodies,
     value: Array,
     start: Array,
     deviation: Array,
@@ -198,7 +196,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, 
     deviation, x = _newton(model, value, start, deviation, grid=grid, given=given, is_known=is_known)
     on = grid_of(*grid)
 
-    def equations(model: CoincidentModel, value: Array) -> Array:
+    def equations(model: JammedBodies, value: Array) -> Array:
         omega, speed = _speed_pair(given, value, x)
         residual = _balance(model, on, _port_response(model, on, omega, speed), deviation, omega, speed).residual
         return _append_mean_condition(residual.ravel())
@@ -209,7 +207,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, 
 
 
 def _linearize(
-    model: CoincidentModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
+    model: JammedBodies, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
     """Return residuals (G M + 1,), their Jacobian, and the scale of the torques in them."""
     if known is None:
@@ -244,7 +242,7 @@ class BranchTangent(NamedTuple):
     acceleration: Array
 
 
-def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
+def branch_tangent(model: JammedBodies, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
     """Return the tangent of the branch at a periodic motion, and the error of the motion.
 
     The error is estimated as the change in one Newton step with the residuals at twice as many points; for the deviation the
@@ -309,7 +307,7 @@ class Harmonics(NamedTuple):
     force: Array
 
 
-def harmonics_of(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, response: Array | None = None) -> Harmonics:
+def harmonics_of(model: JammedBodies, grid: Grid, motion: PeriodicSolution, response: Array | None = None) -> Harmonics:
     """Return harmonics of psi and of the carrier's motion; `response`: its `unbalance_response`, if known."""
     carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.coincident import CoincidentModel
+from jaxvib.equations.jammed_bodies import JammedBodies
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid
 from jaxvib.numerics.linalg import relative_to, small_solve
@@ -52,7 +52,7 @@ class Floquet(NamedTuple):
     trivial: Array
 
 
-def _oscillation(model: CoincidentModel, speed: Array) -> Array:
+def _oscillation(model: JammedBodies, speed: Array) -> Array:
     """Return the rate of the carrier's fastest oscillation at the rotor's `speed`, rad/s."""
     linear, gyroscopic = model.linear, model.linear.mount.gyroscopic
     square, half = relative_to(linear.mass, linear.carrier.stiffness)
@@ -60,13 +60,13 @@ def _oscillation(model: CoincidentModel, speed: Array) -> Array:
     return fastest if gyroscopic is None else fastest + speed * jnp.linalg.norm(half @ gyroscopic @ half.T)
 
 
-def _damping_rate(model: CoincidentModel) -> Array:
+def _damping_rate(model: JammedBodies) -> Array:
     """Return the fastest rate of decay by damping of the carrier, 1/s."""
     square, _ = relative_to(model.linear.mass, model.linear.carrier.damping)
     return jnp.max(jnp.linalg.eigvalsh(square, symmetrize_input=False))
 
 
-def _drag_rate(model: CoincidentModel, omega: Array, speed: Array) -> Array:
+def _drag_rate(model: JammedBodies, omega: Array, speed: Array) -> Array:
     """Return the fastest rate of decay by drag and friction of the loads at load speeds `omega`, 1/s.
 
     The motion of the carrier reduces the inertia of a body of loads. The rate is
@@ -86,14 +86,14 @@ def _drag_rate(model: CoincidentModel, omega: Array, speed: Array) -> Array:
     return jnp.vectorize(fastest)(omega, speed) / left
 
 
-def is_stiff(model: CoincidentModel, omega: Array, speed: Array) -> Array:
+def is_stiff(model: JammedBodies, omega: Array, speed: Array) -> Array:
     """Return True if multipliers at load speeds `omega` and the rotor's `speed` (rad/s) need the implicit method, because of
     the decay rates of loads and carrier."""
     decay = jnp.maximum(_damping_rate(model), _drag_rate(model, omega, speed))
     return decay > _STIFF_DECAY_RATIO * (_oscillation(model, speed) + 2.0 * omega)
 
 
-def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
+def steps_for(model: JammedBodies, omega: Array, speed: Array, *, implicit: bool) -> Array:
     """Return the number of integration steps in a turn of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
 
     An `implicit` method is stable at any rate of decay; its steps follow the oscillation only.
@@ -125,7 +125,7 @@ class _Disturbances(NamedTuple):
     `omega` (P,) of the loads and `speed` (P,) of the rotor; `w` and `n`: the same numbers with the shape (1, 1, P).
     """
 
-    model: CoincidentModel
+    model: JammedBodies
     stiffness: Array
     damping: Array
     gyroscopic: Array | None
@@ -142,7 +142,7 @@ class _Disturbances(NamedTuple):
     n: Array
 
     @classmethod
-    def about(cls, model: CoincidentModel, motion: PeriodicSolution) -> _Disturbances:
+    def about(cls, model: JammedBodies, motion: PeriodicSolution) -> _Disturbances:
         """Return the equations about the motions of a model."""
         carrier, mount, mass = model.linear.carrier, model.linear.mount, model.linear.mass
         nd = mass.shape[0]
@@ -238,7 +238,7 @@ class _Disturbances(NamedTuple):
 
 
 def floquet(
-    model: CoincidentModel,
+    model: JammedBodies,
     grid: Grid,
     motion: PeriodicSolution,
     harmonics: Harmonics,

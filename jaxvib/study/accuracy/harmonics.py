@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.display import Axes, Drawn, speed_text
-from jaxvib.equations.coincident import coincident_model
+from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_half_turn_symmetry
@@ -97,7 +97,7 @@ def harmonic_convergence(
 
 @cached
 def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
-    model = coincident_model(jammed_model(scene))
+    model = jammed_bodies(jammed_model(scene))
     grid = grid_of(points, model.half_turn)
 
     def one(w: Array) -> tuple[Array, Array]:

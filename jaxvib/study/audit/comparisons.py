@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.equations.coincident import COINCIDENT_TERMS, require_coincident
+from jaxvib.equations.jammed_bodies import PERIODIC_JAM_TERMS, require_periodic_jams
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -79,7 +79,7 @@ class JamComparison(NamedTuple):
     def has_exact_orbit(self, scene: Scene) -> bool:
         """Return True if the theory of exact orbits includes the scene."""
         try:
-            require_coincident(scene)
+            require_periodic_jams(scene)
         except InputError:
             return False
         return True
@@ -151,7 +151,9 @@ class RunComparison(NamedTuple):
     def full(self, scene: Scene) -> MotionValues:
         """Return the values of the full equations."""
         start = self.state(scene)
-        run = simulate(scene, self.until, start=start, save="window", turns=_WINDOW_PERIODS, estimate=False, throw=False)
+        run = simulate(
+            scene, self.until, start=start, save="window", window_periods=_WINDOW_PERIODS, estimate=False, throw=False
+        )
         return _read(scene, run, math.nan)
 
     @classmethod
@@ -173,7 +175,7 @@ class RunComparison(NamedTuple):
 
 def without_excluded_effects(scene: Scene) -> Scene:
     """Return the scene without effects that theories of jams exclude, such as imbalance, which turns at another speed."""
-    kept = tuple(e for e in scene.all_effects if all(isinstance(term, COINCIDENT_TERMS) for term in e.terms()))
+    kept = tuple(e for e in scene.all_effects if all(isinstance(term, PERIODIC_JAM_TERMS) for term in e.terms()))
     return scene if len(kept) == len(scene.all_effects) else scene.replace(effects=kept)
 
 

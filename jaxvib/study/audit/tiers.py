@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import averaged_loads
-from jaxvib.equations.coincident import require_coincident
+from jaxvib.equations.jammed_bodies import require_periodic_jams
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
@@ -170,7 +170,7 @@ TIERS = (
     Tier(
         "exact orbit",
         "the periodic motion of a jam with all harmonics, its stability; no transients",
-        require_coincident,
+        require_periodic_jams,
         lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False),
     ),
     Tier(

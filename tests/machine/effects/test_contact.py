@@ -128,7 +128,7 @@ def test_restitution_is_read_from_files_and_checked():
 def test_compiled_run_ups_build_a_restitution_anew():
     again = jax.jit(lambda damping, e: jv.LoadContact(1e5, damping, e).restitution)(0.0, 0.7)
     assert float(again) == pytest.approx(0.7)
-    found = jv.run_ups(plane(0.7), 0.1, angles=[[0.0, 1.0]], stepsize_controller=jv.EqualSteps(200))
+    found = jv.run_up_map(plane(0.7), 0.1, angles=[[0.0, 1.0]], stepsize_controller=jv.EqualSteps(200))
     assert bool(np.all(found.finished))
 
 

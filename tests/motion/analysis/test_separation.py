@@ -188,6 +188,6 @@ def test_every_start_from_rest_is_apart(monkeypatch):
     expected = np.deg2rad([1.0, 1.0])
     found = jv.ensemble(lambda speed: eqx.tree_at(lambda x: x.drive.speed, s, speed), jnp.asarray([50.0, 60.0]), 1e-6)
     np.testing.assert_allclose(np.diff(found.state.azimuth), [expected, expected], rtol=1e-6)
-    np.testing.assert_allclose(np.diff(jv.run_ups(s, 0.1).angle), [expected], rtol=1e-12)
+    np.testing.assert_allclose(np.diff(jv.run_up_map(s, 0.1).angle), [expected], rtol=1e-12)
     run = Evaluation(s).start_up(0.1, 0.05)
     np.testing.assert_allclose(np.diff(run.trajectory.state.azimuth[0]), expected, rtol=1e-12)

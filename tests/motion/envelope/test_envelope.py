@@ -57,7 +57,7 @@ def test_envelope_of_an_isotropic_rotor_is_exact():
 def both(s, speed, end):
     """Brought up over the first 0.6 of the time: the full equations and the averaged ones."""
     s = spun_up(s, speed, 0.6 * end)
-    given = dict(turns=4, samples=2**14, throw=False)
+    given = dict(window_periods=4, samples=2**14, throw=False)
     return jv.simulate(s, end, stepsize_controller=jv.Tolerance(1e-7), max_steps=2**18, **given), jv.envelope(
         s, end, stepsize_controller=jv.Tolerance(1e-6), **given
     )

@@ -16,7 +16,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.equations.model import assemble
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.envelope import envelope as module
-from jaxvib.motion.envelope import run_up as run_ups
+from jaxvib.motion.envelope import run_up as run_up_module
 from jaxvib.motion.envelope.result import Envelopes, plot_histories
 
 G = 9.81
@@ -112,7 +112,7 @@ def test_units_are_the_largest_unbalance_and_speed():
 
 
 @pytest.mark.parametrize(
-    ("frequencies", "end", "turns", "window"),
+    ("frequencies", "end", "periods", "window"),
     [
         ([10.0, 40.0], 1e3, 20, 2.0 * np.pi * 20 / 10.0),
         ([0.0, 40.0], 1e3, 20, 2.0 * np.pi * 20 / 40.0),
@@ -121,11 +121,11 @@ def test_units_are_the_largest_unbalance_and_speed():
         ([10.0, 40.0], 8.0, 20, 4.0),
     ],
 )
-def test_window_holds_turns_of_the_slowest_resonance(frequencies, end, turns, window):
-    last, whole = module._saves(jnp.asarray(100.0), jnp.array(frequencies), jnp.asarray(end), 5, turns)
+def test_window_holds_periods_of_the_slowest_resonance(frequencies, end, periods, window):
+    last, whole = module._saves(jnp.asarray(100.0), jnp.array(frequencies), jnp.asarray(end), 5, periods)
     np.testing.assert_allclose(last.ts, np.linspace(end - window, end, 512), rtol=1e-12)
     np.testing.assert_allclose(whole.ts, np.linspace(0.0, end, 5), rtol=1e-12)
-    assert len(module._saves(jnp.asarray(100.0), jnp.array(frequencies), jnp.asarray(end), 0, turns)) == 1
+    assert len(module._saves(jnp.asarray(100.0), jnp.array(frequencies), jnp.asarray(end), 0, periods)) == 1
 
 
 @pytest.mark.parametrize(
@@ -411,7 +411,7 @@ def ended(status, *speeds):
     ],
 )
 def test_exciter_is_caught_by_the_lowest_resonance_ahead(status, speeds, caught, name):
-    speed, at, found = run_ups._judgement(mixed(), ended(status, *speeds), np.array([10.0, 20.0, 96.0]))
+    speed, at, found = run_up_module._judgement(mixed(), ended(status, *speeds), np.array([10.0, 20.0, 96.0]))
     np.testing.assert_allclose(speed, [-speeds[0], speeds[1]])
     assert at.tolist() == caught and found == name
 
@@ -427,8 +427,8 @@ def test_least_torque_is_found_by_bisection(monkeypatch, threshold, expected):
         factor = float(scene.exciters[0].drive.factor)
         return ended("done", -90.0 if factor >= threshold else -5.0, 80.0)
 
-    monkeypatch.setattr(run_ups, "envelope", at_factor)
-    found = run_ups._least_torque(mixed(), jnp.asarray(9.0), np.array([10.0, 20.0, 96.0]), passed=threshold <= 1.0)
+    monkeypatch.setattr(run_up_module, "envelope", at_factor)
+    found = run_up_module._least_torque(mixed(), jnp.asarray(9.0), np.array([10.0, 20.0, 96.0]), passed=threshold <= 1.0)
     if np.isnan(expected):
         assert np.isnan(found)
     else:
@@ -437,11 +437,13 @@ def test_least_torque_is_found_by_bisection(monkeypatch, threshold, expected):
 
 def test_scaled_motor_has_a_multiple_of_the_torque():
     electrical = jv.DCMotorElectrical(24.0, 0.6, 0.08, 0.002, 0.02)
-    scaled = run_ups._Scaled(electrical, jnp.asarray(3.0))
+    scaled = run_up_module._Scaled(electrical, jnp.asarray(3.0))
     assert float(scaled.torque(100.0)) == pytest.approx(3.0 * 0.08 * 16.0 / 0.6) and scaled.kind == "scaled"
     assert float(scaled.torque_at(0.0, 100.0, (jnp.asarray(2.0),))) == pytest.approx(0.48)
     assert float(scaled.speed) == pytest.approx(300.0) and float(scaled.inertia) == 0.002
-    assert float(jax.grad(lambda f: run_ups._Scaled(electrical, f).torque(100.0))(3.0)) == pytest.approx(0.08 * 16.0 / 0.6)
+    assert float(jax.grad(lambda f: run_up_module._Scaled(electrical, f).torque(100.0))(3.0)) == pytest.approx(
+        0.08 * 16.0 / 0.6
+    )
 
 
 def test_run_up_reads_peaks_and_speeds(monkeypatch):
@@ -464,8 +466,8 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
         angles.append(0.0 if start is None else float(start.exciters[0].rotor[0]))
         return run
 
-    monkeypatch.setattr(run_ups, "envelope", averaged)
-    monkeypatch.setattr(run_ups, "_least_torque", lambda *_, passed: 0.5 if passed else 2.0)
+    monkeypatch.setattr(run_up_module, "envelope", averaged)
+    monkeypatch.setattr(run_up_module, "_least_torque", lambda *_, passed: 0.5 if passed else 2.0)
     found = jv.run_up(scene, "9 s")
     assert asked == [(9.0, 4096, False)] * 8 and found.status_name == "passed" and np.isnan(found.least_torque)
     assert found.peak_amplitude.tolist() == [4e-3, 5e-3, 0.03] and float(found.peak_force) == pytest.approx(np.sqrt(37.0))
@@ -482,7 +484,7 @@ def test_run_up_reads_peaks_and_speeds(monkeypatch):
     assert lines[5] == "  all pass with torques of at least 0.5 times those of the motors" and len(lines) == 6
     assert len(found.summary().splitlines()) == 5
     slow = eqx.tree_at(lambda r: r.window.rotor_speeds[0], run, jnp.full(3, -5.0))
-    monkeypatch.setattr(run_ups, "envelope", lambda *_, **__: slow)
+    monkeypatch.setattr(run_up_module, "envelope", lambda *_, **__: slow)
     caught = jv.run_up(scene, "9 s", least=True)
     assert caught.status_name == "caught" and float(caught.least_torque) == 2.0
     assert caught.summary().splitlines()[1].startswith("  exciter 0: 47.746 rpm, caught by resonance 1 at ")

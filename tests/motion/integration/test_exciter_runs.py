@@ -83,7 +83,7 @@ def test_share_that_synchronises_jumps_at_the_closed_form():
     many = jv.ensemble(screen, limit * jnp.asarray([0.3, 0.6, 0.9, 0.95, 1.05, 1.1, 1.3, 1.6]), 10.0, estimate=False)
     assert many.synchronous.tolist() == [True] * 4 + [False] * 4
     turned = 2.5 * (many.load_speed[:, 0] + many.load_speed[:, 1])  # the second motor turns clockwise
-    np.testing.assert_allclose(many.slip, np.abs(turned), atol=1e-9)
+    np.testing.assert_allclose(many.relative_rotation, np.abs(turned), atol=1e-9)
     # Wilson's interval of 4 of 8 cases.
     half = 1.959964 * np.sqrt(0.25 / 8.0 + 1.959964**2 / (4.0 * 64.0)) / (1.0 + 1.959964**2 / 8.0)
     np.testing.assert_allclose(many.synchronous_share, (0.5, 0.5 - half, 0.5 + half, 4, 8), rtol=1e-9)

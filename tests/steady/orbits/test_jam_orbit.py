@@ -6,7 +6,7 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
-from jaxvib.equations.coincident import coincident_model
+from jaxvib.equations.jammed_bodies import jammed_bodies
 from jaxvib.equations.linear import jammed_model
 from jaxvib.steady.orbits import diagram, search
 from jaxvib.steady.orbits.describe import half_range
@@ -81,7 +81,7 @@ def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():
     """A whole turn is needed if gravity makes the halves of the motion differ."""
     half = published().scene()
     whole = jv.Scene(half.machine, half.loads, half.drive, (jv.Gravity(9.81),))
-    models = [coincident_model(jammed_model(s)) for s in (half, whole)]
+    models = [jammed_bodies(jammed_model(s)) for s in (half, whole)]
     few, many = (int(steps_for(model, jnp.asarray(1.7), jnp.asarray(3.0), implicit=False)) for model in models)
     assert few > 4 and 2 * few - 1 <= many <= 2 * few
 

@@ -14,9 +14,9 @@ from jaxvib.machine.loads import pendulums
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.rotor import planar_rotor, rotor
 from jaxvib.machine.torus import torus_balls
-from jaxvib.study.maps.run_ups import RunUps, run_ups
+from jaxvib.study.maps.run_up_map import RunUpMap, run_up_map
 
-__all__ = ["VARIANTS", "published_rotor", "published_torus", "rotor_run_ups"]
+__all__ = ["VARIANTS", "published_rotor", "published_torus", "rotor_run_up_map"]
 
 Number = float | Array
 
@@ -55,10 +55,10 @@ def published_rotor(mu: float = 9.2e-4, variant: str = "printed", *, eccentricit
     return Scene(machine, bobs, RunUp(460.0, 230.0), (Gravity(), StaticImbalance(37.0 * eccentricity)))
 
 
-def rotor_run_ups(mu: Sequence[float], variant: str, *, until: float = 6.0) -> RunUps:
+def rotor_run_up_map(mu: Sequence[float], variant: str, *, until: float = 6.0) -> RunUpMap:
     """Run-ups of the published rotor at each friction `mu`, N m s, from pendulums that hang at exactly one angle."""
     drag = [each / _LENGTH**2 for each in mu]
-    return run_ups(published_rotor(variant=variant), until, drag=drag, angles=[[-0.5 * math.pi] * 4], batch=8)
+    return run_up_map(published_rotor(variant=variant), until, drag=drag, angles=[[-0.5 * math.pi] * 4], batch=8)
 
 
 TORUS_SPEED, ECCENTRICITY, RADIUS, TUBE, _DENSITY = 140.0, 1e-3, 0.2, 15e-3, 7812.0

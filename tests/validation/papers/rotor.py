@@ -16,8 +16,8 @@ from jaxvib.machine.structures.rotor import Rotor, rotor
 from jaxvib.steady.jams.phase_search import PhaseBranch, phase_branch
 from jaxvib.steady.jams.phases import phase_jam
 from jaxvib.steady.whirl import critical_speeds
-from jaxvib.study.maps.run_ups import RunUps
-from papers.machines import VARIANTS, published_rotor, rotor_run_ups
+from jaxvib.study.maps.run_up_map import RunUpMap
+from papers.machines import VARIANTS, published_rotor, rotor_run_up_map
 from papers.printed import Misprint, PrintedNumber
 
 __all__ = ["NUMBERS"]
@@ -116,21 +116,21 @@ def _length() -> float:
 
 
 @functools.cache
-def _run_ups() -> RunUps:
-    return rotor_run_ups(_TRIED, _BOTH)
+def _run_up_map() -> RunUpMap:
+    return rotor_run_up_map(_TRIED, _BOTH)
 
 
 def _ended(kind: str) -> list[float]:
     """Frictions tried whose run-up ends in this kind of motion."""
-    return [mu for mu, found in zip(_TRIED, _run_ups().kind[:, 0], strict=True) if found == kind]
+    return [mu for mu, found in zip(_TRIED, _run_up_map().kind[:, 0], strict=True) if found == kind]
 
 
 def _speed(mu: float) -> float:
-    return float(_run_ups().omega[_TRIED.index(mu), 0])
+    return float(_run_up_map().omega[_TRIED.index(mu), 0])
 
 
 def _ripple(mu: float) -> float:
-    return float(np.asarray(_run_ups().regime.ripple)[_TRIED.index(mu), 0])
+    return float(np.asarray(_run_up_map().regime.ripple)[_TRIED.index(mu), 0])
 
 
 def _least_that_jams() -> float:

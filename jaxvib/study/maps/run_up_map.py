@@ -43,7 +43,7 @@ _MIN_ALLOWED_STEPS = 2**20
 """Smallest default of `max_steps`. It is so large that run-ups of any usual length share one program."""
 
 
-class RunUps(Result):
+class RunUpMap(Result):
     """Outcomes of run-ups over nd drags and ns starts.
 
     **Attributes**
@@ -111,7 +111,7 @@ def _span(values: np.ndarray) -> str:
 
 
 @validated
-def run_ups(
+def run_up_map(
     scene: Scene,
     until: Number,
     *,
@@ -123,7 +123,7 @@ def run_ups(
     stepsize_controller: StepChoice | None = None,
     batch: int = 16,
     max_steps: int | None = None,
-) -> RunUps:
+) -> RunUpMap:
     """Compute run-ups of a scene for each drag and each set of initial angles of its loads, and the regimes at their ends.
 
     **Arguments**
@@ -142,8 +142,8 @@ def run_ups(
     - `batch`: number of runs that advance together on each core; typical: 16 (the default)
     - `max_steps`: a run fails after this number of steps; default: as for `simulate`, but at least 2^20
 
-    **Returns** `RunUps`; its `fraction` gives the share of the starts that end in a kind of motion. A run that fails raises no
-    error; it is counted as "failed".
+    **Returns** `RunUpMap`; its `fraction` gives the share of the starts that end in a kind of motion. A run that fails raises
+    no error; it is counted as "failed".
 
     **Raises** `InputError` for values that are not allowed.
 
@@ -151,7 +151,7 @@ def run_ups(
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
     ...                  jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5), jv.SpinUp(60.0, duration=1.0))
-    >>> found = jv.run_ups(scene, 4.0, drag=[0.05, 5.0], starts=6, stepsize_controller=jv.Tolerance(1e-5))
+    >>> found = jv.run_up_map(scene, 4.0, drag=[0.05, 5.0], starts=6, stepsize_controller=jv.Tolerance(1e-5))
     >>> found.kind.shape, found.fraction("jammed").tolist()
     ((2, 6), [0.0, 1.0])
     >>> print(found.summary())
@@ -165,7 +165,7 @@ def run_ups(
     if not scene.loads.circular:
         raise InputError(
             "loads.kind",
-            f"is {quoted(scene.loads.kind)}; run_ups varies the drag of loads on a circle; for balls in a torus use capture",
+            f"is {quoted(scene.loads.kind)}; run_up_map varies the drag of loads on a circle; for balls in a torus use capture",
         )
     loads = cast(CircularLoads, scene.loads)
     given = loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
@@ -195,7 +195,7 @@ def run_ups(
     def folded(leaf: np.ndarray) -> np.ndarray:
         return leaf.reshape(shape + leaf.shape[1:])
 
-    return RunUps(
+    return RunUpMap(
         drag=np.asarray(drags),
         angle=sets,
         regime=jax.tree.map(lambda leaf: jnp.asarray(folded(leaf)), regime),

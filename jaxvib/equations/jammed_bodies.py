@@ -16,13 +16,13 @@ from jaxvib.machine.effects.terms import ContactFriction, LoadPotential, RotorIm
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
-COINCIDENT_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
+PERIODIC_JAM_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
 """Terms that exact jams include. `LoadInteraction` is not computed: forces between loads cancel in the torque on a body."""
 
 Points = Array | np.ndarray
 
 
-class CoincidentModel(eqx.Module):
+class JammedBodies(eqx.Module):
     """Scene whose loads are G rigid bodies. It is assembled once for each analysis and passed on.
 
     Identical loads are coincident and form one body. If loads differ, each of them is a body with an angle of its own.
@@ -106,7 +106,7 @@ class CoincidentModel(eqx.Module):
         return by_angle, by_rate, jnp.stack(by_a)
 
 
-def coincident_model(linear: JammedModel) -> CoincidentModel:
+def jammed_bodies(linear: JammedModel) -> JammedBodies:
     """Return the coincident loads as bodies on their carrier. **Raises** `InputError` for an unbalanced rotor."""
     loads, effects = linear.loads, linear.scene.all_effects
     _require_balance(effects)
@@ -116,10 +116,10 @@ def coincident_model(linear: JammedModel) -> CoincidentModel:
     else:
         each = loads.mass * loads.radius, inertia, loads.drag * loads.radius**2
         unbalance, whole, drag = (jnp.broadcast_to(x, (loads.count,)) for x in each)
-    return CoincidentModel(linear, loads, effects, unbalance, whole, drag, loads.offsets(), has_half_turn_symmetry(effects))
+    return JammedBodies(linear, loads, effects, unbalance, whole, drag, loads.offsets(), has_half_turn_symmetry(effects))
 
 
-def require_coincident(scene: Scene) -> CircularLoads:
+def require_periodic_jams(scene: Scene) -> CircularLoads:
     """Return the loads of a scene whose jams are periodic.
 
     **Raises** `InputError` for an unbalanced rotor, and as `jammed_loads`.
@@ -131,7 +131,7 @@ def require_coincident(scene: Scene) -> CircularLoads:
 
 def _require_balance(effects: tuple[Effect, ...]) -> None:
     problem = "excites|excite the machine at the rotor speed as well, so that no motion is periodic"
-    require_terms(effects, COINCIDENT_TERMS, problem, "or simulate")
+    require_terms(effects, PERIODIC_JAM_TERMS, problem, "or simulate")
 
 
 def friction_on_light_loads(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:

@@ -15,7 +15,7 @@ def test_run_ups_name_each_lane():
         jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5),
         jv.SpinUp(60.0, duration=1.0),
     )
-    found = jv.run_ups(s, 5.0, drag=[0.05, 5.0], angles=[[0.0, 0.1], [1.0, 2.0]], stepsize_controller=jv.Tolerance(1e-5))
+    found = jv.run_up_map(s, 5.0, drag=[0.05, 5.0], angles=[[0.0, 0.1], [1.0, 2.0]], stepsize_controller=jv.Tolerance(1e-5))
     assert found.kind.shape == (2, 2) and np.all(found.finished)
     assert np.all(found.fraction("jammed") + found.fraction("unbalanced") + found.fraction("balanced") <= 1.0)
     assert not np.any(found.fraction("failed"))
@@ -34,12 +34,12 @@ def test_run_ups_name_each_lane():
     for line, kinds in zip(lines[1:], found.kind, strict=True):
         assert all(f"{50 * np.sum(kinds == kind)} % (" in line and f"%) {kind}" in line for kind in kinds)
     with pytest.raises(jv.InputError, match=r"angles has shape \(1, 3\)"):
-        jv.run_ups(s, 5.0, angles=[[0.0, 0.1, 0.2]])
+        jv.run_up_map(s, 5.0, angles=[[0.0, 0.1, 0.2]])
     for more, says in ((dict(drag=np.zeros(0)), "drag is an empty array"), (dict(starts=2, seed=-1), "seed is -1")):
         with pytest.raises(jv.InputError, match=says):
-            jv.run_ups(s, 5.0, **more)
+            jv.run_up_map(s, 5.0, **more)
     with pytest.raises(jv.InputError, match="cannot be combined with angles"):
-        jv.run_ups(s, 5.0, starts=3, angles=[[0.0, 0.1]])
+        jv.run_up_map(s, 5.0, starts=3, angles=[[0.0, 0.1]])
 
 
 def test_run_ups_that_fail_are_no_motion():
@@ -50,7 +50,7 @@ def test_run_ups_that_fail_are_no_motion():
             jv.balls(count=1, mass=0.4, radius=0.08, drag=0.5),
             jv.SpinUp(60.0, duration=0.5),
         )
-        found = jv.run_ups(s, 2.0, drag=[5.0, 1e12], max_steps=2**14)
+        found = jv.run_up_map(s, 2.0, drag=[5.0, 1e12], max_steps=2**14)
     assert found.finished.tolist() == [[True], [False]]
     assert found.fraction("failed").tolist() == [0.0, 1.0] and found.kind[1, 0] == "failed"
     assert found.summary().splitlines()[2] == "drag 1e+12 N s/m: failed"
@@ -67,8 +67,8 @@ def test_run_ups_start_as_far_apart_as_asked():
         jv.SpinUp(60.0, duration=1.0),
     )
     for separation in ("10 deg", 0.0):
-        found = jv.run_ups(s, 0.1, separation=separation, stepsize_controller=jv.Tolerance(1e-5))
+        found = jv.run_up_map(s, 0.1, separation=separation, stepsize_controller=jv.Tolerance(1e-5))
         np.testing.assert_allclose(np.degrees(np.ptp(found.angle)), 10.0 if separation else 0.0, atol=1e-12)
     for others in ({"starts": 3}, {"angles": [[0.0, 0.1]]}):
         with pytest.raises(jv.InputError, match=r"separation is '10 deg'; it is only for a single start"):
-            jv.run_ups(s, 0.1, separation="10 deg", **others)
+            jv.run_up_map(s, 0.1, separation="10 deg", **others)

@@ -1,4 +1,4 @@
-"""jaxvib run-up, run-ups."""
+"""jaxvib run-up, run-up-map."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jaxvib.errors import InputError
 def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: Path | None, output: Output) -> None:
     """Run the motors of SCENE up from rest by averaged equations: resonances that catch exciters, and peaks on the way.
 
-    --out adds the figure. For loads (balls, pendulums) and several drags use `run-ups`."""
+    --out adds the figure. For loads (balls, pendulums) and several drags use `run-up-map`."""
     found = jv.run_up(loaded_scene(scene, without), until, least=least)
     output.picture("run_up.png", found.plot)
     output.csv(csv, found.run, "trajectory_time")
@@ -34,7 +34,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
     output.done(document, found.summary, "run_up", found)
 
 
-@app.command("run-ups")
+@app.command("run-up-map")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time of each run-up, such as 6s.")
 @click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [value of SCENE].")
@@ -44,7 +44,7 @@ def run_up(scene: Path, until: str, least: bool, without: tuple[str, ...], csv: 
 @click.option("--step-tolerance", "tolerance", type=float, help="Allowed error of one time step [1e-7].")
 @click.option("--batch", type=int, default=16, show_default=True, help="Number of run-ups computed in parallel.")
 @shared
-def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
+def run_up_map(scene: Path, drags: tuple[str, ...], tolerance: float | None, output: Output, **options: Any) -> None:
     """Compute run-ups of SCENE from rest for each drag and each set of initial angles, and report the final regimes."""
     from jaxvib.units import number
 
@@ -52,9 +52,9 @@ def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output
     loaded = loaded_scene(scene)
     if all(exciter.loads is None for exciter in loaded.exciters):
         raise InputError("scene", "has no loads (balls, pendulums); for motors with unbalances use `jaxvib run-up`")
-    found = jv.run_ups(loaded, drag=each, stepsize_controller=chosen_steps(tolerance), **options)
-    output.picture("run_ups.png", found.plot)
-    output.keep("run_ups.npz", found)
+    found = jv.run_up_map(loaded, drag=each, stepsize_controller=chosen_steps(tolerance), **options)
+    output.picture("run_up_map.png", found.plot)
+    output.keep("run_up_map.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))
     rows = [
         {
@@ -72,5 +72,5 @@ def run_ups(scene: Path, drags: tuple[str, ...], tolerance: float | None, output
         shares = [[f"{row['drag']:.5g}", *(f"{100.0 * row['shares'][kind]:.3g} %" for kind in kinds)] for row in rows]
         return "\n".join([table("final motion of the loads", ["drag, N s/m", *kinds], shares), found.summary()])
 
-    document = {"until": options["until"], "starts": len(found.angle), "seed": options["seed"], "run_ups": rows}
-    output.done(document, text, "run_ups", found)
+    document = {"until": options["until"], "starts": len(found.angle), "seed": options["seed"], "map": rows}
+    output.done(document, text, "run_up_map", found)
