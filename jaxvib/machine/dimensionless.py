@@ -6,7 +6,9 @@ from __future__ import annotations
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
@@ -15,6 +17,7 @@ from jaxvib.machine.drives.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.platforms import Platforms
+from jaxvib.runtime.devices import known, numpy_of, on_device
 from jaxvib.units import Number, Numbers, number, numbers
 from jaxvib.units import count as whole
 
@@ -110,7 +113,7 @@ class Dimensionless(eqx.Module):
             raise InputError("natural", f"has {n} values; the machines of these papers have 1, 2 or 3 platforms")
         self.form = form
         self.count = whole(count, "count")
-        self.natural = jnp.broadcast_to(n_i, (n,))
+        self.natural = n_i if n_i.ndim else jnp.broadcast_to(n_i, (n,))
         self.damping = numbers(damping, "", "damping", n, low=0.0)
         links = len(_LINKS[n])
         self.link_natural = numbers(link_natural, "", "link_natural", links, low=0.0) if links else jnp.zeros((0,))
@@ -146,16 +149,19 @@ class Dimensionless(eqx.Module):
         """Force M2S w^2 y~ in N, the unit of the foundation force."""
         return self.mass_scale * self.frequency_scale**2 * self.length_unit
 
-    def _by_platform(self, others: Array, exciter: float) -> Array:
+    def _by_platform(self, others: Array | np.ndarray, exciter: float) -> Array:
         where = min(1, others.shape[0])
-        return jnp.concatenate([others[:where], jnp.full((1,), exciter, dtype=others.dtype), others[where:]])
+        return numpy_of(others).concatenate([others[:where], np.full(1, exciter, dtype=others.dtype), others[where:]])
 
     def scene(self) -> Scene:
         """Return the `Scene` in SI units, with the chosen size."""
+        return on_device(jax.tree.map(known, self)._scene())
+
+    def _scene(self) -> Scene:
         n = self.natural.shape[0]
         w, m_total, m = self.frequency_scale, self.mass_scale, self._load_mass
         mass = m_total / self._by_platform(self.rho, 1.0)
-        loads_mass = self._by_platform(jnp.zeros_like(self.rho), 1.0) * self.count * m
+        loads_mass = self._by_platform(np.zeros(self.rho.shape, self.rho.dtype), 1.0) * self.count * m
         machine = Platforms(
             mass=mass - loads_mass,
             stiffness=self.natural**2 * mass * w**2,

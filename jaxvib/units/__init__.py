@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxvib.boundary import is_whole
 from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import traced
+from jaxvib.runtime.devices import numpy_of
 from jaxvib.units.reading import Number, Numbers, Quantity, in_own_unit, require_real, to_float, unit_name, unit_ratio
 
 __all__ = [
@@ -184,18 +185,17 @@ def numbers(
             raise InputError(field, "is an empty list; at least 1 value is needed")
         if not all(isinstance(part, jax.Array) for part in parts):
             for i, part in enumerate(parts):
-                _array(part, unit, f"{field}[{i}]", (), bounds)
+                _converted(part, unit, f"{field}[{i}]", (), bounds)
         known = not any(isinstance(part, jax.Array) for part in parts)
         stacked = np.asarray(parts, dtype=float) if known else jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
         return _array(stacked, unit, field, stacked.shape, bounds)
     single: Any = value
     magnitude = to_float(single, unit, field)
     if np.ndim(magnitude) == 0:
-        scalar = _array(magnitude, unit, field, (), bounds)
-        if shared or length is None:
-            return scalar
-        known = not isinstance(magnitude, jax.Array)
-        return jnp.asarray(np.full(length, magnitude), dtype=float) if known else jnp.broadcast_to(scalar, (length,))
+        scalar = _converted(magnitude, unit, field, (), bounds)
+        if not (shared or length is None):
+            scalar = numpy_of(scalar).broadcast_to(scalar, (length,))
+        return jnp.asarray(scalar, dtype=float)
     if np.size(magnitude) == 0 and length is None:
         raise InputError(field, "is an empty array; at least 1 value is needed")
     if np.ndim(magnitude) != 1 or (length is not None and np.shape(magnitude)[0] != length):

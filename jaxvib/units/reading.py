@@ -6,7 +6,7 @@ import math
 import re
 import tokenize
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias, cast, runtime_checkable
 
 import numpy as np
 from jax import Array
@@ -134,12 +134,13 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         if factor is not None:
             return magnitude * factor
         return _magnitude(_quantity(magnitude, written, value, unit, field), unit, field, value)
-    if isinstance(value, Quantity):
+    # The test of the protocol takes longer than everything else here.
+    if hasattr(value, "m_as") and isinstance(value, Quantity):
         if not hasattr(value, "units"):  # a quantity of another library, with its own conversion
             return value.m_as(unit or "dimensionless")
         return _magnitude(value, unit, field, str(value))
     require_real(value, unit, field)
-    return value
+    return cast("float | Array | np.ndarray | np.number", value)
 
 
 def require_real(value: object, unit: str, field: str) -> None:
