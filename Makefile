@@ -1,4 +1,4 @@
-# Everything a fresh machine needs beside Python and pip is installed into $(VENV).
+# Everything that is needed besides Python and pip is installed into $(VENV).
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
@@ -9,13 +9,13 @@ EXAMPLE = examples/antiphase
 .PHONY: demo test test-slow validate test-versions check docs bench-guard clean
 
 demo: $(VENV)/installed-demo
-	@echo "--- how the first drawing can jam"
+	@echo "--- jam modes of the first drawing"
 	@$(JAXVIB) modes $(EXAMPLE)/machine.toml --out $(OUT)/first
-	@echo "--- the supports that leave the foundation at rest"
+	@echo "--- supports with the smallest foundation force"
 	@$(JAXVIB) optimize $(EXAMPLE)/design.toml --tolerance stiffness=5% --out $(OUT)/antiphase
-	@echo "--- the machine that was found, spun up smoothly from rest"
+	@echo "--- spin-up of the optimized machine from rest"
 	@$(JAXVIB) simulate $(OUT)/antiphase/found.toml --until 120s --spin-up 30s --start spin_up --out $(OUT)/spin_up
-	@echo "--- pictures"
+	@echo "--- figures"
 	@ls $(OUT)/*/*.png
 
 test: $(VENV)/installed
@@ -53,11 +53,11 @@ docs: $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo out/site/index.html
 
-# Ratios of times beside recorded ones: fails where something became three times slower.
+# Ratios of times, compared with recorded ratios; fails if a ratio is three times as large.
 bench-guard: $(VENV)/installed-bench
 	$(BIN)/python benchmarks/guard.py
 
-# What users install: without what the tests need.
+# The installation of a user, without the packages of the tests.
 $(VENV)/installed-demo: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
