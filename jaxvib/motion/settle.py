@@ -85,7 +85,7 @@ def settle(
 
     - `scene` with a drive of constant speed
     - `start`, `mode`: as for `simulate`; default: near the jam mode `mode`; without a mode, at rest
-    - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, also in a jam
+    - `separation`: angle between neighbouring loads at a named start, rad; default: as for `simulate`, in a jam 1 degree
     - `drift`: drift below which a motion has settled, see `Measured`; typical: 1e-3 to 1e-8; default: 1e-6, in single precision
       1e-3. A drift given here must be reached; with the default, motions that beat or creep also count as settled.
       In addition, the distance of the motion from its steady state must be below ten times the drift, because with little
