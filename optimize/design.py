@@ -14,10 +14,12 @@ from optimize.synthesize import synthesize
 
 @dataclass(frozen=True)
 class Design:
-    """Design task: `space`, `objective`, the arguments of `synthesize` in `search`, and the demands
-    `subject_to`.
+    """Design task.
 
     Returned by `load_design` and by the functions of `optimize.recipes`.
+
+    **Attributes**: `space`: a `DesignSpace`; `objective`: the quantity to minimize; `search`: further arguments of
+    `synthesize`, for example {"starts": 32}; `subject_to`: the demands.
     """
 
     space: DesignSpace
@@ -26,5 +28,8 @@ class Design:
     subject_to: tuple[Demand, ...] = ()
 
     def run(self, **more: Any) -> Synthesis:
-        """Search for the best machine by `synthesize`, with arguments `more` in place of those in `search`."""
+        """Search for the best machine by `synthesize`. Arguments in `more` replace those in `search`.
+
+        **Returns** `Synthesis`. **Raises** the errors of `synthesize`.
+        """
         return synthesize(self.space, self.objective, subject_to=self.subject_to, **{**self.search, **more})

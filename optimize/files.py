@@ -49,9 +49,9 @@ def load_design(path: str | Path) -> Design:
     - `[free]`: bounds for each parameter that may change
     - `[ties]`: parameters that follow others
     - `[choices]`: parameters whose values are chosen from a list, or from a catalogue: `file`, a CSV file relative to the
-      design file, and the name of its `column`. For rows of a catalogue, such as motors, the key is any word, and its value is
+      design file, and the name of its `column`. For rows of a catalogue, such as motors, the key is any name, and its value is
       a table of `file` and `columns`, which maps parameters to names of columns
-    - every `[[hold]]`: a quantity and the value that it keeps; default: its value in the scene
+    - every `[[hold]]`: a quantity and the `value` that it keeps; default: its value in the scene
     - every `[[demand]]`: a quantity that is `at_most` or `at_least` a value
     - `[objective]`: the quantity to minimize, or to maximize with `maximize = true`
     - `[search]`: the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`, `searcher`
@@ -59,7 +59,8 @@ def load_design(path: str | Path) -> Design:
     A quantity with `tolerances` is a statistic over machines whose parameters deviate within these tolerances: the mean
     (`statistic = "expected"`) or the largest value (`"worst"`).
 
-    **Returns** `Design`. **Raises** `InputError` for a file that cannot be read and for every error in it, naming the field.
+    **Returns** `Design`. **Raises** `InputError` for a file that cannot be read, and for an error in it; the message names the
+    field.
 
     >>> import pathlib, tempfile
     >>> from jaxvib.machine.files import TEMPLATES
@@ -70,7 +71,7 @@ def load_design(path: str | Path) -> Design:
     >>> load_design(folder / "design.toml").objective.name
     'force_per_amplitude'
     """
-    start()  # a process that uses no other name of jaxvib makes its first arrays here
+    start()  # without an earlier call of jaxvib, the first arrays of the process are made here
     tables = read_toml(path)
     for name in tables:
         if name not in _SECTIONS:
@@ -88,13 +89,13 @@ def load_design(path: str | Path) -> Design:
         if not isinstance(tables.get(name, []), list):
             raise InputError(name, f"is not a list of tables; write [[{name}]] for each quantity")
     scene = load_scene(Path(path).parent / tables["scene"])
-    design = _of_recipe(scene, tables) if has_recipe else _of_tables(scene, tables, Path(path).parent)
+    design = _design_from_recipe(scene, tables) if has_recipe else _design_from_tables(scene, tables, Path(path).parent)
     demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
     search = {**design.search, **_search_options(tables.get("search", {}))}
     return Design(design.space, design.objective, search, (*design.subject_to, *demands))
 
 
-def _of_recipe(scene: Scene, tables: Tables) -> Design:
+def _design_from_recipe(scene: Scene, tables: Tables) -> Design:
     """Return the design task of a file with a table [recipe]."""
     for name in ("free", "ties", "choices", "hold", "objective"):
         if name in tables:
@@ -107,17 +108,17 @@ def _of_recipe(scene: Scene, tables: Tables) -> Design:
     return build_part(partial(_RECIPES[name], scene), table, "recipe")
 
 
-def _of_tables(scene: Scene, tables: Tables, folder: Path) -> Design:
+def _design_from_tables(scene: Scene, tables: Tables, folder: Path) -> Design:
     """Return the design task of a file in a `folder` with the tables [free] and [objective]."""
-    values = [quantity_from_table(table, f"hold[{k}]", ("value",)) for k, table in enumerate(tables.get("hold", []))]
-    held = [hold(q, more.get("value")) for q, more in values]
+    held_tables = [quantity_from_table(table, f"hold[{k}]", ("value",)) for k, table in enumerate(tables.get("hold", []))]
+    held = [hold(q, options.get("value")) for q, options in held_tables]
     ties = {name: tuple(v) if isinstance(v, list) else v for name, v in tables.get("ties", {}).items()}
     free, choices = dict(tables.get("free", {})), dict(tables.get("choices", {}))
-    choices = {name: _from_catalogue(scene, name, values, folder) for name, values in choices.items()}
-    objective, more = quantity_from_table(tables["objective"], "objective", ("maximize",))
-    if not isinstance(more.get("maximize", False), bool):
-        raise InputError("objective.maximize", f"is {quoted(more['maximize'])}; write true or false, without quotes")
-    if more.get("maximize", False):
+    choices = {name: _from_catalogue(scene, name, listed, folder) for name, listed in choices.items()}
+    objective, options = quantity_from_table(tables["objective"], "objective", ("maximize",))
+    if not isinstance(options.get("maximize", False), bool):
+        raise InputError("objective.maximize", f"is {quoted(options['maximize'])}; write true or false, without quotes")
+    if options.get("maximize", False):
         objective = -objective
     return Design(DesignSpace(scene, free, held, ties=ties, choices=choices), objective)
 
@@ -142,27 +143,26 @@ def _search_options(table: Tables) -> Tables:
 
 
 def _from_catalogue(scene: Scene, name: str, values: Any, folder: Path) -> Any:
-    """Return the values of a choice.
-
-    A table with `file`, and `column` if necessary, is a column of a CSV file. A table with `file` and `columns` is its rows.
-    """
-    if not isinstance(values, Mapping) or any("." in each for each in values):
+    """Return the values of a choice: a list as it is, a column of a CSV file (a table with `file` and, if necessary, `column`),
+    or several columns, whose rows belong together (a table with `file` and `columns`)."""
+    if not isinstance(values, Mapping) or any("." in parameter for parameter in values):
         return values
-    named = values.get("columns", {name: values.get("column")})
+    column_names = values.get("columns", {name: values.get("column")})
     if (
         not isinstance(values.get("file"), str)
         or values.keys() - {"file", "column", "columns"}
-        or not isinstance(named, Mapping)
+        or not isinstance(column_names, Mapping)
     ):
         advice = (
             "write a list, or file = 'springs.csv', column = 'rate', or, for rows, columns = {'drive.power' = 'power', ...}"
         )
         raise InputError(f"choices.{name}", f"is {quoted(dict(values))}; {advice}")
     path = folder / values["file"]
-    found = {
-        each: csv_column(path, find_number(scene, each, "choices").unit, column).tolist() for each, column in named.items()
+    columns = {
+        parameter: csv_column(path, find_number(scene, parameter, "choices").unit, column).tolist()
+        for parameter, column in column_names.items()
     }
-    return found if "columns" in values else found[name]
+    return columns if "columns" in values else columns[name]
 
 
 def _demands(table: object, section: str) -> list[Demand]:
@@ -171,8 +171,8 @@ def _demands(table: object, section: str) -> list[Demand]:
     quantity, more = quantity_from_table(table, section, ("at_most", "at_least"))
     if not more:
         raise InputError(section, "has no limit; give at_most, at_least or both")
-    make = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
-    return [make[name](limit) for name, limit in more.items()]
+    comparison = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
+    return [comparison[name](limit) for name, limit in more.items()]
 
 
 def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> tuple[Quantity, Tables]:
@@ -186,8 +186,8 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     if not isinstance(name, str) or name not in _QUANTITIES:
         problem = "is missing" if name is None else f"is {name!r}"
         raise InputError(f"{section}.quantity", f"{problem}; {suggest_name(str(name), list(_QUANTITIES))}")
-    own = (*more, "tolerances", "statistic", "samples")
-    values = {k: v for k, v in table.items() if k not in ("quantity", *own)}
+    own_fields = (*more, "tolerances", "statistic", "samples")
+    values = {k: v for k, v in table.items() if k not in ("quantity", *own_fields)}
     for key in ("of", "prices"):
         if isinstance(values.get(key), list):
             values[key] = tuple(tuple(v) if isinstance(v, list) else v for v in values[key])
@@ -195,10 +195,12 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
         count(values["mode"], f"{section}.mode")
     quantity = build_part(_QUANTITIES[name], values, section)
     if "tolerances" in table:
-        how = table.get("statistic", "expected")
-        if not isinstance(how, str) or how not in _STATISTICS:
-            raise InputError(f"{section}.statistic", f"is {quoted(how)}; {suggest_name(str(how), list(_STATISTICS))}")
-        quantity = _STATISTICS[how](quantity, table["tolerances"], samples=table.get("samples", 64))
+        statistic = table.get("statistic", "expected")
+        if not isinstance(statistic, str) or statistic not in _STATISTICS:
+            raise InputError(
+                f"{section}.statistic", f"is {quoted(statistic)}; {suggest_name(str(statistic), list(_STATISTICS))}"
+            )
+        quantity = _STATISTICS[statistic](quantity, table["tolerances"], samples=table.get("samples", 64))
     return quantity, {k: table[k] for k in more if k in table}
 
 

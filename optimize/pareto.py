@@ -1,4 +1,4 @@
-"""Trade-offs of two quantities, with the machine that belongs to each point."""
+"""Trade-offs of two quantities, with the machine at each point."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _NO_LIMIT = 1e100
 
 
 class Front(Result):
-    """Machines of a trade-off: if one is better than another in one quantity, it is worse in the other quantity.
+    """Machines of a trade-off of two quantities: a machine that is better than another in one quantity is worse in the other.
 
     Returned by `pareto`.
 
@@ -93,7 +93,7 @@ def pareto(
     starts: int = 32,
     seed: int = 0,
 ) -> Front:
-    """Return the trade-off of two quantities, both of which are minimized.
+    """Return the trade-off of two quantities, which are both minimized.
 
     - Each end of the front is the least value of one quantity and, among the machines that have this value, the least value of
       the other quantity
@@ -129,35 +129,35 @@ def pareto(
     count(points, "points", low=2)
     demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
 
-    def both(found: Synthesis) -> tuple[float, float]:
-        return float(first(found.scene)), float(second(found.scene))
+    def values_of(synthesis: Synthesis) -> tuple[float, float]:
+        return float(first(synthesis.scene)), float(second(synthesis.scene))
 
-    def searched(objective: Quantity, other: Quantity, limit: float) -> list[Synthesis]:
+    def search_with_limit(objective: Quantity, other: Quantity, limit: float) -> list[Synthesis]:
         """Search for the least objective with a limit on the other quantity, then for the least value of that quantity among
         machines with the same objective."""
         best = synthesize(space, objective, subject_to=[*demands, other < limit], starts=starts, seed=seed, verify=False)
         # A flat objective has many minima; the first search ends at any of them.
         with_best_objective = [*demands, objective < float(objective(best.scene))]
-        then = synthesize(space, other, subject_to=with_best_objective, begin=best, seed=seed, verify=False, throw=False)
-        if "interrupted" in (best.status_name, then.status_name):
+        refined = synthesize(space, other, subject_to=with_best_objective, begin=best, seed=seed, verify=False, throw=False)
+        if "interrupted" in (best.status_name, refined.status_name):
             raise KeyboardInterrupt  # a front needs all of its searches
-        return [best, then] if then.status_name != "contradictory" else [best]
+        return [best, refined] if refined.status_name != "contradictory" else [best]
 
-    # This limit excludes only machines without the other quantity. With it, all searches share two programs.
-    lowest = searched(first, second, _NO_LIMIT)
-    highest = searched(second, first, _NO_LIMIT)
-    (_, worst), (_, least) = both(lowest[-1]), both(highest[-1])
-    found = [*lowest, *highest]
+    # The limit excludes only machines that do not have the other quantity. Because of it, all searches share two programs.
+    lowest = search_with_limit(first, second, _NO_LIMIT)
+    highest = search_with_limit(second, first, _NO_LIMIT)
+    (_, worst), (_, least) = values_of(lowest[-1]), values_of(highest[-1])
+    results = [*lowest, *highest]
     for limit in np.linspace(worst, least, points)[1:-1] if worst > least else ():
         with contextlib.suppress(ComputationError):  # a search may not find a narrow range of feasible machines
-            found += searched(first, second, float(limit))
-    values = np.asarray([both(each) for each in found])
-    kept = not_dominated(values)
+            results += search_with_limit(first, second, float(limit))
+    values = np.asarray([values_of(result) for result in results])
+    indices = not_dominated(values)
     return Front(
-        values=values[kept],
+        values=values[indices],
         names=(first.words, second.words),
         units=(first.unit, second.unit),
-        machines=tuple(scene_to_toml(found[k].scene) for k in kept),
+        machines=tuple(scene_to_toml(results[k].scene) for k in indices),
     )
 
 
@@ -169,8 +169,8 @@ def not_dominated(values: np.ndarray) -> list[int]:
     """
     span = np.maximum(np.ptp(values, axis=0), 0.1 * np.max(np.abs(values), axis=0))
     scaled = values / np.where(span > 0.0, span, 1.0)
-    kept: list[int] = []
+    indices: list[int] = []
     for k in np.argsort(np.sum(scaled, axis=1), kind="stable"):  # a row with a larger sum cannot dominate
-        if not any(np.all(scaled[j] <= scaled[k] + _SAME_POINT_DIFFERENCE) for j in kept):
-            kept.append(int(k))
-    return sorted(kept, key=lambda k: (values[k, 0], -values[k, 1]))
+        if not any(np.all(scaled[j] <= scaled[k] + _SAME_POINT_DIFFERENCE) for j in indices):
+            indices.append(int(k))
+    return sorted(indices, key=lambda k: (values[k, 0], -values[k, 1]))

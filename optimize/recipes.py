@@ -47,15 +47,15 @@ def _platforms(scene: Scene, least: int) -> Platforms:
 
 
 def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[str, tuple[Number, Number]]:
-    """Return the bounds k/`range_` and k*`range_` of the stiffness k of each spring of these kinds."""
-    found: dict[str, tuple[Number, Number]] = {}
+    """Return the bounds k/`range_` and k*`range_` of the stiffness k of each spring in the fields `kinds` of the machine."""
+    bounds: dict[str, tuple[Number, Number]] = {}
     for kind in kinds:
         for k, value in enumerate(np.asarray(getattr(machine, kind))):
             if value > 0.0:
-                found[f"machine.{kind}[{k}]"] = (float(value / range_), float(value * range_))
-    if not found:
+                bounds[f"machine.{kind}[{k}]"] = (float(value / range_), float(value * range_))
+    if not bounds:
         raise InputError("scene", "has no springs that can be changed")
-    return found
+    return bounds
 
 
 def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
@@ -83,7 +83,7 @@ def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
 
 
 def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
-    """Return the design task for an anti-resonance machine of three masses: least middle amplitude per outer amplitude.
+    """Return the design task for an anti-resonance machine of three masses: the least ratio of middle and outer amplitude.
 
     The springs of the links are free, and the frequency of the jam keeps its value. Without damping the middle platform (2) is
     at rest if k12/M1 = k23/M3 = w^2; the outer amplitude is the amplitude of the displacement of platform 1 relative to
@@ -101,9 +101,9 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
 
 
 def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: int = 16) -> list[tuple[str, Synthesis]]:
-    """Find out which spring of an existing machine should be exchanged.
+    """Determine which spring of an existing machine should be exchanged.
 
-    For each spring, search for the best machine that differs in this spring only.
+    For each spring, the best machine that differs in this spring only is searched for.
 
     **Arguments**: `objective`: the quantity to minimize; `range_`: the factor by which a spring may differ; `starts` of each
     search.
@@ -112,19 +112,23 @@ def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: in
     """
     machine = _platforms(scene, 1)
     free = _springs(machine, range_, ("stiffness", "link_stiffness"))
-    found = []
+    results = []
     for name, bounds in free.items():
         best = synthesize(DesignSpace(scene, {name: bounds}), objective, starts=starts, verify=False)
-        found.append((name, best))
-    return sorted(found, key=lambda each: float(each[1].values.min()))
+        results.append((name, best))
+    return sorted(results, key=lambda result: float(result[1].values.min()))
 
 
 def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[int, int] | None = None) -> Design:
-    """Return the design task: the lightest loads that shake a platform by at least the amplitude `least` (m or text).
+    """Return the design task for the lightest loads with which a platform vibrates with at least the amplitude `least`.
 
     The mass of the loads is free, from one tenth to ten times its value; the radius of the track keeps its value.
 
-    **Returns** `Design`, not yet searched; `design.run()` searches.
+    **Arguments**: `scene`: platforms with equal loads; `least`: amplitude, m zero to peak or text, typical: 0.5 to 10 mm;
+    `mode` and `of`: as for `amplitude`.
+
+    **Returns** `Design`, not yet searched; `design.run()` searches. **Raises** `InputError` for another machine, and for loads
+    of different masses.
     """
     machine = _platforms(scene, 1)
     del machine
@@ -136,7 +140,7 @@ def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[
 
 
 def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
-    """Return the design task: springs for which a jam mode exists over the widest range of rotor speeds.
+    """Return the design task for springs with which a jam mode exists over the widest range of rotor speeds.
 
     The range includes the present rotor speed. The objective is the distance of the rotor speed from the nearer fold, above or
     below. The amplitude must be at least `keep` times the present amplitude.
@@ -216,8 +220,8 @@ def feeder(
     range_: float = 1.5,
     spread: float = 0.1,
 ) -> Design:
-    """Return the design task for a feeder: least foundation force divided by the amplitude of the trough, with a throw of given
-    angle and stroke.
+    """Return the design task for a feeder: least foundation force per amplitude of the trough, for a given throw angle and
+    stroke.
 
     The mean of the `points` keeps the throw angle and the stroke. The positions of the exciters, their unbalances and the
     stiffness of the supports are free; the unbalances keep their ratios.
@@ -264,7 +268,7 @@ def _exciters(scene: Scene, least: int, reach: Number) -> tuple[dict[str, Bounds
 
 
 def _middle(points: Sequence[Sequence[Number]]) -> tuple[float, float]:
-    """Return the mean of the points of a deck."""
+    """Return the mean (x, y), m, of the points of a deck."""
     if not isinstance(points, (list, tuple)) or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in points):
         raise InputError("points", f"is {quoted(points)}; it must be a list of at least two points (x, y)")
     x, y = np.mean([[number_in(v, "m", f"points[{k}]") for v in p] for k, p in enumerate(points)], axis=0).tolist()

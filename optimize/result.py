@@ -30,7 +30,7 @@ _EQUAL_VALUE = 1e-4
 """Relative difference of the objectives of two machines below which they count as equally good."""
 
 _MIN_LIMIT_CHANGE = 1e-6
-"""Smallest change of a limit, per cent, that is shown."""
+"""Smallest change of a limit, per cent, for which the change of the objective is shown."""
 
 
 class SynthesisStatus(eqx.Enumeration):
@@ -71,8 +71,11 @@ class Outcome:
 
 
 class Row(NamedTuple):
-    """Row of the table: name `what` and SI `unit`; values `before` and `after` the search, by the exact motion (`exact`) and by
-    time integration (`time`). A value that was not computed is NaN."""
+    """Row of the table of a parameter or quantity.
+
+    **Attributes**: name `what`; SI `unit`; value `before` the search; values of the best design: by the method of the quantity
+    (`after`), by the exact motion (`exact`), and by time integration (`time`). A value that was not computed is NaN.
+    """
 
     what: str
     unit: str
@@ -87,14 +90,14 @@ class Limit(NamedTuple):
 
     **Attributes**
 
-    - `what` in words; its `value` and `limit` in SI `unit`
+    - `what`: the condition as text; `value` of its quantity and its `limit`, in the SI `unit`
     - `violation`: its relative violation (0: met; infinite: the machine has no such value)
     - `active`: True if it limits the design
-    - `multiplier`: derivative of the objective with respect to the limit, times the limit, for a change that relaxes the limit
-      (held quantities: an increase)
+    - `multiplier`: derivative of the objective with respect to the limit, in the direction that relaxes the limit (for held
+      quantities: an increase of the held value), times the modulus of the limit; in the unit of the objective
     - `gain`: change of the objective, per cent, if the limit is relaxed by 1 %, predicted from this derivative; negative for an
       improvement. A prediction of more than a few per cent is not reliable
-    - `written`: unit of a limit that was written as text, "" for the display unit
+    - `written`: unit in which the user wrote the limit, such as "mm"; "" for the default display unit
     """
 
     what: str
@@ -123,8 +126,10 @@ class Limit(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """Influence of the free parameter `what` on the objective: the change of the objective, per cent, if only this parameter is
-    1 % smaller (`less`) or 1 % larger (`more`)."""
+    """Influence of a free parameter, named `what`, on the objective.
+
+    **Attributes**: change of the objective, per cent, if only this parameter is 1 % smaller (`less`) or 1 % larger (`more`).
+    """
 
     what: str
     less: float
@@ -132,8 +137,11 @@ class Influence(NamedTuple):
 
 
 class Machine(NamedTuple):
-    """Distinct machine of a search: `starts`, the number of starts that ended at it; the `value` of the objective; the free
-    `numbers`, SI."""
+    """Distinct machine of a search.
+
+    **Attributes**: `starts`: the number of starts whose search ended at this machine; `value` of the objective; `numbers`: the
+    free parameters, SI.
+    """
 
     starts: int
     value: float
@@ -158,8 +166,10 @@ class Synthesis(Result):
     - `kkt`: relative residual of the Karush-Kuhn-Tucker conditions at the best design
     - `starts`: number of searches, from `drawn` random designs; `converged`: number of searches that ended at a design that no
       change of a free parameter improves; `same`: number of searches that ended at the best design
-    - `designs` (starts, d) in [0, 1]: the final design of each search; `values`: its objective; `done`: True if it converged
-    - `history` (iterations, starts) of the objective; `objective` and `unit`: its name and unit
+    - `designs` (starts, d) in [0, 1]: the final design of each search; `values` (starts,): its objective, infinite for a design
+      that does not meet all demands; `done` (starts,): True if the search converged
+    - `history` (steps, starts): the objective after each step of the descent and of the polishing
+    - `objective` and `unit`: name and unit of the objective
     """
 
     status: SynthesisStatus
@@ -206,16 +216,16 @@ class Synthesis(Result):
         return out
 
     def findings(self) -> list[str]:
-        """Return lines of text on demands, held quantities, bounds and influences, and on the distinct final designs."""
+        """Return lines of text with the limits, the five largest influences, and the distinct final designs."""
         lines = []
         best = self.machines[0].value if self.machines else math.nan
 
-        def changed(*percent: float) -> str:
+        def change_text(*percent: float) -> str:
             if math.isnan(best) or not max(map(abs, percent)) > _MAX_SHOWN_PERCENT:
-                return " / ".join(f"{each:+.3g} %" for each in percent) + " of the objective"
-            changes = [max(abs(best), 1e-300) * each / 100.0 for each in percent]  # for an objective near 0
+                return " / ".join(f"{influence:+.3g} %" for influence in percent) + " of the objective"
+            changes = [max(abs(best), 1e-300) * influence / 100.0 for influence in percent]  # for an objective near 0
             unit, factor = shown_unit(self.unit, max(map(abs, changes)))
-            return " / ".join(f"{each * factor:+.3g} {unit}".rstrip() for each in changes)
+            return " / ".join(f"{influence * factor:+.3g} {unit}".rstrip() for influence in changes)
 
         for limit in self.limits:
             values = limit.value_text()
@@ -226,8 +236,8 @@ class Synthesis(Result):
             else:
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
-        for each in ranked[:5]:
-            lines.append(f"  1 % less / more {each.what}: {changed(each.less, each.more)}")
+        for influence in ranked[:5]:
+            lines.append(f"  1 % less / more {influence.what}: {change_text(influence.less, influence.more)}")
         equal = [m for m in self.machines if abs(m.value - best) <= _EQUAL_VALUE * abs(best)]
         unit, factor = shown_unit(self.unit, abs(best))
         factor = -factor if objective_text(self.objective).startswith("greatest ") else factor
@@ -289,7 +299,7 @@ def _limit_influence(gain: float) -> str:
 
 
 def objective_text(objective: str) -> str:
-    """Return the name of the objective for sentences."""
+    """Return the name of the objective for sentences, such as "least power" or "greatest amplitude"."""
     words = objective.replace("_", " ")
     return f"greatest {words.removeprefix('negative ')}" if words.startswith("negative ") else f"least {words}"
 

@@ -48,10 +48,11 @@ def hold(quantity: Quantity, value: Number | None = None) -> HeldQuantity:
     **Arguments**
 
     - `quantity` such as `jam_frequency(mode=3)`
-    - `value` in its unit, or text; default: its value in the initial scene; typical: not 0
+    - `value` in the unit of the quantity, or text; typical: 0.8 to 1.2 times the value of the initial scene; default: the value
+      of the initial scene
 
-    **Returns** `HeldQuantity`. **Raises** `InputError` for a wrong unit, or a value of 0 (deviations from a held value are
-    relative).
+    **Returns** `HeldQuantity`. **Raises** `InputError` for a wrong unit, and for the value 0, because deviations from a held
+    value are relative.
 
     >>> from optimize import hold, jam_frequency
     >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name
@@ -59,14 +60,14 @@ def hold(quantity: Quantity, value: Number | None = None) -> HeldQuantity:
     """
     if value is None:
         return HeldQuantity(quantity, None)
-    held = float(number(value, quantity.unit, f"hold.{quantity.name}"))
-    if held == 0.0:
+    number_held = float(number(value, quantity.unit, f"hold.{quantity.name}"))
+    if number_held == 0.0:
         raise InputError(f"hold.{quantity.name}", "is 0; a held value must differ from 0")
-    return HeldQuantity(quantity, held)
+    return HeldQuantity(quantity, number_held)
 
 
 class Tie(NamedTuple):
-    """Parameters that follow others: `target` = `factor` times `source`, entry by entry."""
+    """Tie of a parameter to another one: `target` = `factor` times `source`, entry by entry."""
 
     target: NamedNumber
     source: NamedNumber
@@ -74,7 +75,8 @@ class Tie(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Parameter of a row of a catalogue: `target` follows `source` through the pairs (`at`, `values`), SI, linearly between."""
+    """Further column of a catalogue of rows: the parameter `target` is interpolated linearly in the pairs (`at`, `values`), SI,
+    at the value of the parameter `source`, the first column."""
 
     target: NamedNumber
     source: NamedNumber
@@ -83,7 +85,7 @@ class Column(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Parameter with a list of allowed values, ascending, SI; `start`: its index in the design vector."""
+    """Parameter `name` with its allowed `values`, ascending, SI; `start`: its index in the design vector."""
 
     name: str
     values: tuple[float, ...]
@@ -104,7 +106,7 @@ class DesignSpace(eqx.Module):
       factor), or (name, "keep") to keep the present ratio of both; entries of an array that are 0 stay 0, as in `free`
     - `choices`: a mapping from the name of a parameter to its allowed values, such as the springs of a catalogue, or from
       "loads.count" to allowed numbers of loads; typical: 2 to 20 values. Rows of a catalogue, such as motors, are a mapping
-      from any word to the columns: {"motor": {"drive.speed": ["1450 rpm", "970 rpm"], "drive.inertia": [0.01, 0.02]}}; the
+      from any name to the columns: {"motor": {"drive.speed": ["1450 rpm", "970 rpm"], "drive.inertia": [0.01, 0.02]}}; the
       values of the first column must differ
 
     Names and bounds of `free`:
@@ -125,7 +127,7 @@ class DesignSpace(eqx.Module):
     - a name that the scene does not have, and a lower bound above the upper one
     - a parameter that is free twice, or free and tied
     - values of a catalogue that no scene can have
-    - more held quantities than free parameters
+    - as many held quantities as free parameters, or more
 
     >>> import jaxvib as jv
     >>> from optimize import DesignSpace
@@ -164,31 +166,31 @@ class DesignSpace(eqx.Module):
         chosen, counts = _read_choices(scene, single)
         if not free and not chosen:
             raise InputError("free", "is empty; name at least one number that may change, such as machine.stiffness")
-        ranges = [(name, *_bounds(scene, name, bounds)) for name, bounds in free.items()]
+        ranges = [(name, *_read_bounds(scene, name, bounds)) for name, bounds in free.items()]
         for name, values in chosen.items():
             if name in free:
                 raise InputError(f"choices.{name}", "is free already; give it once, as free or as a choice")
             is_log = values[-1] / values[0] >= 10.0 if values[0] > 0.0 else False
             ranges.append((name, find_number(scene, name, "choices"), values[0], values[-1], is_log))
-        taken: set = set()
+        used: set = set()
         numbers, lows, highs, logs, choices_ = [], [], [], [], []
-        for name, whole, low, high, log in ranges:
-            if whole.entries & taken:
+        for name, array, low, high, log in ranges:
+            if array.entries & used:
                 raise InputError(f"free.{name}", "frees a number that is free already; give each number once")
-            taken |= whole.entries
-            for each in present_numbers(scene, whole, "choices" if name in chosen else "free"):
+            used |= array.entries
+            for entry in present_numbers(scene, array, "choices" if name in chosen else "free"):
                 if name in chosen:
-                    choices_ += [Choice(name, chosen[name], len(lows) + k) for k in range(each.size)]
-                numbers.append(each)
-                lows, highs, logs = lows + [low] * each.size, highs + [high] * each.size, logs + [log] * each.size
+                    choices_ += [Choice(name, chosen[name], len(lows) + k) for k in range(entry.size)]
+                numbers.append(entry)
+                lows, highs, logs = lows + [low] * entry.size, highs + [high] * entry.size, logs + [log] * entry.size
         self.scene = scene
         self.free, self.logs, self.choices = tuple(numbers), tuple(logs), tuple(choices_)
         self.low, self.high = np.asarray(lows), np.asarray(highs)
         for column in self.columns:
-            if column.target.entries & taken:
+            if column.target.entries & used:
                 raise InputError(f"choices.{column.target.name}", "is free or chosen already; give each number once")
-            taken |= column.target.entries
-        self.ties = _read_ties(scene, ties or {}, taken)
+            used |= column.target.entries
+        self.ties = _read_ties(scene, ties or {}, used)
         self.counts = counts
         for held in hold:
             if not isinstance(held, HeldQuantity):
@@ -264,12 +266,12 @@ class DesignSpace(eqx.Module):
         return {n.name: (n.leaf(scene) if n.entry is None else n.leaf(scene)[n.entry]).tolist() for n in self.free}
 
     def words(self) -> list[tuple[str, str]]:
-        """Return the name for tables and the unit of each free parameter."""
+        """Return the name for tables and the SI unit of each free parameter."""
         return [(word, each.unit) for each in self.free for word in each.words(self.scene)]
 
     @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
-        """Return the same space with other bounds `low` and `high` (d,), SI; equal bounds fix a parameter."""
+        """Return the same space with the bounds `low` and `high` (d,), SI; equal bounds fix a parameter."""
         for bounds, name in ((low, "low"), (high, "high")):
             self._require_size(bounds, name, single=True)
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
@@ -292,7 +294,7 @@ def _require_tables(scene: object, free: object, hold: object, ties: object, cho
         raise InputError("hold", f"is {quoted(hold)}; it must be a list of quantities in optimize.hold(...)")
 
 
-def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, float, float, bool]:
+def _read_bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, float, float, bool]:
     if isinstance(bounds, Mapping):
         example = f"{name}.{next(iter(bounds), '')}"
         raise InputError(f"free.{name}", f'is a table; write the whole name in quotes, for example "{example}"')
@@ -313,22 +315,22 @@ def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, float
 
 
 def _read_rows(scene: Scene, choices: Mapping[str, Any]) -> tuple[dict[str, Sequence[Number]], tuple[Column, ...]]:
-    """Return the choices of single parameters, among them the first column of each catalogue of rows, and its other columns."""
+    """Return the choices of single parameters, including the first column of each catalogue of rows, and the other columns."""
     single: dict[str, Sequence[Number]] = {}
     columns: list[Column] = []
-    for label, given in choices.items():
-        if not isinstance(given, Mapping):
-            single[label] = given
+    for label, columns_given in choices.items():
+        if not isinstance(columns_given, Mapping):
+            single[label] = columns_given
             continue
         field = f"choices.{label}"
-        if len(given) < 2:
+        if len(columns_given) < 2:
             raise InputError(field, "needs at least two columns; give a parameter alone as a list of values")
-        found = {name: find_number(scene, name, field) for name in given}
+        entries = {name: find_number(scene, name, field) for name in columns_given}
         read: dict[str, list[float]] = {}
-        for name, entry in found.items():
-            if not isinstance(given[name], (list, tuple)) or entry.size != 1:
+        for name, entry in entries.items():
+            if not isinstance(columns_given[name], (list, tuple)) or entry.size != 1:
                 raise InputError(f"{field}.{name}", "needs a list of values of a single number, such as machine.stiffness[0]")
-            read[name] = [entry.value(v, f"{field}.{name}[{k}]") for k, v in enumerate(given[name])]
+            read[name] = [entry.value(v, f"{field}.{name}[{k}]") for k, v in enumerate(columns_given[name])]
         first, *others = read
         lengths = {name: len(values) for name, values in read.items()}
         if len(set(lengths.values())) > 1:
@@ -339,7 +341,7 @@ def _read_rows(scene: Scene, choices: Mapping[str, Any]) -> tuple[dict[str, Sequ
         order = np.argsort(read[first])
         at = tuple(read[first][k] for k in order)
         single[first] = at
-        columns += [Column(found[n], found[first], at, tuple(read[n][k] for k in order)) for n in others]
+        columns += [Column(entries[n], entries[first], at, tuple(read[n][k] for k in order)) for n in others]
     return single, tuple(columns)
 
 
@@ -347,7 +349,7 @@ def _read_choices(
     scene: Scene, choices: Mapping[str, Sequence[Number]]
 ) -> tuple[dict[str, tuple[float, ...]], tuple[int, ...]]:
     """Return the catalogues by name, ascending without duplicates, and the numbers of loads."""
-    found: dict[str, tuple[float, ...]] = {}
+    allowed: dict[str, tuple[float, ...]] = {}
     counts: tuple[int, ...] = ()
     for name, values in choices.items():
         if not isinstance(values, (list, tuple)) or not values:
@@ -355,24 +357,24 @@ def _read_choices(
         if name == "loads.count":
             counts = tuple(sorted({count(v, f"choices.{name}") for v in values}))
             continue
-        one = find_number(scene, name, "choices")
-        given = sorted({one.value(v, f"choices.{name}[{k}]") for k, v in enumerate(values)})
-        if len(given) < 2:
+        entry = find_number(scene, name, "choices")
+        sorted_values = sorted({entry.value(v, f"choices.{name}[{k}]") for k, v in enumerate(values)})
+        if len(sorted_values) < 2:
             raise InputError(f"choices.{name}", "has one value; put the value into the scene, or give several values")
-        found[name] = tuple(given)
-    return found, counts
+        allowed[name] = tuple(sorted_values)
+    return allowed, counts
 
 
-def _read_ties(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ...]:
-    found = []
-    for name, given in ties.items():
+def _read_ties(scene: Scene, ties: Mapping[str, Source], used: set) -> tuple[Tie, ...]:
+    read = []
+    for name, source_given in ties.items():
         target = find_number(scene, name, "ties")
-        if target.entries & taken:
+        if target.entries & used:
             raise InputError(f"ties.{name}", "is free as well; a tied number cannot be free")
-        pair = isinstance(given, (list, tuple)) and len(given) == 2
-        source_name, factor = given if pair else (given, 1.0)
+        pair = isinstance(source_given, (list, tuple)) and len(source_given) == 2
+        source_name, factor = source_given if pair else (source_given, 1.0)
         if not isinstance(source_name, str):
-            raise InputError(f"ties.{name}", f"is {quoted(given)}; give another number's name, or (name, factor)")
+            raise InputError(f"ties.{name}", f"is {quoted(source_given)}; give another number's name, or (name, factor)")
         source = find_number(scene, source_name, f"ties.{name}")
         if source.entries & target.entries:
             raise InputError(f"ties.{name}", "is tied to itself; name another number")
@@ -389,9 +391,9 @@ def _read_ties(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Ti
             ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):
             raise InputError(f"ties.{name}", f"has no ratio to {source_name}, which is 0 in the scene; give a factor")
-        taken = taken | target.entries
-        found.append(Tie(target, source, tuple(map(float, ratio))))
-    return tuple(found)
+        used = used | target.entries
+        read.append(Tie(target, source, tuple(map(float, ratio))))
+    return tuple(read)
 
 
 def _with_value(held: HeldQuantity, scene: Scene) -> HeldQuantity:
@@ -399,5 +401,5 @@ def _with_value(held: HeldQuantity, scene: Scene) -> HeldQuantity:
         return HeldQuantity(held.quantity, np.asarray(held.value))
     value = float(held.quantity(scene))
     if not (np.isfinite(value) and value != 0.0):
-        raise InputError(f"hold.{held.quantity.name}", f"is {value} in the initial scene; give the value at which it is held")
+        raise InputError(f"hold.{held.quantity.name}", f"is {value} in the initial scene; give the value that it must keep")
     return HeldQuantity(held.quantity, np.asarray(value))

@@ -80,9 +80,9 @@ def synthesize(
     """Search a design space from many random starts at once for the least value of a quantity, subject to demands.
 
     - Starts are drawn uniformly within the bounds and changed until the held quantities have their values
-    - Adam (optax) descends from all of them at once; its steps keep the held quantities, and an augmented Lagrangian includes
+    - Adam (optax) descends from all starts at once; its steps keep the held quantities, and an augmented Lagrangian includes
       the demands
-    - Sequential quadratic programming with exact first derivatives refines the best designs
+    - Sequential quadratic programming with exact first derivatives refines the final design of each start
     - Values of catalogues are chosen by branch and bound; each allowed number of loads is tried
     - Jam modes are followed from one design to the next; at the end they are searched for again on the whole branch
 
@@ -104,15 +104,17 @@ def synthesize(
     - `verify`: True to compute the exact motion of the best design. If it is stable, the full equations are integrated until
       the motion has settled, from a state in which the loads deviate by up to 1e-3 rad, and the quantities are measured;
       `unverified` states why there is no such run
-    - `throw`: raise if demands contradict each other; otherwise the status and `limits` show it
-    - `progress`: a function that is called with the name of the present step and the finished share of the search (0 to 1).
-      An interrupt (Ctrl-C) ends the search at once with its best design, which is then not polished and not verified
+    - `throw`: True to raise `ComputationError` if no design meets all demands; False to return the design with the least
+      violation, with the status "contradictory"
+    - `progress`: a function that is called with the name of the present step and the finished share of the search (0 to 1)
+
+    An interrupt (Ctrl-C) ends the search at once with its best design, which is then not polished and not verified.
 
     **Returns** `Synthesis`.
 
-    **Raises** `InputError` for values that are not allowed, and `ComputationError` with the status "no_feasible_start" if the
-    objective does not exist for any random design, or "contradictory" if no design meets all demands. The message states which
-    demands are not met, and by how much.
+    **Raises** `InputError` for values that are not allowed, and `ComputationError` with the status "no_feasible_start" if there
+    is no random design for which the objective, the held quantities and those of the demands exist, or "contradictory" if no
+    design meets all demands. The message states which quantities do not exist, or which demands are not met, and by how much.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -133,24 +135,24 @@ def synthesize(
     report = partial(_report, progress, _SEARCH_SHARE if verify else 0.9)
     if begin is not None:
         options = dataclasses.replace(options, begin=_designs_to_continue(space, begin), starts=len(begin.designs))
-    space, problem, found = _search(space, objective, demands, options, report)
-    others = scenes_of(problem, neighbours(problem, found))
-    scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], others)))
-    status, unfinished, searched = _searched(found)
+    space, problem, result = _search(space, objective, demands, options, report)
+    neighbour_scenes = scenes_of(problem, neighbours(problem, result))
+    scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], neighbour_scenes)))
+    status, unfinished, searched = _searched(result)
     motion = _motion_of(space, objective, demands)
     named = _named_quantities(space, scene, objective, demands, motion)
-    sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
-    batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
-    reports = evaluate_quantities((*(q for _, q in named), objective, *sides), batch, problem)
-    limits = limits_of(problem, demands, found, reports[1, len(named) + 1 :].reshape(-1, 2))
+    demand_sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
+    batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, neighbour_scenes)
+    reports = evaluate_quantities((*(q for _, q in named), objective, *demand_sides), batch, problem)
+    limits = limits_of(problem, demands, result, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and status is SynthesisStatus.contradictory:
         raise _unmet(limits)
     report("integrating the best machine" if verify else "computing quantities", 0.9)
     verify = verify and not unfinished
     run, unverified = (None, unfinished) if unfinished else _run(scene, motion, verify)
     report("computing the exact motion", 0.99)
-    other = _other_tiers(scene, [q for _, q in named], verify, run, motion)
-    rows = _table(space, scene, named, reports[:2, : len(named)], other)
+    other_tiers = _other_tiers(scene, [q for _, q in named], verify, run, motion)
+    rows = _table(space, scene, named, reports[:2, : len(named)], other_tiers)
     n = len(_standard_rows(scene, motion, objective.of))
     before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((space.scene, scene)))
     verified = None if run is None else _by_run(space, run, motion, objective.of)
@@ -168,13 +170,14 @@ def synthesize(
         table=rows,
         limits=limits,
         influences=influences_of(problem, reports[1:, len(named)]),
-        machines=machines_of(problem, found, _SAME_DESIGN_DISTANCE),
+        machines=machines_of(problem, result, _SAME_DESIGN_DISTANCE),
         **searched,
     )
 
 
 def _report(progress: Progress | None, searching: float, what: str, share: float) -> None:
-    """Report the share of the whole time; 0.9 of the steps are the search, which takes the share `searching`."""
+    """Report the share of the whole time. Up to 0.9, `share` is that of the search, which takes the part `searching` of the
+    time."""
     if progress is not None:
         shown = share * searching / 0.9 if share <= 0.9 else searching + (share - 0.9) / 0.1 * (1.0 - searching)
         call_user(progress, "progress", what, shown)
@@ -186,14 +189,15 @@ def _unmet(limits: tuple[Limit, ...]) -> ComputationError:
     return failure(SynthesisStatus.contradictory, hint)
 
 
-def _searched(found: SearchResult) -> tuple[SynthesisStatus, str, dict[str, Any]]:
-    """Return the status of a search, why its machine is not verified, and the fields of `Synthesis` from its designs."""
-    best, z = found.best, found.point.z
-    kept = found.violation < 10.0 * FEASIBILITY_TOLERANCE
-    done = kept & (found.remaining_decrease < _CONVERGED_DECREASE)
-    if found.interrupted:
+def _searched(result: SearchResult) -> tuple[SynthesisStatus, str, dict[str, Any]]:
+    """Return the status of a search, the reason why its best machine is not verified ("" for none), and the fields of
+    `Synthesis` that describe the searches."""
+    best, z = result.best, result.point.z
+    is_feasible = result.violation < 10.0 * FEASIBILITY_TOLERANCE
+    done = is_feasible & (result.remaining_decrease < _CONVERGED_DECREASE)
+    if result.interrupted:
         status, unfinished = SynthesisStatus.interrupted, "the search was interrupted"
-    elif not kept[best]:
+    elif not is_feasible[best]:
         status, unfinished = SynthesisStatus.contradictory, "the machine does not meet all demands"
     else:
         status, unfinished = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged, ""
@@ -202,14 +206,14 @@ def _searched(found: SearchResult) -> tuple[SynthesisStatus, str, dict[str, Any]
         unfinished,
         {
             "starts": len(z),
-            "drawn": found.drawn,
+            "drawn": result.drawn,
             "converged": int(np.sum(done)),
-            "same": int(np.sum(kept & (np.max(np.abs(z - z[best]), axis=1) < _SAME_DESIGN_DISTANCE))),
+            "same": int(np.sum(is_feasible & (np.max(np.abs(z - z[best]), axis=1) < _SAME_DESIGN_DISTANCE))),
             "designs": z,
-            "values": np.where(kept, found.point.values[:, 0], np.inf),
+            "values": np.where(is_feasible, result.point.values[:, 0], np.inf),
             "done": done,
-            "history": found.history,
-            "kkt": float(found.optimality.kkt[best]),
+            "history": result.history,
+            "kkt": float(result.optimality.kkt[best]),
         },
     )
 
@@ -229,10 +233,10 @@ def _validate_demands(space: DesignSpace, objective: Quantity, subject_to: Deman
     demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
     for demand in demands:
         if not isinstance(demand, Demand):
-            held = (
+            hint = (
                 "; == is no demand, hold(quantity, value) in the DesignSpace keeps a value" if isinstance(demand, bool) else ""
             )
-            raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'{held}")
+            raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'{hint}")
     validate_scene(space.scene)
     between(space.scene, objective.of)
     if space.scene.is_plain and not space.scene.drive.constant:
@@ -265,13 +269,13 @@ def _search(
         problem = problem_of(here, objective, demands, options.starts)
         if problem.keys:
             require_drag(jammed_loads(space.scene))
-        found = choose(problem, options, report)
-        if found is None:
+        result = choose(problem, options, report)
+        if result is None:
             continue
-        existing, drawn = existing + found.existing, drawn + found.drawn
-        if best is None or _rank(found) < _rank(best[2]):
-            best = here, problem, found
-        if found.interrupted:
+        existing, drawn = existing + result.existing, drawn + result.drawn
+        if best is None or _rank(result) < _rank(best[2]):
+            best = here, problem, result
+        if result.interrupted:
             best = (*best[:2], best[2]._replace(interrupted=True))
             break
     if best is None:
@@ -285,18 +289,18 @@ def _search(
 
 
 def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options) -> str:
-    """Return text with the quantities of a search that do not exist for any random design."""
+    """Return the names of the quantities of a search that exist for no random design, as text."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
-    every = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
+    quantities = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
     z = np.random.default_rng(options.seed).uniform(size=(options.starts, space.size))
-    values = evaluate_quantities(every, scenes_of(problem_of(space, objective, (), options.starts), space.numbers(z)))
-    absent = [q.words for q, there in zip(every, np.any(np.isfinite(values), axis=0).tolist(), strict=True) if not there]
-    return " or ".join(absent) or "all of: " + ", ".join(q.words for q in every)
+    values = evaluate_quantities(quantities, scenes_of(problem_of(space, objective, (), options.starts), space.numbers(z)))
+    absent = [q.words for q, exists in zip(quantities, np.any(np.isfinite(values), axis=0).tolist(), strict=True) if not exists]
+    return " or ".join(absent) or "all of: " + ", ".join(q.words for q in quantities)
 
 
-def _rank(found: SearchResult) -> tuple[bool, float]:
-    kept = bool(found.violation[found.best] < 10.0 * FEASIBILITY_TOLERANCE)
-    return not kept, float(found.point.values[found.best, 0] if kept else found.violation[found.best])
+def _rank(result: SearchResult) -> tuple[bool, float]:
+    is_feasible = bool(result.violation[result.best] < 10.0 * FEASIBILITY_TOLERANCE)
+    return not is_feasible, float(result.point.values[result.best, 0] if is_feasible else result.violation[result.best])
 
 
 def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
@@ -316,15 +320,15 @@ def _motion_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
     """Return the motion of a search: the jam mode of its objective, otherwise that of the first demand with a jam mode."""
     quantities = objective, *(d.quantity for d in demands)
     modes = [q.mode for q in quantities if q.mode is not None]
-    every = *quantities, *(h.quantity for h in space.held)
-    is_working = any(isinstance(part, RegimeQuantity) for q in every for part in walk(q))
+    all_quantities = *quantities, *(h.quantity for h in space.held)
+    is_working = any(isinstance(part, RegimeQuantity) for q in all_quantities for part in walk(q))
     return modes[0] if modes else "working" if is_working else None
 
 
 def _run(scene: Scene, motion: _Motion, verify: bool) -> tuple[Run | None, str]:
     """Integrate the full equations until the motion has settled in a jam mode, or in the working regime.
 
-    **Returns** the run and an empty text, or None and the reason.
+    **Returns** the run and an empty text, or None and the reason why there is no run.
     """
     if motion is None:
         return None, "neither the objective nor the demands have a motion to integrate"
@@ -363,7 +367,7 @@ def _jam_run(scene: Scene, mode: int) -> tuple[Run | None, str]:
 
 
 def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
-    """Return the exact motion of a jam mode; None if there is none, or if the method does not include the scene."""
+    """Return the exact motion of a jam mode; None if it does not exist, or if `jam_orbit` does not support the scene."""
     try:
         orbit = jam_orbit(scene, mode=mode, throw=False)
     except (InputError, ComputationError):
@@ -383,7 +387,7 @@ def _deviating_start(orbit: Orbit) -> State:
 
 
 def _standard_rows(scene: Scene, motion: _Motion, of: Pair) -> list[tuple[str, Quantity]]:
-    """Return the standard rows of the table of a machine in a jam mode, or in the working regime."""
+    """Return names and quantities of the standard rows of the table, for a machine in a jam mode or in the working regime."""
     if motion is None:
         return []
     if motion == "working":
@@ -402,9 +406,9 @@ def _named_quantities(
     """Return the quantities of the table: the standard ones, then the objective, held quantities and demands."""
     standard = _standard_rows(scene, motion, objective.of)
     sought = objective.parts[0] if objective.name.startswith("negative ") and objective.parts else objective
-    own = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
-    known = {q for _, q in standard}
-    return standard + [(q.words, q) for q in dict.fromkeys(own) if q not in known]
+    named = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
+    standard_quantities = {q for _, q in standard}
+    return standard + [(q.words, q) for q in dict.fromkeys(named) if q not in standard_quantities]
 
 
 def _table(
@@ -416,7 +420,7 @@ def _table(
 ) -> tuple[Row, ...]:
     """Return the rows of free parameters and quantities before and after the search."""
     start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.free]) for s in (space.scene, scene))
-    absent = [each.spec.zero_is_absent for each in space.free for _ in range(each.size)]
+    absent = [number.spec.zero_is_absent for number in space.free for _ in range(number.size)]
     numbers = zip(space.words(), absent & (start == 0.0) & (end != 0.0), start, end, strict=True)
     table = [
         Row(f"{word} (new)" if new else word, unit, float(a), float(b), math.nan, math.nan)
@@ -432,17 +436,17 @@ def _table(
 def _other_tiers(
     scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, motion: _Motion
 ) -> tuple[list[float], list[float]]:
-    """Return the quantities by the exact motion and by the run of the verification, NaN for a quantity that this tier cannot
-    compute."""
+    """Return the values of the quantities by the exact motion, and by the run of the verification; NaN for a quantity that the
+    tier cannot compute."""
 
     def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
-        other = quantity.at_tier(tier)
-        if other == quantity and tier not in {getattr(q, "tier", None) for q in walk(quantity)}:
+        at_tier = quantity.at_tier(tier)
+        if at_tier == quantity and tier not in {getattr(q, "tier", None) for q in walk(quantity)}:
             return math.nan
-        if tier == "time" and any(getattr(q, "tier", tier) != tier or hasattr(q, "case") for q in walk(other)):
+        if tier == "time" and any(getattr(q, "tier", tier) != tier or hasattr(q, "case") for q in walk(at_tier)):
             return math.nan
         try:
-            return float(other.read(evaluation))
+            return float(at_tier.read(evaluation))
         except (InputError, ComputationError):  # the method does not support this scene
             return math.nan
 

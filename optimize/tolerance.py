@@ -25,7 +25,7 @@ _SHORT_NAMES = {
     "drag": re.compile(r"(exciters\[\d+\]\.)?loads\.drag"),
     "unbalance": re.compile(r"exciters\[\d+\]\.unbalance"),
 }
-"""Names of parameters of a scene that a short name stands for."""
+"""Patterns of the names of those parameters that each short name stands for."""
 
 _SHARE_PATTERN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*%")
 _RANGE = re.compile(r"(.+?)\.\.(.+)")
@@ -39,9 +39,10 @@ class ToleranceRange(NamedTuple):
 
     Returned by `tolerance_ranges`.
 
-    **Attributes**: `words`: name of the quantity; its SI `unit`; its value in the `design`; `low` and `high`: 95 % of the
-    machines that have the quantity lie between them; `worst` value (the largest, for a demand "at least" the smallest); `share`
-    of the machines that have the quantity and, for a demand, meet it.
+    **Attributes**: `words`: name of the quantity or demand; `unit` of the quantity, SI; `design`: its value for the design;
+    `low` and `high`: 95 % of the machines for which the quantity exists lie between these values; `worst`: the largest value,
+    for a demand "at least" the smallest; `share`: fraction of the machines for which the quantity exists and, if it is a
+    demand, the demand is met.
     """
 
     words: str
@@ -54,9 +55,10 @@ class ToleranceRange(NamedTuple):
 
 
 class _NumberRange(NamedTuple):
-    """Range of a number: a value, or a mass in addition to that of the design if `is_added`."""
+    """Range of a parameter from `low` to `high`, SI. If `is_added`, the range is that of a mass that is added to the
+    parameter."""
 
-    found: NamedNumber
+    number: NamedNumber
     low: float
     high: float
     is_added: bool
@@ -77,14 +79,15 @@ def tolerance_ranges(
 
     - `scene` of the design
     - `quantities`, or demands of quantities; typical: 1 to 5
-    - `tolerances`: texts of the form NAME=SHARE, such as "stiffness=5%" (95 of 100 machines are within it, each number has its
-      own deviation) or NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg" (any value of the range is equally likely).
-      Short names are stiffness and damping (of all springs and dampers, each with its own deviation), mass, drag and unbalance.
-      "load=0..20kg" is material on platform or body 1, at its centre of mass, "load[2]=..." on platform or body 2
+    - `tolerances`: texts of one of two forms. NAME=SHARE, such as "stiffness=5%": 95 of 100 machines are within the tolerance,
+      and the deviations of all numbers are independent. NAME=LOW..HIGH, such as "machine.mass[0]=100kg..130kg": all values of
+      the range are equally likely. Short names are stiffness and damping (of all springs and dampers), mass, drag and
+      unbalance. "load=0..20kg" is material on platform or body 1, at its centre of mass, "load[2]=..." on platform or body 2
     - `samples`: number of machines; typical: 64 to 1000 (default 128)
     - `seed` of the random deviations
 
-    **Returns** a list of `ToleranceRange`. **Raises** `InputError` for a text of another form and for an unknown name.
+    **Returns** a list of `ToleranceRange`, one for each of the `quantities`. **Raises** `InputError` for a text of another form
+    and for an unknown name.
 
     >>> import jaxvib as jv
     >>> from optimize import jam_frequency
@@ -95,27 +98,27 @@ def tolerance_ranges(
     (1.0, True)
     """
     machines = list(_machines(scene, tolerances, samples, seed))
-    found = []
-    for each in quantities:
-        quantity = (each.quantity if isinstance(each, Demand) else each).simplified
+    ranges = []
+    for item in quantities:
+        quantity = (item.quantity if isinstance(item, Demand) else item).simplified
         values = np.array([_value(quantity, machine) for machine in machines])
-        there = values[np.isfinite(values)]
-        kept = np.isfinite(values)
-        at_least = isinstance(each, Demand) and each.sense == "at least"
-        if isinstance(each, Demand):
-            limits = np.array([float(each.limit(machine)) for machine in machines])
-            kept = values >= limits if at_least else values <= limits
-        low, high = np.quantile(there, [0.025, 0.975]) if there.size else (np.nan, np.nan)
-        worst = np.nan if not there.size else np.min(there) if at_least else np.max(there)
+        existing = values[np.isfinite(values)]
+        is_met = np.isfinite(values)
+        at_least = isinstance(item, Demand) and item.sense == "at least"
+        if isinstance(item, Demand):
+            limits = np.array([float(item.limit(machine)) for machine in machines])
+            is_met = values >= limits if at_least else values <= limits
+        low, high = np.quantile(existing, [0.025, 0.975]) if existing.size else (np.nan, np.nan)
+        worst = np.nan if not existing.size else np.min(existing) if at_least else np.max(existing)
         design = float(quantity(scene))
-        found.append(
-            ToleranceRange(each.words, quantity.unit, design, float(low), float(high), float(worst), float(np.mean(kept)))
+        ranges.append(
+            ToleranceRange(item.words, quantity.unit, design, float(low), float(high), float(worst), float(np.mean(is_met)))
         )
-    return found
+    return ranges
 
 
 def _value(quantity: Quantity, scene: Scene) -> float:
-    """Return the value of a quantity, NaN if it does not exist."""
+    """Return the value of a quantity for a scene, NaN if it does not exist."""
     try:
         return float(quantity(scene))
     except ComputationError:  # there is no stable synchronous regime
@@ -125,7 +128,7 @@ def _value(quantity: Quantity, scene: Scene) -> float:
 class Tolerances(NamedTuple):
     """Tolerances of a scene.
 
-    **Attributes**: `errors`: names of parameters and their relative errors; `ranges` of parameters.
+    **Attributes**: `errors`: names of parameters with their relative tolerances; `ranges` of parameters.
     """
 
     errors: tuple[tuple[str, float], ...]
@@ -133,10 +136,11 @@ class Tolerances(NamedTuple):
 
 
 def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
-    """Return tolerances from texts. **Raises** `InputError` as `tolerance_ranges`."""
+    """Return tolerances from texts, see `tolerance_ranges`. **Raises** `InputError` for a text of another form or an unknown
+    name."""
     errors: list[tuple[str, float]] = []
     ranges: list[_NumberRange] = []
-    there = numbers_of(scene)
+    present = numbers_of(scene)
     for text in tolerances:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
@@ -146,8 +150,8 @@ def read_tolerances(scene: Scene, tolerances: Sequence[str]) -> Tolerances:
             if not 0.0 < size < 1.0:
                 raise InputError("tolerances", f"is {quoted(text)}; the share must be greater than 0 % and less than 100 %")
             pattern = _SHORT_NAMES.get(name)
-            short = [each for each in there if pattern is not None and pattern.fullmatch(each)]
-            errors += [(each, size) for each in short or [find_number(scene, name, "tolerances").name]]
+            matching = [parameter for parameter in present if pattern is not None and pattern.fullmatch(parameter)]
+            errors += [(parameter, size) for parameter in matching or [find_number(scene, name, "tolerances").name]]
         elif ends := _RANGE.fullmatch(value):
             ranges.append(_range(scene, name, ends[1], ends[2]))
         else:
@@ -163,29 +167,29 @@ def _machines(scene: Scene, tolerances: Sequence[str], samples: int, seed: int) 
     shares = [random.permutation((np.arange(samples) + 0.5) / samples) for _ in ranges]
     for k in range(samples):
         machine = scene if batch is None else jax.tree.map(lambda leaf, k=k: leaf[k], batch)
-        for each, share in zip(ranges, shares, strict=True):
-            value = each.low + (each.high - each.low) * share[k]
-            now = each.found.read(machine)
-            machine = put_numbers(machine, (each.found,), now + value if each.is_added else 0.0 * now + value)
+        for entry, share in zip(ranges, shares, strict=True):
+            value = entry.low + (entry.high - entry.low) * share[k]
+            now = entry.number.read(machine)
+            machine = put_numbers(machine, (entry.number,), now + value if entry.is_added else 0.0 * now + value)
         yield machine
 
 
 def _range(scene: Scene, name: str, low: str, high: str) -> _NumberRange:
-    """Return a range; its first end may lack the unit of the second."""
+    """Return the range of a parameter from texts; if `low` has no unit, it has that of `high`."""
     material = _MATERIAL.fullmatch(name)
-    found = find_number(scene, _mass_name(scene, int(material[1] or 1)) if material else name, "tolerances")
+    entry = find_number(scene, _mass_name(scene, int(material[1] or 1)) if material else name, "tolerances")
     unit = "".join(re.findall(r"[^\d.eE+\-\s].*$", high.strip()))
     ends = [low if re.search(r"[^\d.eE+\-\s]", low) else f"{low.strip()} {unit}".strip(), high]
-    first, last = (float(number(end.strip(), found.unit, f"tolerances.{name}")) for end in ends)
+    first, last = (float(number(end.strip(), entry.unit, f"tolerances.{name}")) for end in ends)
     if not first < last:
         raise InputError(f"tolerances.{name}", f"is {low}..{high}; the second must be larger than the first")
-    return _NumberRange(found, first, last, material is not None)
+    return _NumberRange(entry, first, last, material is not None)
 
 
 def _mass_name(scene: Scene, number: int) -> str:
     """Return the name of the mass of a platform or body; the only body of a machine has no number."""
-    there = numbers_of(scene)
-    if f"machine.bodies[{number - 1}].mass" in there:
+    present = numbers_of(scene)
+    if f"machine.bodies[{number - 1}].mass" in present:
         return f"machine.bodies[{number - 1}].mass"
-    is_single = number == 1 and "machine.mass" in there and there["machine.mass"].size == 1
+    is_single = number == 1 and "machine.mass" in present and present["machine.mass"].size == 1
     return "machine.mass" if is_single else f"machine.mass[{number - 1}]"

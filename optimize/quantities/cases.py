@@ -49,37 +49,38 @@ class Sampled:
     several = True
 
     def factors(self, scene: Scene) -> list[tuple[NamedNumber, np.ndarray]]:
-        """Return the factors (samples, entries) of each parameter, from a normal distribution cut at three standard deviations.
+        """Return the factors (samples, entries) of each parameter, with normally distributed deviations from 1.
 
-        They are a Latin hypercube: the samples of each parameter cover its distribution evenly, in an independent order.
+        Deviations beyond three standard deviations are cut. The factors are a Latin hypercube: the samples of each entry cover
+        its distribution evenly, in an order that is independent of the other entries.
         """
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
         for name, error in self.errors:
-            found = find_number(scene, name, "tolerance")
+            entry = find_number(scene, name, "tolerance")
             shares = (np.arange(self.samples) + 0.5) / self.samples
             deviations = np.clip([normal.inv_cdf(float(share)) for share in shares], -3.0, 3.0)
-            deviation = np.stack([random.permutation(deviations) for _ in range(found.size)], axis=1)
+            deviation = np.stack([random.permutation(deviations) for _ in range(entry.size)], axis=1)
             # The tolerance is two standard deviations: 95 of 100 machines are within it.
-            out.append((found, np.maximum(1.0 + 0.5 * error * deviation, 0.05)))
+            out.append((entry, np.maximum(1.0 + 0.5 * error * deviation, 0.05)))
         return out
 
     def scenes(self, scene: Scene) -> Scene:
         """Return the scenes; every array has a leading axis."""
-        factors = [(found, jnp.asarray(f)) for found, f in self.factors(scene)]
+        factors = [(entry, jnp.asarray(f)) for entry, f in self.factors(scene)]
 
-        def one(*each: Array) -> Scene:
+        def scene_with(*factors_of_scene: Array) -> Scene:
             changed = scene
-            for (found, _), factor in zip(factors, each, strict=True):
-                changed = put_numbers(changed, (found,), found.read(changed) * factor)
+            for (entry, _), factor in zip(factors, factors_of_scene, strict=True):
+                changed = put_numbers(changed, (entry,), entry.read(changed) * factor)
             return changed
 
-        return jax.vmap(one)(*(f for _, f in factors))
+        return jax.vmap(scene_with)(*(f for _, f in factors))
 
 
 @dataclass(frozen=True)
-class _OfPart(Quantity):
-    """Quantity that is computed from another one."""
+class _DerivedQuantity(Quantity):
+    """Quantity that is computed from another quantity."""
 
     @property
     def words(self) -> str:
@@ -87,8 +88,8 @@ class _OfPart(Quantity):
 
 
 @dataclass(frozen=True)
-class Under(_OfPart):
-    """Quantity in a case."""
+class Under(_DerivedQuantity):
+    """Quantity of the scene in another load case."""
 
     case: Changed = Changed("", ())
 
@@ -102,12 +103,12 @@ class Under(_OfPart):
         scene, path = evaluation.under(self.case)
         inner = Evaluation(scene, evaluation.near_speeds, path)
         value = compute(inner)
-        evaluation.found.update(inner.found)
+        evaluation.speeds.update(inner.speeds)
         return value
 
 
 @dataclass(frozen=True)
-class Robust(_OfPart):
+class Robust(_DerivedQuantity):
     """Statistic of a quantity over tolerances."""
 
     case: Sampled = Sampled((), 1, 0)
@@ -120,7 +121,7 @@ class Robust(_OfPart):
             return jnp.mean(values)
         if self.statistic == "worst":
             return greatest(values)
-        # The mean of the values above the quantile would be smoother, but the user requests the quantile.
+        # The mean of the values above the quantile would be smoother, but the user requests the quantile itself.
         return jnp.quantile(values, self.level)
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
@@ -136,17 +137,17 @@ class Robust(_OfPart):
         if not isinstance(near_speeds, TargetRecorder) and near_speeds is not None:
             keys = [key for key in near_speeds if key[0][: len(path)] == path]
             near = tuple(near_speeds[key] for key in keys)
-        found: list[Key] = []
+        keys_found: list[Key] = []
 
-        def one(scene: Scene, near: tuple[Array, ...] | None) -> tuple[Array, tuple[Array, ...]]:
+        def value_of(scene: Scene, near: tuple[Array, ...] | None) -> tuple[Array, tuple[Array, ...]]:
             recorder = near_speeds if isinstance(near_speeds, TargetRecorder) else None
             inner = Evaluation(scene, recorder if near is None else dict(zip(keys, near, strict=True)), path)
             value = compute(inner)
-            found[:] = inner.found
-            return value, tuple(inner.found.values())
+            keys_found[:] = inner.speeds
+            return value, tuple(inner.speeds.values())
 
-        values, speeds = jax.vmap(one)(scenes, near)
-        evaluation.found.update(zip(found, speeds, strict=True))
+        values, speeds = jax.vmap(value_of)(scenes, near)
+        evaluation.speeds.update(zip(keys_found, speeds, strict=True))
         return values
 
     @property
@@ -156,7 +157,7 @@ class Robust(_OfPart):
 
 @validated
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
-    """Return a quantity of the same machine in another load case: some parameters are changed, such as the rotor speed.
+    """Return a quantity of the same machine in another load case, in which some parameters, such as the rotor speed, differ.
 
     **Arguments**
 
@@ -180,7 +181,9 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     return Under(f"{quantity.words} ({name})", quantity.unit, of=quantity.of, case=case, parts=(quantity,))
 
 
-def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, seed: int, how: str, level: float) -> Quantity:
+def _robust(
+    quantity: Quantity, tolerances: Mapping[str, float], samples: int, seed: int, statistic: str, level: float
+) -> Quantity:
     if not isinstance(tolerances, Mapping) or not tolerances:
         raise InputError(
             "tolerances", f"is {quoted(tolerances)}; it must be a dictionary such as {{'machine.stiffness': 0.05}}"
@@ -191,9 +194,15 @@ def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, s
     case = Sampled(
         tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), count(seed, "seed", low=0)
     )
-    words = how if how != "quantile" else f"{level:.0%} quantile of"
+    words = statistic if statistic != "quantile" else f"{level:.0%} quantile of"
     return Robust(
-        f"{words} {quantity.words}", quantity.unit, of=quantity.of, case=case, parts=(quantity,), statistic=how, level=level
+        f"{words} {quantity.words}",
+        quantity.unit,
+        of=quantity.of,
+        case=case,
+        parts=(quantity,),
+        statistic=statistic,
+        level=level,
     )
 
 
@@ -204,9 +213,9 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
     **Arguments**
 
     - `quantity` of each machine
-    - `tolerances`: a mapping from the name of a parameter or array of the scene to the relative tolerance that 95 of 100
-      machines keep (0.05: 5 %). Each entry of an array has its own, normally distributed error of at most one and a half
-      tolerances; typical: 0.01 to 0.1 for masses and springs, 0.3 to 0.5 for damping
+    - `tolerances`: a mapping from the name of a parameter or array of the scene to a relative tolerance (0.05: 5 %), which is
+      two standard deviations: 95 of 100 machines are within it. Each entry of an array has an independent, normally distributed
+      error, cut at one and a half tolerances; typical: 0.01 to 0.1 for masses and springs, 0.3 to 0.5 for damping
     - `samples`: number of random machines; typical: 16 to 256 (default 64). The time is proportional to it
     - `seed` of the random machines (a Latin hypercube)
 

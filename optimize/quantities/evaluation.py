@@ -1,4 +1,5 @@
-"""Results of a scene from which quantities are computed. Each is computed once; jams are followed from a similar machine."""
+"""Results of a scene from which quantities are computed. Each result is computed once; jams can be followed from those of a
+similar machine."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ from jaxvib.steady.regimes.working import working_regime
 from jaxvib.units.known import is_known
 
 _NO_FOLD = 10.0
-"""Upper fold of a mode that no fold ends at higher rotor speeds, in units of the rotor speed."""
+"""Rotor speed, in units of that of the scene, in place of a fold at the end of a mode toward higher rotor speeds if there is no
+fold at this end."""
 
 _RUN_UP_SAMPLES = 4000
 """Number of stored states of a run-up."""
@@ -48,14 +50,15 @@ class Case(Protocol):
 
 
 Target = tuple[str, int]
-"""Followed jam, ("jam", mode), or followed fold at an end of the mode, ("below", mode) or ("above", mode)."""
+"""Jam or fold that is followed: ("jam", mode), or the fold at an end of the mode, ("below", mode) or ("above", mode) for the
+end at lower or higher load speed."""
 
 Key = tuple[tuple[Case, ...], Target]
-"""Scene, as the cases that lead from the scene of the design to it, and its followed jam or fold."""
+"""Followed jam or fold of a scene. The scene is identified by the cases that lead to it from the scene of the design."""
 
 
 class TargetRecorder:
-    """Substitute for the known load speeds of an `Evaluation`; it records which jams and folds quantities request."""
+    """Substitute for the argument `near_speeds` of an `Evaluation` that records which jams and folds quantities request."""
 
     def __init__(self) -> None:
         self.keys: list[Key] = []
@@ -67,13 +70,14 @@ class TargetRecorder:
 
 
 class Evaluation:
-    """Results of one scene, each computed when it is first requested.
+    """Results of one scene; each result is computed when it is first requested.
 
     **Attributes**
 
     - `scene`; `is_known`: True if its parameters have values, False if they are traced
     - `near_speeds`: load speeds (rad/s) near which jams and folds are searched for, by `Key`; None to compute the whole branch
-    - `found`: the resulting load speeds by `Key`
+    - `path`: the cases that lead to this scene from the scene of the design
+    - `speeds`: the load speeds of the jams and folds that were computed, rad/s, by `Key`
     """
 
     def __init__(
@@ -87,7 +91,7 @@ class Evaluation:
         self.is_known = is_known(scene)
         self.near_speeds = near_speeds
         self.path = path
-        self.found: dict[Key, Array] = {}
+        self.speeds: dict[Key, Array] = {}
         if modes is not None:
             self.modes = modes
         self._jams: dict[Key, Jam] = {}
@@ -111,9 +115,9 @@ class Evaluation:
 
     def jam(self, mode: int) -> Jam:
         """Return the jam of the mode with this number, with NaN values if it does not exist."""
-        most = 2 * self.scene.machine.structure().mass.shape[0] + 1
-        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
-            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
+        mode_count = 2 * self.scene.machine.structure().mass.shape[0] + 1
+        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= mode_count:
+            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {mode_count}")
         key: Key = (self.path, ("jam", mode))
         if key not in self._jams:
             jam = (
@@ -122,27 +126,28 @@ class Evaluation:
                 else follow_jam(self.jammed, mode, self.near_speeds[key])
             )
             self._jams[key] = jam
-            self.found[key] = jam.omega
+            self.speeds[key] = jam.omega
         return self._jams[key]
 
     def folds(self, mode: int) -> tuple[Array, Array]:
-        """Return the rotor speeds, rad/s, of the folds at the lower and the upper end of a jam mode on n(Omega).
+        """Return the rotor speeds, rad/s, of the folds at the ends of a jam mode with lower and with higher load speed.
 
-        If a fold is absent, the value is 0 on the side of slow rotors, and ten times the rotor speed of the scene on the other.
+        If there is no fold at an end, the value is 0 at the end toward lower rotor speeds, and ten times the rotor speed of the
+        scene at the end toward higher rotor speeds.
         """
-        speeds = []
+        rotor_speeds = []
         for side in ("below", "above"):
             key: Key = (self.path, (side, mode))
             near = guesses(self.modes, (side, mode)) if self.near_speeds is None else self.near_speeds[key]
             exists = jnp.isfinite(near)
             omega, speed = follow_fold(self.jammed, jnp.where(exists, near, 1.0))
-            self.found[key] = jnp.where(exists, omega, near)
+            self.speeds[key] = jnp.where(exists, omega, near)
             slower = (side == "below") == (mode % 2 == 1)
-            speeds.append(jnp.where(exists, speed, 0.0 if slower else _NO_FOLD * self.scene.drive.speed))
-        return speeds[0], speeds[1]
+            rotor_speeds.append(jnp.where(exists, speed, 0.0 if slower else _NO_FOLD * self.scene.drive.speed))
+        return rotor_speeds[0], rotor_speeds[1]
 
     def orbit(self, mode: int) -> Orbit:
-        """Return the exact periodic motion near a jam mode, with NaN values if it does not exist."""
+        """Return the exact periodic motion of a jam mode, with NaN values if it does not exist."""
         if mode not in self._orbits:
             jam = self.jam(mode)
             if self.near_speeds is None and self.is_known:
@@ -165,7 +170,7 @@ class Evaluation:
     def regime(self) -> SynchronousRegime:
         """Working regime of the exciters.
 
-        **Raises** `ComputationError` if there is none and the scene is known; under a JAX transformation its values are NaN.
+        **Raises** `ComputationError` if there is no working regime. For a traced scene nothing is raised; the values are NaN.
         """
         return working_regime(self.scene)
 
@@ -177,7 +182,7 @@ class Evaluation:
         return without_numbers(orbit.stable, orbit)
 
     def working(self, tier: Literal["leading", "exact", "time"]) -> SynchronousRegime | SynchronousOrbit | Run:
-        """Return the motion in which the exciters work: averaged, exact, or integrated from the exact motion."""
+        """Return the working regime of the exciters: averaged, exact, or integrated from the exact motion."""
         if tier == "leading":
             return self.regime
         if tier == "exact":
@@ -195,7 +200,8 @@ class Evaluation:
         return 60.0 * 2.0 * np.pi / frequencies.min()
 
     def keep_run(self, motion: int | Literal["working"], run: Run) -> None:
-        """Store a run that has settled in a jam mode or in the working regime, in place of a new one."""
+        """Store a run that has settled in a jam mode or in the working regime; quantities then use it and integrate no
+        other."""
         self._runs["working" if motion == "working" else ("jam", motion)] = run
 
     def start_up(self, until: float, spin_up: float) -> Run:
@@ -204,7 +210,7 @@ class Evaluation:
         return self._run(("start_up", until, spin_up), integrate)
 
     def _run(self, key: Hashable, integrate: Callable[..., Run]) -> Run:
-        """Return a run. Its derivatives exist in forward mode only."""
+        """Return the run with this key, which is integrated once. Its derivatives exist in forward mode only."""
         import diffrax
 
         if key not in self._runs:
@@ -213,17 +219,20 @@ class Evaluation:
         return self._runs[key]
 
     def under(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:
-        """Return the scene or scenes of a case, and their path."""
+        """Return the scene of a case (several: arrays with a leading axis), and its `path`."""
         return case.scenes(self.scene), (*self.path, case)
 
 
 def guesses(modes: JamModes, target: Target) -> Array:
-    """Return the load speed, rad/s, of a target from the jam modes of a scene; NaN if it does not exist."""
-    what, mode = target
+    """Return the load speed, rad/s, of a target from the jam modes of a scene.
+
+    The value is NaN for a jam that does not exist, and -inf ("below") or inf ("above") for a fold that does not exist.
+    """
+    kind, mode = target
     omega = modes.select(mode, throw=False).omega
-    if what == "jam":
+    if kind == "jam":
         return omega
     folds = jnp.where(modes.folds.exists, modes.folds.omega, jnp.nan)
-    if what == "below":
+    if kind == "below":
         return jnp.nanmax(jnp.where(folds < omega, folds, jnp.nan), initial=-jnp.inf)
     return jnp.nanmin(jnp.where(folds > omega, folds, jnp.nan), initial=jnp.inf)

@@ -1,7 +1,7 @@
 """Quantities of machines whose exciters synchronise: motion of a deck, force, power, margins.
 
-The quantities are those of the working regime, see `jaxvib.working_regime`. A scene that has no stable synchronous regime
-raises `ComputationError` with the status "none_stable"; in a search, its designs do not exist.
+The quantities are those of the working regime, see `jaxvib.working_regime`. For a scene without a stable synchronous regime a
+quantity raises `ComputationError` with the status "none_stable" when it is computed; in a search its value is NaN.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ _LARGEST_MARGIN = 1e3
 _PEAK_STEPS, _PEAK_REACH = 8, 0.1
 """Number of steps of the search for the speed of the largest torque at a resonance, and largest distance from the resonance."""
 
-_ON_THE_WAY = 0.95
-"""Largest natural frequency, relative to the working speed, that counts as a resonance on the way up."""
+_MAX_PASSED_RESONANCE = 0.95
+"""Largest natural frequency, relative to the least no-load speed of the motors, that counts as a resonance that a run-up
+passes."""
 
 Point = tuple[float, float]
 
@@ -60,7 +61,7 @@ def _point(at: Sequence[Number], field: str) -> Point:
     return number_in(at[0], "m", f"{field}[0]"), number_in(at[1], "m", f"{field}[1]")
 
 
-def _of_point(
+def _point_quantity(
     name: str,
     unit: str,
     function: Callable[..., Array],
@@ -96,7 +97,7 @@ def throw_stroke(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier
     >>> (throw_stroke(at=(0.5, 0.1)) > "6 mm").words
     'stroke at (0.5, 0.1) m at least 6 mm'
     """
-    return _of_point("throw_stroke", "m", _throw_stroke, "stroke", at, body, tier)
+    return _point_quantity("throw_stroke", "m", _throw_stroke, "stroke", at, body, tier)
 
 
 def _throw_stroke(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
@@ -115,7 +116,7 @@ def throw_angle(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier 
     >>> (throw_angle() > "40 deg").words
     'throw angle at (0, 0) m at least 40 deg'
     """
-    return _of_point("throw_angle", "rad", _throw_angle, "throw angle", at, body, tier)
+    return _point_quantity("throw_angle", "rad", _throw_angle, "throw angle", at, body, tier)
 
 
 def _throw_angle(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
@@ -136,7 +137,7 @@ def throw_number(*, at: Sequence[Number] = (0.0, 0.0), slope: Number = 0.0, body
     ''
     """
     along = number_in(slope, "rad", "slope")
-    return _of_point("throw_number", "", _throw_number, "throw number", at, body, tier, along)
+    return _point_quantity("throw_number", "", _throw_number, "throw number", at, body, tier, along)
 
 
 def _throw_number(evaluation: Evaluation, tier: Tier, at: Point, body: int, slope: float) -> Array:
@@ -156,7 +157,7 @@ def roundness(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: Tier = 
     >>> (roundness() > 0.9).words
     'roundness at (0, 0) m at least 0.9'
     """
-    return _of_point("roundness", "", _roundness, "roundness", at, body, tier)
+    return _point_quantity("roundness", "", _roundness, "roundness", at, body, tier)
 
 
 def _roundness(evaluation: Evaluation, tier: Tier, at: Point, body: int) -> Array:
@@ -170,14 +171,14 @@ def force_per_throw(*, at: Sequence[Number] = (0.0, 0.0), body: int = 0, tier: T
 
     **Arguments**: `at`, `body`, `tier` as in `throw_stroke`; typical: the middle of the deck.
 
-    **Returns** `Quantity`; typical: the stiffness of all supports, 1e5 to 2e6 N/m. **Raises** `InputError` for a place that is
-    no point.
+    **Returns** `Quantity`; typical: the stiffness of all supports, 1e5 to 2e6 N/m. **Raises** `InputError` for `at` that is not
+    a point.
 
     >>> from optimize import force_per_throw
     >>> force_per_throw().unit
     'N/m'
     """
-    return _of_point(
+    return _point_quantity(
         "force_per_throw", "N/m", _force_per_throw, "foundation force divided by the amplitude of a point", at, body, tier
     )
 
@@ -190,7 +191,8 @@ def _force_per_throw(evaluation: Evaluation, tier: Tier, at: Point, body: int) -
 def motion_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Tier = "leading") -> Quantity:
     """Return the spread of the motions over a deck: root mean square over its points of |U_p - mean| / |mean|.
 
-    It is 0 if all points have the same motion; the deck then throws in the same way everywhere.
+    U_p is the complex amplitude (x, y) of point p. The spread is 0 if all points have the same motion; the deck then throws in
+    the same way at all points.
 
     **Arguments**: `points`: a list of (x, y), m or text; `body`, `tier` as in `throw_stroke`; typical: 2 to 10 points.
 
@@ -200,7 +202,7 @@ def motion_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier: Ti
     >>> (motion_spread([(-1.0, 0.1), (1.0, 0.1)]) < 0.05).words
     'spread of the motions over the deck at most 0.05'
     """
-    return _of_deck("motion_spread", _motion_spread, "spread of the motions over the deck", points, body, tier)
+    return _deck_quantity("motion_spread", _motion_spread, "spread of the motions over the deck", points, body, tier)
 
 
 @validated
@@ -215,10 +217,10 @@ def amplitude_spread(points: Sequence[Sequence[Number]], *, body: int = 0, tier:
     >>> amplitude_spread([(-1.0, 0.1), (1.0, 0.1)]).unit
     ''
     """
-    return _of_deck("amplitude_spread", _amplitude_spread, "spread of amplitudes over the deck", points, body, tier)
+    return _deck_quantity("amplitude_spread", _amplitude_spread, "spread of amplitudes over the deck", points, body, tier)
 
 
-def _of_deck(
+def _deck_quantity(
     name: str, function: Callable[..., Array], text: str, points: Sequence[Sequence[Number]], body: int, tier: Tier
 ) -> Quantity:
     if not isinstance(points, (list, tuple)) or len(points) < 2:
@@ -236,9 +238,12 @@ def _amplitude_spread(evaluation: Evaluation, tier: Tier, points: tuple[Point, .
 
 
 def synchronization_margin() -> Quantity:
-    """Return the factor by which all differences of the motors' torques can grow until the regime ends; at most 1000.
+    """Return the factor by which all differences of the motors' torques can grow until the synchronous regime ends.
 
-    **Returns** `Quantity`; typical: 2 to 50; 1000 for equal motors.
+    See `margin` of `jaxvib.SynchronousRegime`. Values above 1000 are replaced by 1000.
+
+    **Returns** `Quantity`; typical: 2 to 50; 1000 for equal motors. A scene without a stable regime raises `ComputationError`
+    when the quantity is computed.
 
     >>> from optimize import synchronization_margin
     >>> (synchronization_margin() > 3.0).words
@@ -257,9 +262,10 @@ def _margin(evaluation: Evaluation, tier: Tier) -> Array:
 def resonance_distance() -> Quantity:
     """Return the distance of the working speed from the nearest natural frequency, relative to the working speed.
 
-        min_r |w_r / Omega - 1|
+        min_r |w_r / Omega - 1|,    w_r natural frequencies, Omega speed of the working regime
 
-    **Returns** `Quantity`; typical: 0.3 to 0.9.
+    **Returns** `Quantity`; typical: 0.3 to 0.9. A scene without a stable regime raises `ComputationError` when the quantity is
+    computed.
 
     >>> from optimize import resonance_distance
     >>> (resonance_distance() > 0.5).words
@@ -274,20 +280,22 @@ def _distance(evaluation: Evaluation, tier: Tier) -> Array:
 
 
 def _distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
-    each = -jnp.abs(natural_frequencies(evaluation.scene) / evaluation.regime.speed - 1.0)
-    return each if sign < 0.0 else -jnp.max(each)[None]
+    distances = -jnp.abs(natural_frequencies(evaluation.scene) / evaluation.regime.speed - 1.0)
+    return distances if sign < 0.0 else -jnp.max(distances)[None]
 
 
 def least_torque() -> Quantity:
-    """Return the smallest factor of the torques of all motors with which they still pass the resonances on the way up.
+    """Return the smallest factor of the torques of all motors with which the motors still pass the resonances of a run-up.
 
-        max_r max_w (w^4/2) sum_ik S_i S_k |A_ik(w)| / sum_i L_i(w),      A = (H^H - H)/(2 i),    w near w_r
+        max_r max_w (w^4/2) sum_ik S_i S_k |A_ik(w)| / sum_i L_i(w),      A = (H^H - H)/(2 i),    w within 10 % of w_r
 
-    The numerator is the largest mean torque of a steady vibration at the speed w over all phases; resonances up to 95 % of the
-    slowest motor's working speed count. Rotors of large inertia need this torque in a slow run-up; a fast passage needs less,
-    see `jaxvib.run_up`, which integrates the run-up.
+    S_i is the unbalance of exciter i, kg m, L_i(w) the torque of its motor, H(w) the matrix of displacements per centrifugal
+    force of the exciters. The numerator is an upper bound of the mean torque of a steady vibration at the speed w over all
+    phases. The resonances w_r up to 95 % of the least no-load speed of the motors count. Rotors of large inertia need this
+    torque in a slow run-up; a fast passage needs less, see `jaxvib.run_up`, which integrates the run-up.
 
-    **Returns** `Quantity`; typical: 0.1 to 0.8; above 1 the motors are caught by a resonance.
+    **Returns** `Quantity`; typical: 0.1 to 0.8; above 1 the motors are caught by a resonance. A scene with an ideal drive
+    raises `InputError` when the quantity is computed.
 
     >>> from optimize import least_torque
     >>> (least_torque() < 0.7).words
@@ -302,17 +310,17 @@ def _least_torque(evaluation: Evaluation, tier: Tier) -> Array:
 
 
 def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
-    """Return the ratio of the torques at each resonance, 0 at those above the working speed."""
+    """Return the largest ratio of the torques near each resonance, 0 for resonances that a run-up does not pass."""
     scene = evaluation.scene
     balance = assemble_torque_balance(scene)
     if any(balance.is_prescribed):
         raise InputError("scene", "has an ideal drive, which passes every resonance; this quantity needs motors")
 
-    def ratio(speed: Array, given: TorqueBalance = balance) -> Array:
-        influence = influence_of(given, speed)
+    def ratio(speed: Array, ratio_balance: TorqueBalance = balance) -> Array:
+        influence = influence_of(ratio_balance, speed)
         resisting = magnitude((influence.conj().T - influence) / 2j)
-        needed = speed**4 / 2.0 * (given.unbalance @ resisting @ given.unbalance)
-        return needed / jnp.sum(given.driving_torque(speed))
+        needed = speed**4 / 2.0 * (ratio_balance.unbalance @ resisting @ ratio_balance.unbalance)
+        return needed / jnp.sum(ratio_balance.driving_torque(speed))
 
     frozen = jax.lax.stop_gradient(balance)
 
@@ -327,28 +335,28 @@ def _least_torques(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
             move = jnp.nan_to_num(value / jnp.abs(curvature))
             return jnp.clip(w - jnp.clip(move, -0.02 * resonance, 0.02 * resonance), low, high)
 
-        # The ratio is stationary at its peak, so that the derivative of the speed is not needed.
+        # The ratio is stationary at its peak; therefore the derivative of the speed is not needed.
         return ratio(jax.lax.fori_loop(0, _PEAK_STEPS, step, resonance))
 
     resonances = jax.lax.stop_gradient(natural_frequencies(scene))
     slowest = jnp.min(jnp.stack([exciter.drive.speed for exciter in scene.exciters]))
-    counts = (resonances > 0.0) & (resonances < _ON_THE_WAY * slowest)
-    each = jax.vmap(peak)(jnp.where(counts, resonances, 0.5 * slowest))
-    each = jnp.where(counts, each, 0.0)
-    return each if sign > 0.0 else -jnp.max(each)[None]
+    counts = (resonances > 0.0) & (resonances < _MAX_PASSED_RESONANCE * slowest)
+    ratios = jax.vmap(peak)(jnp.where(counts, resonances, 0.5 * slowest))
+    ratios = jnp.where(counts, ratios, 0.0)
+    return ratios if sign > 0.0 else -jnp.max(ratios)[None]
 
 
 def deck_points(quantities: Iterable[Quantity]) -> list[Point] | None:
-    """Return the points of body 0 to which quantities of the working regime refer; None without such quantities."""
-    found: dict[Point, None] = {}
-    own = [part for quantity in quantities for part in walk(quantity) if isinstance(part, RegimeQuantity)]
-    for part in own:
+    """Return the points of body 0 to which quantities of the working regime refer; None if there are no such quantities."""
+    points_of_deck: dict[Point, None] = {}
+    regime_quantities = [part for quantity in quantities for part in walk(quantity) if isinstance(part, RegimeQuantity)]
+    for part in regime_quantities:
         match part.settings:
             case ((float(x), float(y)), 0, *_):
-                found[x, y] = None
+                points_of_deck[x, y] = None
             case (tuple() as points, 0):
-                found |= dict.fromkeys(points)
-    return list(found) if own else None
+                points_of_deck |= dict.fromkeys(points)
+    return list(points_of_deck) if regime_quantities else None
 
 
 def working_speed() -> Quantity:

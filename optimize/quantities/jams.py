@@ -34,9 +34,9 @@ __all__ = [
 
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
-    """Return the platform, or the pair of platforms, of an amplitude.
+    """Return the platform, or the pair of platforms, whose amplitude is computed.
 
-    It is `of`; if `of` is None, platform 1 relative to platform 2, or the only platform.
+    This is `of`; for None it is platform 1 relative to platform 2, or the only platform.
 
     **Raises** `InputError` for a platform that the machine does not have.
     """
@@ -78,7 +78,10 @@ def pair_text(of: Pair) -> str:
 
 
 def pair_of(of: Pair | list[int]) -> Pair:
-    """Return a platform or a pair of platforms; a list from a design file becomes a pair. **Raises** `InputError` otherwise."""
+    """Return a platform or a pair of platforms; a list from a design file becomes a pair.
+
+    **Raises** `InputError` for other values.
+    """
     parts = of if isinstance(of, (list, tuple)) else (of,)
     whole = all(isinstance(part, (int, np.integer)) and not isinstance(part, bool) for part in parts)
     if of is not None and not (whole and len(parts) == (2 if parts is of else 1)):
@@ -126,9 +129,9 @@ def jam_amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Ar
 
 @validated
 def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") -> Quantity:
-    """Return the phase difference of two platforms in a jam mode, rad: 0 in phase, pi in antiphase.
+    """Return the phase difference of two platforms in a jam mode, rad, 0 to pi: 0 in phase, pi in antiphase.
 
-    In the exact motion it is the phase difference of the first harmonics.
+    For the tier "exact" it is the phase difference of the first harmonics.
 
     **Arguments**
 
@@ -236,7 +239,7 @@ def _ratio(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
 
 
 def _peaks(evaluation: Evaluation, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
-    """Return the peaks of the exact force within the period. If its first harmonic is small, several are nearly equal."""
+    """Return the peaks of the exact force within the period. If its first harmonic is small, several peaks are nearly equal."""
     if tier != "exact" or sign < 0.0:
         return sign * jam_force(evaluation, tier, mode, harmonic)[None]
     return evaluation.orbit(mode).force_peaks()
@@ -274,7 +277,8 @@ def fold_margin(*, mode: int) -> Quantity:
 
         margin = min(n - n_low, n_high - n),    n_low, n_high rotor speeds of the folds that end the mode
 
-    Without a fold at that end of the mode, n_low is 0, and n_high is ten times the rotor speed.
+    If no fold ends the mode toward lower rotor speeds, n_low is 0; if no fold ends it toward higher ones, n_high is ten times
+    the rotor speed.
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5.
 
@@ -303,7 +307,7 @@ def _margins(evaluation: Evaluation, sign: float, tier: Tier, mode: int) -> Arra
 
 @validated
 def largest_multiplier(*, mode: int) -> Quantity:
-    """Return the largest modulus of the non-trivial Floquet multipliers of the exact motion: below 1 it is stable.
+    """Return the largest modulus of the non-trivial Floquet multipliers of the exact motion, which is stable if it is below 1.
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5.
 
@@ -324,7 +328,7 @@ def _multiplier(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 def power(*, mode: int | None = None, tier: Tier = "leading") -> Quantity:
     """Return the mean power, W, that loads take from the rotor in a jam mode, or of all drives in the working regime.
 
-        P = n sum_j b_W R^2 (n - Omega) + power of dry friction    (jam)
+        P = n (sum_j b_W R^2 (n - Omega) + torque of dry friction)    (jam, leading order)
 
     **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; default: the working regime of exciters, see
     `throw_stroke`; `tier`: "leading" (the default) or "exact".

@@ -1,4 +1,4 @@
-"""Quantities of the machine itself: support frequencies, sums and products, weight, sag, cost."""
+"""Quantities of the machine itself: support frequencies, sums and products of parameters, mass, static deflection, cost."""
 
 from __future__ import annotations
 
@@ -53,7 +53,8 @@ def _frequencies(evaluation: Evaluation, tier: Tier) -> Array:
 
 
 def _entries(field: str) -> tuple[str, str, str, str]:
-    """Return the part, name and unit of an array of a scene whose entries all have one unit, and a text for its entries."""
+    """Return the part of the scene, the name and the unit of an array whose entries all have one unit, and a text for its
+    entries."""
     part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
     spec = spec_of(field) if part in ("machine", "loads") and "[" not in name else None
     if spec is None or len(spec.units) > 1:
@@ -95,7 +96,7 @@ def _total(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
 def product(field: str) -> Quantity:
     """Return the product of the entries of an array of the scene, such as "machine.stiffness", see `total`.
 
-    The result is in SI; its unit is not shown.
+    The value is in SI, but the quantity has the unit "".
 
     **Arguments**: `field`: the name of the array; typical: "machine.mass", "machine.stiffness".
 
@@ -171,8 +172,8 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
 
     **Arguments**
 
-    - `prices`: pairs (stiffness, price), stiffness in N/m or text, ascending, prices at least 0; typical: 2 to 20 pairs from
-      1e4 to 1e6 N/m
+    - `prices`: pairs (stiffness, price) in ascending order of the stiffness, N/m or text; prices are at least 0; typical: 2 to
+      20 pairs from 1e4 to 1e6 N/m
     - `unit` of the prices
 
     **Returns** `Quantity`. **Raises** `InputError` for a wrong list.
@@ -188,15 +189,15 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
     price = tuple(number_in(p, "", f"prices[{i}]") for i, (_, p) in enumerate(rows))
     if not all(a < b for a, b in itertools.pairwise(stiffness)) or not stiffness[0] > 0.0:
         raise InputError("prices", "must have ascending stiffnesses greater than 0")
-    for i, each in enumerate(price):
-        if not 0.0 <= each < math.inf:
-            raise InputError(f"prices[{i}]", f"has the price {each:g}; a price must be at least 0 and finite")
+    for i, listed in enumerate(price):
+        if not 0.0 <= listed < math.inf:
+            raise InputError(f"prices[{i}]", f"has the price {listed:g}; a price must be at least 0 and finite")
     return _make_quantity("spring_cost", unit, _cost, "cost of the springs", stiffness, price)
 
 
 def _cost(evaluation: Evaluation, tier: Tier, stiffness: tuple[float, ...], price: tuple[float, ...]) -> Array:
     machine = require_platforms(evaluation.scene, "the cost of springs")
     springs = jnp.concatenate([jnp.ravel(machine.stiffness), jnp.ravel(machine.link_stiffness)])
-    each = jnp.interp(springs, jnp.asarray(stiffness), jnp.asarray(price), left="extrapolate", right="extrapolate")
-    least = jnp.where(springs < stiffness[0], price[0], jnp.where(springs > stiffness[-1], price[-1], 0.0))
-    return jnp.sum(jnp.where(springs > 0.0, jnp.maximum(each, least), 0.0))
+    costs = jnp.interp(springs, jnp.asarray(stiffness), jnp.asarray(price), left="extrapolate", right="extrapolate")
+    lowest = jnp.where(springs < stiffness[0], price[0], jnp.where(springs > stiffness[-1], price[-1], 0.0))
+    return jnp.sum(jnp.where(springs > 0.0, jnp.maximum(costs, lowest), 0.0))

@@ -33,7 +33,7 @@ def peak_force(*, until: Number, spin_up: Number) -> Quantity:
     - `spin_up`: time during which the rotor speed rises smoothly, s or text; typical: 1 to 10
 
     **Returns** `Quantity`; its derivatives exist in forward mode only; typical: 500 N to 10 kN. **Raises** `InputError` for a
-    spin-up longer than the run.
+    `spin_up` that is not positive, or longer than the run.
 
     >>> from optimize import peak_force
     >>> (peak_force(until="20 s", spin_up="5 s") < "2 kN").words
@@ -53,19 +53,20 @@ def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float) -> A
 def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: int = 1) -> Quantity:
     """Return the time, s, from the start at rest until the amplitude of a platform stays near its final value.
 
-    The full equations are integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), with w the load speed at the end; the
-    final value is its mean over the last twentieth of the run.
+    The full equations are integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), where w is the load speed at the end of
+    the run; the final value is its mean over the last twentieth of the run.
 
     **Arguments**
 
     - `until` and `spin_up`: as for `peak_force`
     - `within`: the largest relative deviation from the final amplitude; typical: 0.02 to 0.1 (default 0.05)
-    - `of`: the platform (default: 1)
+    - `of`: number of the platform; typical: 1 (the default)
 
     **Returns** `Quantity`; its derivatives exist in forward mode only; typical: the duration of the spin-up plus 2 to
     20 s. A value close to `until` shows that the motion has not settled.
 
-    **Raises** `InputError` for a `within` that is not between 0 and 1.
+    **Raises** `InputError` for a `within` that is not between 0 and 1, and for a `spin_up` as for `peak_force`. A platform that
+    the machine does not have raises it when the quantity is computed.
 
     >>> from optimize import settling_time
     >>> settling_time(until="20 s", spin_up="5 s").unit

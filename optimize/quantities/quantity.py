@@ -18,7 +18,7 @@ from jaxvib.steady.jams.jam import JamModes
 from jaxvib.units import Number, count, in_own_unit
 from jaxvib.units import Quantity as UnitQuantity
 from optimize.quantities.evaluation import Evaluation
-from optimize.quantities.user_inputs import arguments, number_in, same_unit
+from optimize.quantities.user_inputs import count_required_arguments, number_in, same_unit
 
 Pair = int | tuple[int, int] | None
 """Platform of an amplitude, or pair of platforms of a relative amplitude; None: see `between`."""
@@ -44,15 +44,16 @@ class Quantity:
     - `unit`, "" for none
     - `function` of a `Scene`, or of a `Scene` and its jam modes (`jaxvib.JamModes`), that returns a scalar, differentiable, NaN
       if the quantity does not exist
-    - `mode`: its jam mode, if any; typical: 1, 3, 5
-    - `of`: the platform or pair of platforms of its amplitude, if any
-    - `parts`: the quantities from which it is computed, for example the terms of a sum
+    - `mode`: the jam mode to which the quantity refers, if any; typical: 1, 3, 5
+    - `of`: the platform or the pair of platforms whose amplitude the quantity contains, if any
+    - `parts`: the quantities from which this quantity is computed, for example the terms of a sum
 
     The operators `+ - * / **` on quantities and numbers give quantities; `<` and `>` give a `Demand`. Operands of a sum or a
     comparison must have the same unit. A string such as "50 N" can be an operand: `force < "50 N"`,
     `0.3 * a / "1 mm" + force / "10 N"`.
 
-    **Raises** `InputError` if `function` is not a function of one or two arguments, and for units that do not match.
+    **Raises** `InputError` if `function` is not a function of one or two arguments. The operators raise it for units that do
+    not match.
 
     >>> import jaxvib as jv
     >>> from optimize import Quantity, foundation_force
@@ -67,34 +68,36 @@ class Quantity:
     mode: int | None = None
     of: Pair = None
     parts: tuple[Quantity, ...] = field(default=(), kw_only=True)
-    """Quantities from which this one, a sum for example, is computed."""
+    """Quantities from which this quantity is computed, for example the terms of a sum."""
 
     def __post_init__(self) -> None:
         if self.mode is not None:
             count(self.mode, f"quantity {quoted(self.name)}.mode")
-        if type(self) is Quantity and not (callable(self.function) and arguments(self.function) in (1, 2)):
+        if type(self) is Quantity and not (callable(self.function) and count_required_arguments(self.function) in (1, 2)):
             problem = "give a function of a scene, or of a scene and its jam modes"
             raise InputError(f"quantity {quoted(self.name)}", f"has the function {quoted(self.function)}; {problem}")
 
     @validated
     def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
-        """Return the value for a scene, a scalar in `unit`. The jam `modes` of the scene are computed unless they are given.
+        """Return the value for a scene, a scalar in `unit`.
 
-        **Raises** `ComputationError` for a quantity of the working regime of a scene that has none.
+        **Arguments**: `scene`; `modes`: the jam modes of the scene, default: they are computed.
+
+        **Raises** `ComputationError` for a quantity of the working regime if the scene has no stable synchronous regime.
         """
         return self.read(Evaluation(scene, modes=modes))
 
     def read(self, evaluation: Evaluation) -> Array:
-        """Return the quantity's value, a scalar in `unit`, from an `evaluation` of a scene."""
+        """Return the value of the quantity, a scalar in `unit`, from an `evaluation` of a scene."""
         assert self.function is not None
-        if arguments(self.function) == 1:
+        if count_required_arguments(self.function) == 1:
             return jnp.reshape(self.function(evaluation.scene), ())
         return jnp.reshape(self.function(evaluation.scene, evaluation.modes), ())
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
         """Return smooth values (p,) in `unit` whose maximum is `sign` (1 or -1) times the quantity, from an `evaluation`.
 
-        Where two of them are equal, the quantity has a kink, along which a search can move.
+        At designs for which two pieces are equal and largest, the quantity has a kink, along which a search can move.
         """
         return jnp.reshape(sign * self.read(evaluation), (1,))
 
@@ -105,11 +108,11 @@ class Quantity:
 
     @property
     def forward_only(self) -> bool:
-        """True if derivatives exist in forward mode only."""
+        """True if the derivatives of the quantity exist in forward mode only."""
         return any(part.forward_only for part in self.parts)
 
     def at_tier(self, tier: Tier) -> Quantity:
-        """Return the same quantity computed by another `tier`; unchanged if that tier cannot compute it.
+        """Return the same quantity computed by another `tier`, or an equal quantity if that tier cannot compute it.
 
         **Raises** `InputError` for an unknown tier.
         """
@@ -120,7 +123,8 @@ class Quantity:
     def simplified(self) -> Quantity:
         """Leading-order quantity of the machine with its nominal parameters, for a first search.
 
-        A search with it takes less time than one with the quantity itself, and its best machines are near the final ones.
+        A search with the simplified quantity takes less time than a search with the quantity itself, and its best machines are
+        near those of the final search.
         """
         return replace(self, parts=tuple(part.simplified for part in self.parts)) if self.parts else self
 
@@ -174,7 +178,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class BuiltinQuantity(Quantity):
-    """Quantity of this package. Its function has the arguments `Evaluation`, tier and `settings`."""
+    """Quantity of this package. Its function has the arguments evaluation (an `Evaluation`), tier and `settings`."""
 
     tier: Tier = "leading"
     settings: tuple[object, ...] = ()
@@ -199,8 +203,8 @@ class BuiltinQuantity(Quantity):
 
     @property
     def words(self) -> str:
-        how = {"leading": "", "exact": ", exact", "time": ", in time"}[self.tier]
-        return (self.text or self.name.replace("_", " ")) + (how if len(self.tiers) > 1 else "")
+        suffix = {"leading": "", "exact": ", exact", "time": ", in time"}[self.tier]
+        return (self.text or self.name.replace("_", " ")) + (suffix if len(self.tiers) > 1 else "")
 
     @property
     def forward_only(self) -> bool:
@@ -220,7 +224,7 @@ class BuiltinQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Combined(Quantity):
-    """Arithmetic of quantities."""
+    """Result of an `operation` on quantities (`parts`), or a constant."""
 
     operation: str = "+"
     constant: float = 0.0
@@ -253,16 +257,16 @@ class Combined(Quantity):
         if self.operation == ("largest" if sign > 0.0 else "least"):
             return jnp.concatenate([part.pieces(evaluation, sign) for part in self.parts])
         if self.operation in ("+", "-"):
-            one = self.parts[0].pieces(evaluation, sign)
-            other = self.parts[1].pieces(evaluation, sign if self.operation == "+" else -sign)
-            return (one[:, None] + other[None, :]).reshape(-1)
+            left = self.parts[0].pieces(evaluation, sign)
+            right = self.parts[1].pieces(evaluation, sign if self.operation == "+" else -sign)
+            return (left[:, None] + right[None, :]).reshape(-1)
         if self.operation in ("*", "/"):
             for part, other in (self.parts, self.parts[::-1])[: 1 if self.operation == "/" else 2]:
                 numbers = part.pieces(evaluation, sign)
-                if len(numbers) > 1:  # they are the pieces of the product if the other factor is positive
-                    by = other.read(evaluation)
-                    many = numbers * by if self.operation == "*" else numbers / by
-                    return jnp.where(by > 0.0, many, sign * self.read(evaluation))
+                if len(numbers) > 1:  # the pieces of one factor give those of the product if the other factor is positive
+                    factor = other.read(evaluation)
+                    products = numbers * factor if self.operation == "*" else numbers / factor
+                    return jnp.where(factor > 0.0, products, sign * self.read(evaluation))
         return super().pieces(evaluation, sign)
 
 

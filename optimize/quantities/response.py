@@ -1,7 +1,6 @@
-"""Quantities of the response to unbalances: at the working point, at a speed, or the largest value over a range of speeds.
+"""Quantities of the response to unbalances: in the working regime, at a speed, or the largest value over a range of speeds.
 
-The exciters have unbalances and no loads, see `jaxvib.response`. At the working point several exciters have the phases of the
-working regime, at given speeds equal phases.
+The exciters have unbalances and no loads, see `jaxvib.response`. At a given speed all exciters have equal phases.
 """
 
 from __future__ import annotations
@@ -48,10 +47,10 @@ Speeds = tuple[float, float] | None
 """Lowest and highest speed, rad/s; equal for a single speed; None for the working regime."""
 
 Read = Callable[..., Array]
-"""Function of an `UnbalancedModel` and a speed, rad/s, that returns a scalar."""
+"""Function of an `UnbalancedModel`, a speed, rad/s, and settings, that returns a scalar."""
 
 
-def _of_response(
+def _response_quantity(
     name: str, unit: str, read: Read, text: str, speed: Number | None, between: Sequence[Number] | None, *settings: object
 ) -> Quantity:
     if speed is not None and between is not None:
@@ -78,12 +77,12 @@ def _largest(evaluation: Evaluation, tier: Tier, read: Read, speeds: Speeds, *se
 
 def _pieces(evaluation: Evaluation, sign: float, tier: Tier, read: Read, speeds: Speeds, *settings: object) -> Array:
     """Return the largest value near each resonance."""
-    each = _values(evaluation, read, speeds, settings)
-    return each if sign > 0.0 else -jnp.max(each)[None]
+    values = _values(evaluation, read, speeds, settings)
+    return values if sign > 0.0 else -jnp.max(values)[None]
 
 
 def _values(evaluation: Evaluation, read: Read, speeds: Speeds, settings: tuple[object, ...]) -> Array:
-    """Return the value at the working point or at one speed, (1,), or the largest values near each resonance, (nd,)."""
+    """Return the value in the working regime or at one speed, (1,), or the largest value near each resonance, (nd,)."""
     scene = evaluation.scene
     require_unbalances(scene)
     if speeds is None:
@@ -97,9 +96,9 @@ def _values(evaluation: Evaluation, read: Read, speeds: Speeds, settings: tuple[
     resonances = jnp.clip(frozen.modes()[0], low, high)
     middle = 0.5 * (resonances[1:] + resonances[:-1])
     begins, ends = jnp.concatenate([low[None], middle]), jnp.concatenate([middle, high[None]])
-    # The value is stationary at the largest value inside the range, so that the derivative of the speed is not needed.
-    found = jax.vmap(partial(_speed_of_largest, lambda w: read(frozen, w, *settings)))(begins, resonances, ends)
-    return jax.vmap(lambda w: read(model, w, *settings))(jax.lax.stop_gradient(found))
+    # A value inside the range is stationary where it is largest; therefore the derivative of the speed is not needed.
+    speeds_of_largest = jax.vmap(partial(_speed_of_largest, lambda w: read(frozen, w, *settings)))(begins, resonances, ends)
+    return jax.vmap(lambda w: read(model, w, *settings))(jax.lax.stop_gradient(speeds_of_largest))
 
 
 def _speed_of_largest(value: Callable[[Array], Array], begin: Array, resonance: Array, end: Array) -> Array:
@@ -109,13 +108,13 @@ def _speed_of_largest(value: Callable[[Array], Array], begin: Array, resonance: 
     best = jnp.argmax(jax.vmap(value)(grid))
     left, right = grid[jnp.maximum(best - 1, 0)], grid[jnp.minimum(best + 1, grid.size - 1)]
 
-    def narrowed(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+    def narrow(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bounds
-        one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        is_left = value(one) > value(two)
-        return jnp.where(is_left, low, one), jnp.where(is_left, two, high)
+        left_point, right_point = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        is_left = value(left_point) > value(right_point)
+        return jnp.where(is_left, low, left_point), jnp.where(is_left, right_point, high)
 
-    low, high = jax.lax.fori_loop(0, _REFINEMENTS, narrowed, (left, right))
+    low, high = jax.lax.fori_loop(0, _REFINEMENTS, narrow, (left, right))
     inside = 0.5 * (low + high)
     return jnp.where(value(inside) > value(grid[best]), inside, grid[best])
 
@@ -149,7 +148,7 @@ def response_amplitude(
     - `body`: number of the body from 0; typical: 0 (the default)
     - `speed`, rad/s or text, of all exciters; typical: 50 to 160; default: that of the working regime, see `throw_stroke`
     - `between`: the lowest and the highest speed in place of `speed`, for the largest value in this range; typical:
-      ["100 rpm", "900 rpm"], the resonances that a run-up passes slowly
+      ["100 rpm", "900 rpm"], a range with the resonances that a slow run-up passes
 
     **Returns** `Quantity`; typical: 0.5 to 10 mm, 5 to 50 mm at a resonance. A scene whose exciters have loads raises
     `InputError` when the quantity is computed. **Raises** `InputError` for `speed` together with `between`.
@@ -159,7 +158,7 @@ def response_amplitude(
     'largest amplitude under unbalances from 100 to 900 rpm at most 20 mm'
     """
     place = _point_settings(at, body)
-    return _of_response("response_amplitude", "m", _amplitude, "amplitude under unbalances", speed, between, *place)
+    return _response_quantity("response_amplitude", "m", _amplitude, "amplitude under unbalances", speed, between, *place)
 
 
 def _amplitude(model: UnbalancedModel, w: Array, at: int | Array | None, body: int) -> Array:
@@ -188,7 +187,7 @@ def response_stroke(
     'stroke under unbalances at 950 rpm'
     """
     place = _point_settings(at, body)
-    return _of_response("response_stroke", "m", _stroke, "stroke under unbalances", speed, between, *place)
+    return _response_quantity("response_stroke", "m", _stroke, "stroke under unbalances", speed, between, *place)
 
 
 def _stroke(model: UnbalancedModel, w: Array, at: int | Array | None, body: int) -> Array:
@@ -207,7 +206,7 @@ def response_force(*, speed: Number | None = None, between: Sequence[Number] | N
     >>> response_force(between=("100 rpm", "900 rpm")).unit
     'N'
     """
-    return _of_response("response_force", "N", _field("foundation_force"), "force under unbalances", speed, between)
+    return _response_quantity("response_force", "N", _field("foundation_force"), "force under unbalances", speed, between)
 
 
 @validated
@@ -224,7 +223,7 @@ def response_transmissibility(*, speed: Number | None = None, between: Sequence[
     'transmissibility under unbalances at most 0.1'
     """
     text = "transmissibility under unbalances"
-    return _of_response("response_transmissibility", "", _field("transmissibility"), text, speed, between)
+    return _response_quantity("response_transmissibility", "", _field("transmissibility"), text, speed, between)
 
 
 @validated
@@ -239,7 +238,7 @@ def response_torque(*, speed: Number | None = None, between: Sequence[Number] | 
     >>> (response_torque(between=("100 rpm", "900 rpm")) < "12 N m").words
     'largest shaft torque under unbalances from 100 to 900 rpm at most 12 N m'
     """
-    return _of_response("response_torque", "N m", _field("torque"), "shaft torque under unbalances", speed, between)
+    return _response_quantity("response_torque", "N m", _field("torque"), "shaft torque under unbalances", speed, between)
 
 
 def _field(name: str) -> Read:
@@ -256,8 +255,8 @@ def fold_distance() -> Quantity:
 
         min_f |w_f / w - 1|
 
-    w is the highest speed at which the motor can run, w_f the speed of a fold, see `TorqueFolds`. A motor that is weaker, or a
-    machine with more damping, loses the working speed at a fold.
+    w is the highest speed at which the motor can run, w_f the speed of a fold, see `TorqueFolds`. If the motor becomes weaker,
+    or the damping larger, the operating point at the working speed disappears at a fold.
 
     **Returns** `Quantity`; typical: 0.2 to 0.9; 1 without a fold. A scene with several exciters or with an ideal drive raises
     `InputError` when the quantity is computed.
@@ -278,10 +277,10 @@ def _fold_distances(evaluation: Evaluation, sign: float, tier: Tier) -> Array:
     scene = evaluation.scene
     require_unbalances(scene)
     if len(scene.exciters) > 1 or scene.exciter.drive.ideal:
-        has = f"{len(scene.exciters)} exciters" if len(scene.exciters) > 1 else "an ideal drive"
-        raise InputError("scene", f"has {has}; folds of the response exist for one exciter with a motor")
+        has_text = f"{len(scene.exciters)} exciters" if len(scene.exciters) > 1 else "an ideal drive"
+        raise InputError("scene", f"has {has_text}; folds of the response exist for one exciter with a motor")
     operating, folds = operation_of(unbalanced_model(scene, jnp.zeros(1, scene.top_speed.dtype)))
     working = jnp.max(jnp.where(operating.exists, operating.speed, -jnp.inf))
     speeds = jnp.where(folds.exists, folds.speed, 0.0)
-    each = jnp.where(jnp.isfinite(working), -jnp.abs(speeds / working - 1.0), jnp.nan)
-    return each if sign < 0.0 else -jnp.max(each)[None]
+    distances = jnp.where(jnp.isfinite(working), -jnp.abs(speeds / working - 1.0), jnp.nan)
+    return distances if sign < 0.0 else -jnp.max(distances)[None]

@@ -25,8 +25,8 @@ def stroke(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     **Arguments**
 
     - `mode`: number of the jam mode; typical: 1, 3, 5
-    - `of`: a platform, or a pair of them, as `amplitude`
-    - `tier` as `amplitude`
+    - `of`: a platform, or a pair of platforms, as for `amplitude`
+    - `tier`: as for `amplitude`
 
     **Returns** `Quantity`, NaN if the mode does not exist; typical: 2 to 20 mm. A mode or platform that the machine does
     not have raises `InputError` when the quantity is computed.
@@ -45,15 +45,15 @@ def _stroke(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
 
 @validated
 def acceleration(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
-    """Return the amplitude of the acceleration in a jam mode, in g = 9.80665 m/s^2, at the fundamental.
+    """Return the amplitude of the acceleration in a jam mode, in g = 9.80665 m/s^2, for a vibration at the load speed.
 
         a = Omega^2 Y / g
 
     **Arguments**
 
     - `mode`: number of the jam mode; typical: 1, 3, 5
-    - `of`: a platform, or a pair of them, as `amplitude`
-    - `tier` as `amplitude`
+    - `of`: a platform, or a pair of platforms, as for `amplitude`
+    - `tier`: as for `amplitude`
 
     **Returns** `Quantity`, NaN if the mode does not exist; typical: 2 to 6 for screens. A mode or platform that the machine
     does not have raises `InputError` when the quantity is computed.
@@ -74,15 +74,15 @@ def _acceleration(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Ar
 
 @validated
 def velocity(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
-    """Return the root mean square of the velocity in a jam mode, m/s, at the fundamental.
+    """Return the root mean square of the velocity in a jam mode, m/s, for a vibration at the load speed.
 
         v = Omega Y / sqrt 2
 
     **Arguments**
 
     - `mode`: number of the jam mode; typical: 1, 3, 5
-    - `of`: a platform, or a pair of them, as `amplitude`
-    - `tier` as `amplitude`
+    - `of`: a platform, or a pair of platforms, as for `amplitude`
+    - `tier`: as for `amplitude`
 
     **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.05 to 0.3 m/s for platforms. A mode or platform that the
     machine does not have raises `InputError` when the quantity is computed.
@@ -105,7 +105,7 @@ def transmissibility(*, mode: int, tier: Tier = "leading") -> Quantity:
 
         T = F / (S Omega^2),    isolation efficiency = 1 - T
 
-    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier` as `amplitude`.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier`: as for `amplitude`.
 
     **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.01 to 5. A mode that the machine does not have raises
     `InputError` when the quantity is computed.

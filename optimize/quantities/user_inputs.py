@@ -1,4 +1,4 @@
-"""Reading of users' functions, units, and numbers with units."""
+"""Validation of functions of the user, comparison of units, and conversion of numbers with units."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from jaxvib.units import Number, number, unit_ratio
 from jaxvib.units.known import require_known
 
 
-def arguments(function: Callable[..., object]) -> int:
-    """Return the number of required arguments of a function; 1 if it is unknown."""
+def count_required_arguments(function: Callable[..., object]) -> int:
+    """Return the number of required positional arguments of a function; 1 if the signature cannot be read."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -21,16 +21,19 @@ def arguments(function: Callable[..., object]) -> int:
 
 
 @lru_cache(maxsize=256)
-def same_unit(one: str, other: str) -> bool:
+def same_unit(first: str, second: str) -> bool:
     """Return True if two units are the same, for example "N" and "kg m/s^2", but not "Hz" and "rad/s"."""
-    if one == other:
+    if first == second:
         return True
-    ratio = unit_ratio(one, other)
+    ratio = unit_ratio(first, second)
     return ratio is not None and abs(ratio - 1.0) < 1e-12
 
 
 def number_in(value: Number, unit: str, name: str) -> float:
-    """Convert a number, or a string with a unit, to `unit`. **Raises** `InputError` as `jaxvib.units.number` does."""
-    found = number(value, unit, name)
-    require_known(found, name, "a quantity", "make it outside")
-    return float(found)
+    """Convert a number, or a string with a unit, to `unit`.
+
+    **Raises** `InputError` for a wrong unit, for text that is not a number, and for a value that is traced by JAX.
+    """
+    converted = number(value, unit, name)
+    require_known(converted, name, "a quantity", "make it outside")
+    return float(converted)

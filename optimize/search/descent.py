@@ -1,5 +1,4 @@
-"""Descent by Adam (optax) from many starts at once; it keeps held quantities and includes demands by an augmented
-Lagrangian.
+"""Descent by Adam (optax) from many starts at once, with held quantities and with demands (by an augmented Lagrangian).
 
 Sizes of arrays: d free parameters, m equations.
 """
@@ -25,7 +24,7 @@ STEPS_PER_CALL = 25
 """Number of steps of the descent in one call of its program."""
 
 _DESCENT_VIOLATION = 0.1
-"""Largest violation of held quantities that a step of the descent may leave; the next step corrects it."""
+"""Largest relative deviation of held quantities after an accepted step of the descent; the next step corrects it."""
 
 _STEPS_PER_UPDATE = 20
 """Number of steps between updates of the multipliers of demands."""
@@ -34,7 +33,7 @@ _STEPS_PER_UPDATE = 20
 class _SearchState(NamedTuple):
     """State of one search: the design with its values and derivatives (as in `Point`), the state of Adam, the step length, the
     multipliers and the weight of the demands, the largest violation of a demand at the last update of the multipliers
-    (`worst`), the initial size of the objective, and the number of steps `taken`."""
+    (`worst`), the modulus `size` of the initial objective, by which the objective is divided, and the number of `steps`."""
 
     z: Array
     values: Array
@@ -47,7 +46,7 @@ class _SearchState(NamedTuple):
     weight: Array
     worst: Array
     size: Array
-    taken: Array
+    steps: Array
 
 
 class Descended(NamedTuple):
@@ -81,12 +80,12 @@ def _project(vector: Array, held: Array, free: Array) -> Array:
 def _initial_states(point: Any, multipliers: Array) -> _SearchState:
     state = jax.vmap(_ADAM.init)(point.z)
     n = point.z.shape[0]
-    one = jnp.ones(n)
+    ones = jnp.ones(n)
     size = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
     worst = jnp.full(n, jnp.inf)
     z, values, slopes, speeds, speed_slopes, *_ = point
     return _SearchState(
-        z, values, slopes, speeds, speed_slopes, state, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int)
+        z, values, slopes, speeds, speed_slopes, state, ones, multipliers, 10.0 * ones, worst, size, jnp.zeros(n, int)
     )
 
 
@@ -112,16 +111,16 @@ def _step(problem: Problem, state: _SearchState, rate: Array) -> tuple[_SearchSt
     finite = jnp.all(jnp.isfinite(values)) & jnp.all(jnp.isfinite(slopes))
     good = finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _DESCENT_VIOLATION) & (rate > 0.0)
 
-    def chosen(new: Array, old: Array) -> Array:
+    def select(new: Array, old: Array) -> Array:
         return jnp.where(good, new, old)
 
     new = (z, values, slopes, speeds, speed_slopes)
     z, values, slopes, speeds, speed_slopes = jax.tree.map(
-        chosen, new, (state.z, state.values, state.slopes, state.speeds, state.speed_slopes)
+        select, new, (state.z, state.values, state.slopes, state.speeds, state.speed_slopes)
     )
     length = jnp.where(good, jnp.minimum(1.0, 1.2 * state.length), 0.5 * state.length)
 
-    update = (state.taken % _STEPS_PER_UPDATE == _STEPS_PER_UPDATE - 1) & (rate > 0.0)
+    update = (state.steps % _STEPS_PER_UPDATE == _STEPS_PER_UPDATE - 1) & (rate > 0.0)
     excess = values[1 + m :]
     multipliers = jnp.where(update, jnp.maximum(0.0, state.multipliers + state.weight * excess), state.multipliers)
     worst = jnp.max(jnp.maximum(excess, 0.0), initial=0.0)
@@ -129,7 +128,7 @@ def _step(problem: Problem, state: _SearchState, rate: Array) -> tuple[_SearchSt
     weight = jnp.where(slow, jnp.minimum(3.0 * state.weight, 1e4), state.weight)
     state = _SearchState(
         z, values, slopes, speeds, speed_slopes, adam, length, multipliers, weight,
-        jnp.where(update, worst, state.worst), state.size, state.taken + 1,
+        jnp.where(update, worst, state.worst), state.size, state.steps + 1,
     )  # fmt: skip
     return state, values[0]
 
@@ -152,8 +151,9 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, report: Cal
     """Descend by Adam from all starts at once; each step keeps the held quantities and corrects their deviations.
 
     Demands are included by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w) with multipliers l_i and the
-    weight w, which are updated every 20 steps. A step to a design for which the objective does not exist is rejected, and the
-    step length of this search is halved. `report` is called with the progress (0 to 1) and the point.
+    weight w, which are updated every 20 steps. A step is rejected, and the step length of this search is halved, if a quantity
+    does not exist for the new design or if a held quantity deviates by more than 10 %. `report` is called with the progress
+    (0 to 1) and the point.
 
     **Returns** `Descended`.
     """
@@ -163,8 +163,10 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, report: Cal
     states = in_chunks(problem.batch_size, _initial_states, point, np.zeros((len(point.z), len(problem.demands))))
     history: list[np.ndarray] = []
     for k, part in enumerate(rates):
-        each = on_device(part)
-        states, values = in_chunks(problem.batch_size, lambda state, each=each: _run_steps(problem, state, each), states)
+        part_rates = on_device(part)
+        states, values = in_chunks(
+            problem.batch_size, lambda state, part_rates=part_rates: _run_steps(problem, state, part_rates), states
+        )
         history.append(values)
         report((k + 1) / len(rates), _point(states))
     values = np.concatenate(history, axis=1)[:, :steps]
@@ -173,6 +175,6 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, report: Cal
 
 def _point(states: _SearchState) -> Point:
     """Return the designs of all searches, without pieces of the objective."""
-    z, values, slopes = (np.asarray(each) for each in states[:3])
+    z, values, slopes = (np.asarray(array) for array in states[:3])
     nothing = np.zeros((len(z), 0))
     return Point(z, values, slopes, states.speeds, states.speed_slopes, nothing, np.zeros((*nothing.shape, z.shape[1])))

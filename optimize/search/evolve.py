@@ -17,11 +17,11 @@ from jaxvib.runtime.programs import cached
 from optimize.search.problem import Point, Problem, Speeds, evaluate, find_speeds
 
 _VIOLATION_PENALTY = 10.0
-"""Penalty of a demand that is violated by 100 %, in typical values of the objective."""
+"""Penalty of a demand or held quantity that is violated by 100 %, in units of the median objective of the first designs."""
 
 _DESIGNS_PER_BATCH = 8
-"""Number of designs in a batch. It is small because populations are small, and because the jams of only a few designs at a time
-cannot be followed."""
+"""Number of designs in a batch. It is small because populations are small, and because usually only a few designs of a
+population need a search for their jams on the whole branch."""
 
 _MAX_STORED_DESIGNS = 200
 """Number of the latest designs whose jams are stored."""
@@ -33,15 +33,15 @@ _MIN_DESIGN_DISTANCE = 1e-2
 """Smallest distance between polished designs in one free parameter, relative to its range."""
 
 _MERIT_WITHOUT_OBJECTIVE = 1e12
-"""Merit of a design without the objective."""
+"""Merit of a design for which a quantity does not exist."""
 
 
 class Evolved(NamedTuple):
     """Result of an evolution.
 
     **Attributes**: `point`: the best distinct designs, None if the objective exists for no design; `history` (g, 1): the best
-    objective of each generation; `drawn`: number of random designs; `existing`: number of these for which the objective exists;
-    `interrupted`: True if the user interrupted the search.
+    objective of each generation; `drawn`: number of computed designs; `existing`: number of these for which the objective
+    exists; `interrupted`: True if the user interrupted the search.
     """
 
     point: Point | None
@@ -85,8 +85,8 @@ class PopulationValues:
             missing = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
             if len(missing):
                 values[missing], again = self._at(z[missing], find_speeds(self.problem, z[missing]))
-                for every, some in zip(speeds, again, strict=True):
-                    every[missing] = some
+                for all_speeds, new_speeds in zip(speeds, again, strict=True):
+                    all_speeds[missing] = new_speeds
         good = np.all(np.isfinite(values), axis=1)
         if np.any(good):
             new = (z[good], *(each[good] for each in speeds))
@@ -95,16 +95,19 @@ class PopulationValues:
         return values
 
     def _at(self, z: np.ndarray, near: Speeds) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        values, found = in_chunks(self.problem.batch_size, lambda x, w: _evaluate_designs(self.problem, x, w), z, near)
-        return np.array(values), tuple(np.array(each) for each in found)
+        values, speeds = in_chunks(self.problem.batch_size, lambda x, w: _evaluate_designs(self.problem, x, w), z, near)
+        return np.array(values), tuple(np.array(each) for each in speeds)
 
 
 def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[float, float], None]) -> Evolved:
-    """Minimize by CMA-ES (Hansen and Ostermeier, Evolutionary Computation 9, 2001; package cma) with at most `evaluations`
-    designs. After convergence it is restarted with twice the population (Auger and Hansen, IEEE CEC 2005).
+    """Minimize by CMA-ES (Hansen and Ostermeier, Evolutionary Computation 9, 2001; package cma).
 
-    The merit is the scaled objective plus penalties of violated demands. `report` is called with the progress (0 to 1) and the
-    best objective. An interrupt (KeyboardInterrupt) ends the search with its present result.
+    The search ends with the generation in which the number of computed designs reaches `evaluations`. After convergence the
+    method is restarted with twice the population (Auger and Hansen, IEEE CEC 2005). The merit is the scaled objective plus
+    penalties of violated demands and held quantities. `report` is called with the progress (0 to 1) and the best objective. An
+    interrupt (KeyboardInterrupt) ends the search with its present result.
+
+    **Returns** `Evolved`.
     """
     import cma  # an optional dependency
 
@@ -150,10 +153,10 @@ def evolve(problem: Problem, evaluations: int, seed: int, report: Callable[[floa
 
 def _best(merits: np.ndarray, designs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the merits of the best distinct designs, and these designs."""
-    kept: list[int] = []
+    indices: list[int] = []
     for k in np.argsort(merits, kind="stable"):
-        if all(np.max(np.abs(designs[k] - designs[j])) > _MIN_DESIGN_DISTANCE for j in kept):
-            kept.append(int(k))
-        if len(kept) == _POLISHED_DESIGNS:
+        if all(np.max(np.abs(designs[k] - designs[j])) > _MIN_DESIGN_DISTANCE for j in indices):
+            indices.append(int(k))
+        if len(indices) == _POLISHED_DESIGNS:
             break
-    return merits[kept], designs[kept]
+    return merits[indices], designs[indices]

@@ -48,8 +48,9 @@ class SearchResult(NamedTuple):
     """Results of searches.
 
     **Attributes**: those of `Polished`; `drawn`: number of random designs; `existing`: number of these for which the objective
-    exists; `interrupted`: True if the user interrupted the search; `bounds`: lower and upper bounds (d,) of the d parameters in
-    the problem from which the best design comes, SI; `nodes`: number of bounded problems that branch and bound solved.
+    exists; `interrupted`: True if the user interrupted the search; `bounds`: lower and upper bounds (d,) of the d free
+    parameters within which the best design was searched for, SI; `nodes`: number of bounded problems that branch and bound
+    solved.
     """
 
     point: Point
@@ -65,11 +66,11 @@ class SearchResult(NamedTuple):
 
     @property
     def best(self) -> int:
-        """Index of the best design: that with the least objective among designs that meet all demands; if there are none, that
-        with the least violation."""
-        kept = self.violation < 10.0 * FEASIBILITY_TOLERANCE
-        if np.any(kept):
-            return int(np.argmin(np.where(kept, self.point.values[:, 0], np.inf)))
+        """Index of the design with the least objective among the designs that meet all demands. If no design meets them, index
+        of the design with the least violation."""
+        is_feasible = self.violation < 10.0 * FEASIBILITY_TOLERANCE
+        if np.any(is_feasible):
+            return int(np.argmin(np.where(is_feasible, self.point.values[:, 0], np.inf)))
         return int(np.argmin(self.violation))
 
 
@@ -85,7 +86,10 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
     """Search from random starts.
 
     If quantities are expensive (exact motions, integrations, tolerances), a first search uses leading order without tolerances.
-    A second search starts from the best distinct machines of the first, and from random ones if tolerances are considered.
+    A second search starts from the best distinct designs of the first search, and, if there are tolerances, also from random
+    designs.
+
+    **Returns** None if the objective does not exist for any design.
     """
     simplified = None if options.begin is not None else problem.simplified()
     if simplified is None:
@@ -103,22 +107,22 @@ def find(problem: Problem, options: Options, report: Progress) -> SearchResult |
     narrow = _in_small_batches(problem, problem.space)
     if len(begin) == 0:
         begin = first.point.z[:_STARTS_PER_BOUND]
-    found = _find(narrow, replace(options, begin=begin), lambda what, share: report(what, 0.5 + 0.5 * share))
-    if found is None:
+    result = _find(narrow, replace(options, begin=begin), lambda what, share: report(what, 0.5 + 0.5 * share))
+    if result is None:
         return None
-    interrupted = first.interrupted or found.interrupted
-    return found._replace(drawn=first.drawn, existing=first.existing, interrupted=interrupted)
+    interrupted = first.interrupted or result.interrupted
+    return result._replace(drawn=first.drawn, existing=first.existing, interrupted=interrupted)
 
 
 def _in_small_batches(problem: Problem, space: DesignSpace) -> Problem:
-    """Return the problem in another space, in small batches for few designs."""
+    """Return the problem in another design space, with a small size of batches, which suits a few designs."""
     return replace(problem, space=space, batch_size=_STARTS_PER_BOUND)
 
 
 def _has_tolerances(problem: Problem) -> bool:
     """Return True if a quantity is a statistic over tolerances (`Robust`)."""
-    every = [problem.objective, *(q for d in problem.demands for q in (d.quantity, d.limit))]
-    return any(isinstance(part, Robust) for q in every for part in walk(q))
+    quantities = [problem.objective, *(q for d in problem.demands for q in (d.quantity, d.limit))]
+    return any(isinstance(part, Robust) for q in quantities for part in walk(q))
 
 
 def _find(problem: Problem, options: Options, report: Progress) -> SearchResult | None:
@@ -181,13 +185,13 @@ def _find(problem: Problem, options: Options, report: Progress) -> SearchResult 
 
 
 def _restore_modes(problem: Problem, polished: Polished, initial: Point) -> Polished:
-    """Return the results with the requested jams; a design that lost its jam is replaced by the initial one."""
+    """Return the results; a final design whose jam is no longer the requested mode is replaced by the initial design."""
     # The jam that was followed may have another mode number now, which can be determined only from the whole branch.
     point = _with_requested_modes(problem, polished.point)
     lost = ~point.exists()
     if not np.any(lost):
         return polished._replace(point=point)
-    # A machine with the requested mode is preferred to a better one without it.
+    # A design with the requested jam is preferred to a better design without it.
     point = _with_requested_modes(problem, initial).where(lost, point)
     remaining_decrease = np.where(lost, np.inf, polished.remaining_decrease)
     return Polished(point, polished.history, remaining_decrease, violation(problem, point), optimality(problem, point))
@@ -198,19 +202,21 @@ def _with_requested_modes(problem: Problem, point: Point) -> Point:
     if not problem.keys:
         return point
     same = np.ones(len(point.z), bool)
-    for key, ours, whole in zip(problem.keys, point.speeds, find_speeds(problem, point.z), strict=True):
-        near = np.abs(ours / whole - 1.0) < 1e-6
-        there = near if key[1][0] == "jam" else near | ~np.isfinite(whole)
-        same &= np.all(there.reshape(len(same), -1), axis=1)
+    for key, followed, on_branch in zip(problem.keys, point.speeds, find_speeds(problem, point.z), strict=True):
+        near = np.abs(followed / on_branch - 1.0) < 1e-6
+        is_same_jam = near if key[1][0] == "jam" else near | ~np.isfinite(on_branch)
+        same &= np.all(is_same_jam.reshape(len(same), -1), axis=1)
     return point._replace(values=np.where(same[:, None], point.values, np.nan))
 
 
 def choose(problem: Problem, options: Options, report: Progress) -> SearchResult | None:
     """Find the best design with catalogue values, by branch and bound on the continuous search.
 
-    In each bounded problem the parameters vary continuously between two values of their catalogues. If its best design is not
-    better than the best choice found before, all choices between these values are skipped. Since each search is local, the
-    global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with its best choice.
+    In each bounded problem the parameters vary continuously between two values of their catalogues. If the best design of this
+    problem is not better than the best choice up to now, all choices between these values are skipped. Since each search is
+    local, the global optimum is not guaranteed. An interrupt (KeyboardInterrupt) ends the search with its best choice.
+
+    **Returns** None if no choice meets all demands.
     """
     root = find(problem, options, lambda what, share: report(what, 0.5 * share))
     choices = problem.space.choices
@@ -254,8 +260,11 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
 
 
 def _split_bounds(node: SearchResult, choice: Choice, where: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the two parts of a node's bounds: values of the catalogue of `choice` up to, and above, the value in design
-    `where`."""
+    """Yield the two parts of the bounds of a node.
+
+    The catalogue of `choice` is divided into the values up to the present value of this parameter, and the values above it.
+    `where` (d,) are the present free parameters, SI.
+    """
     allowed = [v for v in choice.values if node.bounds[0][choice.start] <= v <= node.bounds[1][choice.start]]
     x = where[choice.start]
     for part in ([v for v in allowed if v <= x], [v for v in allowed if v > x]):
@@ -266,18 +275,19 @@ def _split_bounds(node: SearchResult, choice: Choice, where: np.ndarray) -> Iter
 
 
 def _nearest_choice(problem: Problem, root: SearchResult) -> SearchResult:
-    """Return the best design of an interrupted search, with each parameter rounded to the nearest value of its catalogue.
+    """Return the best design of an interrupted search, with each chosen parameter rounded to the nearest value of its
+    catalogue.
 
-    **Raises** `KeyboardInterrupt` if the objective does not exist for this design.
+    **Raises** `KeyboardInterrupt` if the objective does not exist for the rounded design.
     """
     where = problem.space.within(*root.bounds).numbers(root.point.z[root.best])
     low, high = (b.copy() for b in root.bounds)
     for choice in problem.space.choices:
         low[choice.start] = high[choice.start] = min(choice.values, key=lambda v: abs(v - where[choice.start]))
-    found = _solve_in_bounds(problem, low, high, where[None], 0)
-    if found is None:
+    result = _solve_in_bounds(problem, low, high, where[None], 0)
+    if result is None:
         raise KeyboardInterrupt
-    return found._replace(drawn=root.drawn, existing=root.existing, interrupted=True)
+    return result._replace(drawn=root.drawn, existing=root.existing, interrupted=True)
 
 
 def _distance_to_catalogue(values: tuple[float, ...], x: float) -> float:
@@ -286,15 +296,15 @@ def _distance_to_catalogue(values: tuple[float, ...], x: float) -> float:
     return abs(x - nearest) / max(abs(nearest), 1e-300)
 
 
-def _best_distinct(found: SearchResult) -> np.ndarray:
+def _best_distinct(result: SearchResult) -> np.ndarray:
     """Return the best distinct designs, (at most 7, d)."""
-    order = np.argsort(np.where(found.violation < 10.0 * FEASIBILITY_TOLERANCE, found.point.values[:, 0], np.inf))
-    kept: list[np.ndarray] = []
+    order = np.argsort(np.where(result.violation < 10.0 * FEASIBILITY_TOLERANCE, result.point.values[:, 0], np.inf))
+    distinct: list[np.ndarray] = []
     for k in order:
-        z = found.point.z[k]
-        if np.isfinite(found.point.values[k, 0]) and all(np.max(np.abs(z - other)) > 1e-2 for other in kept):
-            kept.append(z)
-    return np.reshape(kept[: _STARTS_PER_BOUND - 1], (-1, found.point.z.shape[1]))
+        z = result.point.z[k]
+        if np.isfinite(result.point.values[k, 0]) and all(np.max(np.abs(z - other)) > 1e-2 for other in distinct):
+            distinct.append(z)
+    return np.reshape(distinct[: _STARTS_PER_BOUND - 1], (-1, result.point.z.shape[1]))
 
 
 def _solve_in_bounds(
@@ -310,10 +320,10 @@ def _solve_in_bounds(
     if not len(point.z):
         return None
     polished: Polished = polish(narrow, point, polishing, lambda *_: None)
-    kept = _with_requested_modes(narrow, polished.point)
-    violations = np.where(kept.exists(), polished.violation, np.inf)
+    final = _with_requested_modes(narrow, polished.point)
+    violations = np.where(final.exists(), polished.violation, np.inf)
     if not np.any(np.isfinite(violations)):
         return None
     return SearchResult(
-        kept, polished.history, polished.remaining_decrease, violations, polished.optimality, 0, 0, False, (low, high)
+        final, polished.history, polished.remaining_decrease, violations, polished.optimality, 0, 0, False, (low, high)
     )

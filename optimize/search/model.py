@@ -17,7 +17,7 @@ _DIFFERENCE_STEP = 1e-5
 """Step of central differences, as a fraction of the range of a free parameter."""
 
 _MIN_SHARE_AT_KINK = 1e-4
-"""Share above which a piece of the objective counts as one of those that meet at a kink."""
+"""Share of a piece of the objective, as a multiplier, above which the piece counts as one of those that meet at a kink."""
 
 _SMALL_OBJECTIVE_SHARE = 1e-4
 """Smallest scale of the objective, relative to the change of the objective over the bounds that is predicted from its slope."""
@@ -64,12 +64,12 @@ def kink_residuals(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[
     **Returns** the differences (s, k) between the other pieces and the piece with the largest share, in units of `size`, and
     their derivatives (s, k, d); both are 0 for pieces without a share.
     """
-    most = np.argsort(-shares, axis=1)[:, : point.z.shape[1] + 1]
-    values, met = (np.take_along_axis(a, most, axis=1) for a in (point.pieces, shares > _MIN_SHARE_AT_KINK))
-    piece_gradients = np.take_along_axis(point.piece_gradients, most[:, :, None], axis=1)
-    met, size = met[:, 1:] & np.all(np.isfinite(piece_gradients), axis=(1, 2))[:, None], size[:, None]
+    largest = np.argsort(-shares, axis=1)[:, : point.z.shape[1] + 1]
+    values, meets = (np.take_along_axis(a, largest, axis=1) for a in (point.pieces, shares > _MIN_SHARE_AT_KINK))
+    piece_gradients = np.take_along_axis(point.piece_gradients, largest[:, :, None], axis=1)
+    meets, size = meets[:, 1:] & np.all(np.isfinite(piece_gradients), axis=(1, 2))[:, None], size[:, None]
     gap, piece_gradients = values[:, 1:] - values[:, :1], piece_gradients[:, 1:] - piece_gradients[:, :1]
-    return np.where(met, gap / size, 0.0), np.where(met[:, :, None], piece_gradients / size[:, :, None], 0.0)
+    return np.where(meets, gap / size, 0.0), np.where(meets[:, :, None], piece_gradients / size[:, :, None], 0.0)
 
 
 def at_kink(point: Point, near: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -93,12 +93,17 @@ def second_derivatives(problem: Problem, point: Point) -> np.ndarray:
     """
     s, d = point.z.shape
     moves = _DIFFERENCE_STEP * np.concatenate([np.eye(d), -np.eye(d)])
-    # All points in one call, so that chunks are full and every core has work.
+    # All designs are evaluated in one call; batches are then full, and every core has work.
     around = point.take(np.tile(np.arange(s), 2 * d))
     z = around.z + np.repeat(moves, s, axis=0)
-    there = evaluate(problem, z, around.extrapolate_speeds(z))
+    around_point = evaluate(problem, z, around.extrapolate_speeds(z))
     rows = np.concatenate(
-        [there.slopes[:, 1:], _pieces(problem, there)[1], (there.values[:, :1] * there.slopes[:, 0])[:, None]], axis=1
+        [
+            around_point.slopes[:, 1:],
+            _pieces(problem, around_point)[1],
+            (around_point.values[:, :1] * around_point.slopes[:, 0])[:, None],
+        ],
+        axis=1,
     )
     high, low = rows.reshape(2, d, s, -1, d)
     return np.moveaxis((high - low) / (2.0 * _DIFFERENCE_STEP), 0, 1)
@@ -110,9 +115,10 @@ def curvatures(
     """Return second derivatives (s, d, d) of the Lagrangian, in units of the objective, made positive semidefinite.
 
     The second derivatives are projected onto the directions in which active constraints and pieces do not determine the step;
-    in the other directions the linear model determines it. If the objective f is positive, a second set is returned, with
-    (f^2/2)''/f in place of f''. The second set is better if f is the modulus of an almost linear quantity, for example a force
-    that should vanish: the step then leads to the zero at once, whereas the step with f'' does so only from nearby.
+    in the other directions the linear model determines it. If the objective f has one piece and is positive for a design, a
+    second set is returned, with (f^2/2)''/f in place of f''. The second set is better if f is the modulus of an almost linear
+    quantity, for example a force that should vanish: the step then leads to the zero at once, whereas the step with f'' does so
+    only from nearby.
 
     **Arguments**: `second`: see `second_derivatives`; `weights` (s, me + mi): multipliers, in units of the objective's `size`
     (s,); `shares` (s, parts) of the pieces of the objective.
@@ -137,9 +143,11 @@ def curvatures(
     if problem.parts > 1 or not np.any(value > 0.0):
         return [_positive(projector, hessian)]
     with np.errstate(all="ignore"):  # not defined for an objective of 0
-        other = constraints + second[:, :, -1] / (size * value)[:, None, None]
-    is_usable_square = usable & (value > 0.0)[:, None, None] & np.all(np.isfinite(other), axis=(1, 2), keepdims=True)
-    return [_positive(projector, hessian), _positive(projector, np.where(is_usable_square, other, hessian))]
+        constraints_and_square = constraints + second[:, :, -1] / (size * value)[:, None, None]
+    is_usable_square = (
+        usable & (value > 0.0)[:, None, None] & np.all(np.isfinite(constraints_and_square), axis=(1, 2), keepdims=True)
+    )
+    return [_positive(projector, hessian), _positive(projector, np.where(is_usable_square, constraints_and_square, hessian))]
 
 
 def _positive(projector: np.ndarray, hessian: np.ndarray) -> np.ndarray:
@@ -163,8 +171,8 @@ def solve_model(
     held = point.slopes[:, 1 : 1 + m], point.values[:, 1 : 1 + m]
     demands = point.slopes[:, 1 + m :], point.values[:, 1 + m :]
     if problem.parts == 1:
-        found = solve_penalized(hessian, point.slopes[:, 0] / size[:, None], held, demands, box, penalty)
-        return Step(found.p, found.held, found.demands * _active(found, demands), np.ones((len(hessian), 1)))
+        solution = solve_penalized(hessian, point.slopes[:, 0] / size[:, None], held, demands, box, penalty)
+        return Step(solution.p, solution.held, solution.demands * _active(solution, demands), np.ones((len(hessian), 1)))
     values = (point.pieces - point.values[:, :1]) / size[:, None]
     slopes = point.piece_gradients / size[:, None, None]
     # Only the pieces that can become largest in the trust region are used, and not many more than can meet at one kink.
@@ -177,7 +185,7 @@ def solve_model(
         return np.concatenate([rows, np.full((*rows.shape[:2], 1), of_t)], axis=2)
 
     limit_of_t = 1.0 + 2.0 * np.max(np.abs(reachable), axis=1, keepdims=True)
-    found = solve_penalized(
+    solution = solve_penalized(
         np.pad(hessian, ((0, 0), (0, 1), (0, 1))),
         np.concatenate([np.zeros((len(hessian), d)), np.ones((len(hessian), 1))], axis=1),
         (with_t(held[0], 0.0), held[1]),
@@ -186,19 +194,19 @@ def solve_model(
         penalty,
     )
     shares = np.zeros_like(point.pieces)
-    np.put_along_axis(shares, candidates, found.demands[:, mi:], axis=1)
+    np.put_along_axis(shares, candidates, solution.demands[:, mi:], axis=1)
     shares = shares / np.maximum(np.sum(shares, axis=1, keepdims=True), 1e-300)
-    return Step(found.p[:, :d], found.held, found.demands[:, :mi] * _active(found, demands), shares)
+    return Step(solution.p[:, :d], solution.held, solution.demands[:, :mi] * _active(solution, demands), shares)
 
 
-def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def _active(solution: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return True (s, mi) for demands (slopes, excess) that are active after the step.
 
     An interior-point method leaves small multipliers of inactive demands, which are not small relative to an objective near 0.
     """
     slopes, excess = demands
-    slack = -excess - np.einsum("smd,sd->sm", slopes, found.p[:, : slopes.shape[2]])
-    return found.demands[:, : excess.shape[1]] > slack
+    slack = -excess - np.einsum("smd,sd->sm", slopes, solution.p[:, : slopes.shape[2]])
+    return solution.demands[:, : excess.shape[1]] > slack
 
 
 def predicted_decrease(problem: Problem, point: Point, hessian: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
@@ -211,5 +219,5 @@ def predicted_decrease(problem: Problem, point: Point, hessian: np.ndarray, mode
     curved = np.einsum("si,sij,sj->s", model.p, hessian, model.p) * size
     # At the zero of a modulus the slopes vanish; their change then defines the scale.
     change = np.max(np.abs(slopes), axis=(1, 2)) + _DIFFERENCE_STEP * np.trace(hessian, axis1=1, axis2=2) * size
-    least = np.maximum(np.abs(point.values[:, 0]), _SMALL_OBJECTIVE_SHARE * change)
-    return np.abs(linear_change + constraint_change + 0.5 * curved) / np.maximum(least, 1e-300)
+    scale = np.maximum(np.abs(point.values[:, 0]), _SMALL_OBJECTIVE_SHARE * change)
+    return np.abs(linear_change + constraint_change + 0.5 * curved) / np.maximum(scale, 1e-300)

@@ -109,20 +109,20 @@ def restore(
         if shares is not None:
             gap, piece_gradients = kink_residuals(point, shares, np.maximum(np.abs(point.values[:, 0]), 1e-300))
             slopes, values = np.concatenate([slopes, piece_gradients], axis=1), np.concatenate([values, gap], axis=1)
-        z = _least_change(point.z, slopes, values, most=0.3)
+        z = _least_change(point.z, slopes, values, max_change=0.3)
         point = evaluate(problem, z, point.extrapolate_speeds(z))
     return point
 
 
-def _least_change(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, most: float = np.inf) -> np.ndarray:
+def _least_change(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, max_change: float = np.inf) -> np.ndarray:
     """Return the nearest designs to z (s, d), within the bounds, at which the linearized `values` (s, m) vanish.
 
-    **Arguments**: `slopes` (s, m, d): derivatives of the values; `most`: largest change of each entry of z.
+    **Arguments**: `slopes` (s, m, d): derivatives of the values; `max_change`: largest change of each entry of z.
     """
     wanted = -least_norm(slopes, values)
     stopped = ((z <= 0.0) & (wanted < 0.0)) | ((z >= 1.0) & (wanted > 0.0))
     step = -least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values)
-    return np.clip(z + np.clip(step, -most, most), 0.0, 1.0)
+    return np.clip(z + np.clip(step, -max_change, max_change), 0.0, 1.0)
 
 
 class Starts(NamedTuple):
@@ -132,7 +132,7 @@ class Starts(NamedTuple):
 
     - `point`: all initial designs, or None
     - `drawn`: number of random designs; `existing`: number of those for which the objective exists
-    - `nearest`: designs that do not have the held values, at most the requested number, or None
+    - `nearest`: random designs that could not be changed to the held values, at most the requested number, or None
     """
 
     point: Point | None
@@ -150,13 +150,14 @@ def draw_starts(
 ) -> Starts:
     """Draw random designs within the bounds, and change them until the held quantities have their values.
 
-    Further designs are drawn in place of those for which the objective does not exist.
+    Further designs are drawn in place of those that are not usable: the objective does not exist, or the held values are not
+    reached in six steps. The search for usable designs ends after `rounds` times `starts` designs.
     """
     random = np.random.default_rng(seed)
-    kept: list[Point] = []
-    others: list[Point] = []
+    on_held: list[Point] = []
+    off_held: list[Point] = []
     drawn = existing = 0
-    while sum(len(p.z) for p in kept) < starts and drawn < rounds * starts:
+    while sum(len(p.z) for p in on_held) < starts and drawn < rounds * starts:
         z = random.uniform(size=(starts, problem.space.size))
         point = evaluate(problem, z, speeds_of(problem, z))
         drawn += starts
@@ -169,14 +170,14 @@ def draw_starts(
             point = _onto_held(problem, point)
         off = np.max(np.abs(point.values[:, 1 : 1 + problem.equalities]), axis=1, initial=0.0)
         good = point.exists() & (off < FEASIBILITY_TOLERANCE)
-        kept.append(point.take(np.flatnonzero(good)))
-        others.append(before.take(np.flatnonzero(~good)))
-    found, rest = _concatenated(kept), _concatenated(others)
+        on_held.append(point.take(np.flatnonzero(good)))
+        off_held.append(before.take(np.flatnonzero(~good)))
+    starts_on_held, starts_off_held = _concatenated(on_held), _concatenated(off_held)
     return Starts(
-        None if found is None else found.take(np.arange(len(found.z))[:starts]),
+        None if starts_on_held is None else starts_on_held.take(np.arange(len(starts_on_held.z))[:starts]),
         drawn,
         existing,
-        None if rest is None else rest.take(np.arange(len(rest.z))[:starts]),
+        None if starts_off_held is None else starts_off_held.take(np.arange(len(starts_off_held.z))[:starts]),
     )
 
 
@@ -257,8 +258,8 @@ def _begin(problem: Problem, point: Point) -> _Searches:
     size = np.where(size > 0.0, size, 1.0)
     point = restore(problem, point, 2)
     starts, free = point.z.shape
-    found = optimality(problem, point)
-    multipliers = np.nan_to_num(np.concatenate([found.held, found.demands], axis=1)) / size[:, None]
+    start_optimality = optimality(problem, point)
+    multipliers = np.nan_to_num(np.concatenate([start_optimality.held, start_optimality.demands], axis=1)) / size[:, None]
     shares = np.zeros((starts, problem.parts))
     shares[np.arange(starts), np.argmax(point.pieces, axis=1) if problem.parts > 1 else 0] = 1.0
     active = point.exists()
@@ -277,7 +278,8 @@ def _begin(problem: Problem, point: Point) -> _Searches:
 
 
 def _build_models(problem: Problem, searches: _Searches, index: np.ndarray, here: Point) -> tuple[list[Step], np.ndarray]:
-    """Return steps of the searches `index` from `here` by quadratic models, and True where the penalty was too small.
+    """Return the steps of the searches `index` from `here` by quadratic models, and True for searches whose penalty was too
+    small.
 
     Updates the second derivatives, the penalties and the remaining decreases.
     """
@@ -303,12 +305,12 @@ def _dual(model: Step) -> np.ndarray:
 def _move(
     problem: Problem, searches: _Searches, index: np.ndarray, here: Point, models: list[Step], penalty_is_small: np.ndarray
 ) -> None:
-    """Take the better one of the steps if it improves the design, adapt the trust region, and end searches that
+    """Move each design by the better of the steps if this step improves it, adapt the trust regions, and end the searches that
     make no further progress."""
     size, penalty, radius = searches.size[index], searches.penalty[index], searches.trust_radius[index]
     remaining_decrease = searches.remaining_decrease[index]
-    trials = [_trial_point(problem, here, each, size, penalty) for each in models]
-    merits = [_merit(problem, each, size, penalty) for each in trials]
+    trials = [_trial_point(problem, here, model, size, penalty) for model in models]
+    merits = [_merit(problem, trial, size, penalty) for trial in trials]
     first = merits[0] <= merits[-1]
     new, new_merit = trials[0].where(first, trials[-1]), np.minimum(merits[0], merits[-1])
     merit = _merit(problem, here, size, penalty)
@@ -320,8 +322,8 @@ def _move(
     searches.multipliers[index] = np.clip(_dual(models[0]), -1e6, 1e6)
     searches.shares[index] = models[0].shares
     is_met, is_stuck = violation(problem, here) < 1e-10, ~better & (remaining_decrease < _UNREACHABLE_DECREASE)
-    at_rest = is_met & ~penalty_is_small & ((remaining_decrease < _HIDDEN_DECREASE) | is_stuck)
-    searches.active[index] = ~(at_rest | (~better & (radius <= 1e-9)))
+    is_finished = is_met & ~penalty_is_small & ((remaining_decrease < _HIDDEN_DECREASE) | is_stuck)
+    searches.active[index] = ~(is_finished | (~better & (radius <= 1e-9)))
     searches.changed = np.zeros_like(searches.active)
     searches.changed[index] = better & searches.active[index]
 
@@ -331,17 +333,18 @@ def _is_better(
 ) -> np.ndarray:
     """Return True for designs whose step is accepted; `remaining_decrease` is the decrease of the objective that their models
     predict."""
-    kept = violation(problem, new) < np.maximum(FEASIBILITY_TOLERANCE, violation(problem, here))
-    better = new_merit < merit
+    is_feasible = violation(problem, new) < np.maximum(FEASIBILITY_TOLERANCE, violation(problem, here))
+    is_better = new_merit < merit
     # The last step converges quadratically: the decrease of the objective is below its rounding error, but derivatives are
     # exact.
-    better |= kept & (remaining_decrease < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
-    better |= kept & (violation(problem, here) > FEASIBILITY_TOLERANCE) & new.exists()
-    return better
+    is_better |= is_feasible & (remaining_decrease < _HIDDEN_DECREASE) & (new_merit <= merit + _ROUNDING * np.abs(merit))
+    is_better |= is_feasible & (violation(problem, here) > FEASIBILITY_TOLERANCE) & new.exists()
+    return is_better
 
 
 def _trial_point(problem: Problem, point: Point, model: Step, size: np.ndarray, penalty: np.ndarray) -> Point:
-    """Return the better of two points: that after a step, and the nearest one to it on the active constraints and kinks."""
+    """Return the designs after a step, or the nearest designs to them on the active constraints and kinks if these are
+    better."""
     z = np.clip(point.z + model.p, 0.0, 1.0)
     new = evaluate(problem, z, point.extrapolate_speeds(z))
     active = model.demands > 1e-6
@@ -372,8 +375,8 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     counts = np.ones((s, m + mi), bool)
     counts[:, m:] = point.values[:, 1 + m :] > -_ACTIVE_DISTANCE
     if problem.parts > 1:
-        slope, piece_gradients, met = at_kink(point, _ACTIVE_DISTANCE)
-        rows, counts = np.concatenate([rows, piece_gradients], axis=1), np.concatenate([counts, met], axis=1)
+        slope, piece_gradients, meets = at_kink(point, _ACTIVE_DISTANCE)
+        rows, counts = np.concatenate([rows, piece_gradients], axis=1), np.concatenate([counts, meets], axis=1)
     at_low, at_high = point.z <= _ACTIVE_DISTANCE, point.z >= 1.0 - _ACTIVE_DISTANCE
     fixed = np.asarray(problem.space.low == problem.space.high)[None, :] & np.ones((s, 1), bool)
     free = ~(at_low | at_high | fixed)
@@ -386,12 +389,12 @@ def optimality(problem: Problem, point: Point) -> Optimality:
         right = -np.einsum("smd,sd->sm", part, slope * free)
         dual = np.linalg.solve(gram + ridge[:, None, None] * np.eye(counts.shape[1]), right[..., None])[..., 0] * counts
         rest = slope + np.einsum("sm,smd->sd", dual, rows)
-        kept_active = counts.copy()
-        kept_active[:, m:] &= dual[:, m:] >= 0.0
+        still_active = counts.copy()
+        still_active[:, m:] &= dual[:, m:] >= 0.0
         inward = (at_low & (rest < 0.0)) | (at_high & (rest > 0.0))
-        if np.array_equal(kept_active, counts) and not np.any(inward & ~free & ~fixed):
+        if np.array_equal(still_active, counts) and not np.any(inward & ~free & ~fixed):
             break
-        counts, free = kept_active, free | (inward & ~fixed)
+        counts, free = still_active, free | (inward & ~fixed)
     bounds = np.where(free | fixed, 0.0, -rest)
     size = np.maximum(np.abs(slope).max(axis=1), np.abs(point.values[:, 0]))
     residual = np.max(np.abs(np.where(fixed, 0.0, rest + bounds)), axis=1) / np.maximum(size, 1e-300)

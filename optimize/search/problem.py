@@ -2,8 +2,8 @@
 
 Jams are followed from one design to the next: each search for a jam starts near its load speed in the last design.
 
-Two functions are compiled: the evaluation of a chunk of designs, and a number of steps of the descent (`descent`). Chunks run
-in parallel on all cores.
+The designs are computed in batches of at most 64, which run in parallel on all cores. The main compiled programs are the
+derivatives of a batch (`evaluate`) and a number of steps of the descent (`descent`).
 
 Sizes of arrays: s designs, d free parameters, me held quantities (equalities), mi demands (inequalities), p pieces of the
 objective, q quantities.
@@ -31,14 +31,15 @@ from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, gues
 from optimize.quantities.quantity import BuiltinQuantity, Demand, Quantity, walk
 from optimize.space import DesignSpace, HeldQuantity
 
-_CHUNK = 64
-"""Number of designs in a batch on a core."""
+_MAX_BATCH_SIZE = 64
+"""Largest number of designs in a batch; each core computes one batch at a time."""
 
 _ROUNDING_SHARE = 1e-9
 """Value of a quantity, relative to its values for other designs, below which it counts as 0 with a rounding error."""
 
 Speeds = tuple[Any, ...]
-"""Load speeds near which jams and folds are searched for: for each of them (`Key`), an array with an axis over the designs."""
+"""Load speeds, rad/s, near which jams and folds are searched for: for each jam or fold (`Key`) an array with a leading axis
+over the designs."""
 
 
 class Problem(eqx.Module):
@@ -47,7 +48,7 @@ class Problem(eqx.Module):
     **Attributes**
 
     - `space`; `objective`
-    - `demands`, without their limits if these are numbers (`Demand.form`); `constants` (mi,): these limits
+    - `demands`, without those limits that are numbers (`Demand.form`); `constants` (mi,): these limits, 0 for other limits
     - `keys`: the jams and folds whose load speeds are followed, see `Key`
     - `scales` (mi,): positive numbers by which the excesses of the demands are divided
     - `batch_size`: the number of designs in a batch
@@ -60,7 +61,7 @@ class Problem(eqx.Module):
     keys: tuple[Key, ...] = eqx.field(static=True)
     constants: Array | np.ndarray
     scales: Array | np.ndarray
-    batch_size: int = eqx.field(static=True, default=_CHUNK)
+    batch_size: int = eqx.field(static=True, default=_MAX_BATCH_SIZE)
     parts: int = eqx.field(static=True, default=1)
 
     @property
@@ -75,7 +76,7 @@ class Problem(eqx.Module):
         values = self.read(evaluation)
         if pieces:
             values = jnp.concatenate([values, self.objective.pieces(evaluation)])
-        return values, tuple(evaluation.found[key] for key in self.keys)
+        return values, tuple(evaluation.speeds[key] for key in self.keys)
 
     def read(self, evaluation: Evaluation) -> Array:
         """Return the objective, deviations of held quantities and excesses of demands from an evaluation of a scene."""
@@ -87,8 +88,10 @@ class Problem(eqx.Module):
     def simplified(self) -> Problem | None:
         """Return the problem of the first search: leading-order quantities of the machine with its nominal parameters.
 
-        Demands on quantities without a leading order are omitted. None if it is the same problem, or if the objective has no
-        leading order.
+        Demands on quantities without a leading order are omitted.
+
+        **Returns** None if the simplified problem is the same problem, or if the objective or a held quantity has no leading
+        order.
         """
         objective = self.objective.simplified
         demands = [replace(d, quantity=d.quantity.simplified, limit=d.limit.simplified) for d in self.demands]
@@ -98,21 +101,21 @@ class Problem(eqx.Module):
             return None
         if _needs_other_tier(objective) or any(_needs_other_tier(h.quantity) for h in held):
             return None
-        kept = [k for k, d in enumerate(demands) if not (_needs_other_tier(d.quantity) or _needs_other_tier(d.limit))]
+        kept_demands = [k for k, d in enumerate(demands) if not (_needs_other_tier(d.quantity) or _needs_other_tier(d.limit))]
         space = eqx.tree_at(lambda s: s.held, self.space, held)
-        forms, index = tuple(demands[k] for k in kept), np.asarray(kept, int)
+        forms, index = tuple(demands[k] for k in kept_demands), np.asarray(kept_demands, int)
         keys, parts = _keys_and_parts(space, objective, forms)
         return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.batch_size, parts)
 
     @property
     def forward_only(self) -> bool:
-        """True if a quantity has derivatives in forward mode only."""
-        every = [self.objective, *(q for d in self.demands for q in (d.quantity, d.limit))]
-        return any(q.forward_only for q in every) or any(h.quantity.forward_only for h in self.space.held)
+        """True if the derivatives of a quantity exist in forward mode only."""
+        quantities = [self.objective, *(q for d in self.demands for q in (d.quantity, d.limit))]
+        return any(q.forward_only for q in quantities) or any(h.quantity.forward_only for h in self.space.held)
 
 
 def _keys_and_parts(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
-    """Return the load speeds that a search follows, and the number of smooth pieces whose maximum is the objective."""
+    """Return the keys of the load speeds that a search follows, and the number of smooth pieces of the objective."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     return _targets((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
 
@@ -143,7 +146,7 @@ class Point(NamedTuple):
         return np.all(np.isfinite(self.values), axis=1) & np.all(np.isfinite(self.slopes), axis=(1, 2))
 
     def where(self, chosen: np.ndarray, other: Point) -> Point:
-        """Return a point with the designs of this one if `chosen`, otherwise those of the other."""
+        """Return a point with the designs of this point if `chosen` (s,) is True, otherwise with those of `other`."""
         return jax.tree.map(lambda a, b: np.where(chosen.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), self, other)
 
     def take(self, index: np.ndarray) -> Point:
@@ -153,12 +156,12 @@ class Point(NamedTuple):
     def put(self, index: np.ndarray, new: Point) -> Point:
         """Return a copy with the designs of `new` at these indices."""
 
-        def one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        def replaced(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             a = np.array(a)
             a[index] = b
             return a
 
-        return jax.tree.map(one, self, new)
+        return jax.tree.map(replaced, self, new)
 
     def extrapolate_speeds(self, z: np.ndarray) -> Speeds:
         """Extrapolate the followed speeds linearly to other designs."""
@@ -170,7 +173,7 @@ class Point(NamedTuple):
         return tuple(guess)
 
 
-def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
+def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _MAX_BATCH_SIZE) -> Problem:
     """Return the problem of a search with its followed speeds and the scale of each demand.
 
     The scale is the limit of the demand, or, if that is 0, its value for the initial design; it is 1 if both are 0 within
@@ -181,8 +184,8 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
     scales = np.abs(constants)
     if np.any(scales == 0.0):
-        found = _sizes(space, tuple(q for d in demands for q in (d.quantity, d.limit))).reshape(-1, 2).max(axis=1)
-        scales = np.where(scales > 0.0, scales, np.where(np.isfinite(found) & (found > 0.0), found, 1.0))
+        sizes = _sizes(space, tuple(q for d in demands for q in (d.quantity, d.limit))).reshape(-1, 2).max(axis=1)
+        scales = np.where(scales > 0.0, scales, np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, 1.0))
     return Problem(space, objective, forms, keys, constants, scales, _batch_size(starts), parts)
 
 
@@ -205,17 +208,17 @@ def derive(
     If `pieces` is True, the pieces of the objective are the last values.
     """
 
-    def twice(x: Array) -> tuple[tuple[Array, tuple[Array, ...]], tuple[Array, tuple[Array, ...]]]:
-        values, found = problem.values(x, near, pieces)
-        return (values, found), (values, found)
+    def values_and_speeds(x: Array) -> tuple[tuple[Array, tuple[Array, ...]], tuple[Array, tuple[Array, ...]]]:
+        values, speeds = problem.values(x, near, pieces)
+        return (values, speeds), (values, speeds)
 
     rows = 1 + problem.equalities + len(problem.demands) + (problem.parts if pieces else 0)
     if z.shape[0] <= 4 * rows or problem.forward_only:
-        (slopes, speed_slopes), (values, found) = jax.jacfwd(twice, has_aux=True)(z)
+        (slopes, speed_slopes), (values, speeds) = jax.jacfwd(values_and_speeds, has_aux=True)(z)
     else:
-        slopes, (values, found) = jax.jacrev(lambda x: (twice(x)[0][0], twice(x)[1]), has_aux=True)(z)
-        speed_slopes = tuple(jnp.zeros((*w.shape, z.shape[0])) for w in found)
-    return values, slopes, found, speed_slopes
+        slopes, (values, speeds) = jax.jacrev(lambda x: (values_and_speeds(x)[0][0], values_and_speeds(x)[1]), has_aux=True)(z)
+        speed_slopes = tuple(jnp.zeros((*w.shape, z.shape[0])) for w in speeds)
+    return values, slopes, speeds, speed_slopes
 
 
 @cached
@@ -229,7 +232,7 @@ def _derive_all(
 def _speeds_of_branches(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
     """Return the load speed of each key for a batch of scenes, from whole branches."""
 
-    def one(scene: Scene) -> tuple[Array, ...]:
+    def speeds_of_scene(scene: Scene) -> tuple[Array, ...]:
         paths: dict[tuple, JamModes] = {}
         for path, _ in keys:
             if path not in paths:
@@ -245,7 +248,7 @@ def _speeds_of_branches(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ..
         return tuple(guess(path, target) for path, target in keys)
 
     # One scene after the other: this compiles in two thirds of the time and runs equally fast.
-    return jax.lax.map(one, scenes)
+    return jax.lax.map(speeds_of_scene, scenes)
 
 
 @cached
@@ -254,20 +257,24 @@ def _scenes_of(space: DesignSpace, numbers: Array) -> Scene:
 
 
 def _batch_size(count: int) -> int:
-    return min(_CHUNK, 1 << max(count - 1, 0).bit_length())
+    return min(_MAX_BATCH_SIZE, 1 << max(count - 1, 0).bit_length())
 
 
 def evaluate(problem: Problem, z: np.ndarray, near: Speeds) -> Point:
-    """Return values and derivatives of designs z (s, d), whose jams are searched for near the load speeds `near`."""
+    """Return values and derivatives of designs z (s, d). Jams and folds are searched for near the load speeds `near`.
+
+    **Raises** `ValueError` if there is no design.
+    """
     if len(z) == 0:
         raise ValueError("no designs")
-    values, slopes, found, speed_slopes = in_chunks(problem.batch_size, lambda x, w: _derive_all(problem, x, w), z, near)
+    values, slopes, speeds, speed_slopes = in_chunks(problem.batch_size, lambda x, w: _derive_all(problem, x, w), z, near)
     rows = 1 + problem.equalities + len(problem.demands)
-    return Point(z, values[:, :rows], slopes[:, :rows], found, speed_slopes, values[:, rows:], slopes[:, rows:])
+    return Point(z, values[:, :rows], slopes[:, :rows], speeds, speed_slopes, values[:, rows:], slopes[:, rows:])
 
 
 def find_speeds(problem: Problem, z: np.ndarray) -> Speeds:
-    """Return the followed speeds of designs z (s, d) from whole branches; NaN if a jam does not exist."""
+    """Return the followed speeds of designs z (s, d) from whole branches; NaN for a jam and infinite for a fold that does not
+    exist."""
     if not problem.keys:
         return ()
     numbers = problem.space.numbers(np.asarray(z))
@@ -297,12 +304,12 @@ def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[K
     is the first quantity."""
     recorder = TargetRecorder()
 
-    def ask(scene: Scene) -> tuple[Array, list[Array]]:
+    def evaluate_all(scene: Scene) -> tuple[Array, list[Array]]:
         evaluation = Evaluation(scene, recorder)
         return quantities[0].pieces(evaluation), [q.read(evaluation) for q in quantities]
 
     scene = jax.tree.unflatten(shapes.tree, [jax.ShapeDtypeStruct(*leaf) for leaf in shapes.leaves])
-    pieces, _ = jax.eval_shape(ask, scene)
+    pieces, _ = jax.eval_shape(evaluate_all, scene)
     return tuple(recorder.keys), pieces.shape[0]
 
 
@@ -313,17 +320,18 @@ def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]
 
 @cached
 def _evaluate_all(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: Scene, near: tuple[Array, ...]) -> Array:
-    def one(scene: Scene, speeds: tuple[Array, ...]) -> Array:
+    def values_of_scene(scene: Scene, speeds: tuple[Array, ...]) -> Array:
         evaluation = Evaluation(scene, dict(zip(keys, speeds, strict=True)))
         return jnp.stack([q.read(evaluation) for q in quantities])
 
-    return jax.vmap(one)(scenes, near)
+    return jax.vmap(values_of_scene)(scenes, near)
 
 
 def evaluate_quantities(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | None = None) -> np.ndarray:
-    """Return the values (s, q) of quantities of some scenes (arrays with a leading axis), NaN if one does not exist.
+    """Return the values (s, q) of quantities of several scenes (arrays with a leading axis), NaN for a value that does not
+    exist.
 
-    With a `problem` the programs of its search are reused if possible.
+    If a `problem` is given, the programs of its search are reused if possible.
     """
     quantities, leaves = tuple(quantities), jax.tree.leaves(scenes)
     if not quantities:

@@ -57,7 +57,7 @@ def solve_penalized(
     >>> none = np.zeros((1, 0, 1)), np.zeros((1, 0))
     >>> one = solve_penalized(np.eye(1)[None], np.array([[-3.0]]), none, (np.ones((1, 1, 1)), np.array([[-1.0]])),
     ...               (np.array([[-9.0]]), np.array([[9.0]])), np.array([100.0]))
-    >>> one.p.round(6).tolist(), one.demands.round(6).tolist()    # the least of x^2/2 - 3 x where x <= 1
+    >>> one.p.round(6).tolist(), one.demands.round(6).tolist()    # the minimum of x^2/2 - 3 x for x <= 1
     ([[1.0]], [[2.0]])
     """
     (a_rows, a), (c_rows, c), (low, high) = held, demands, box
@@ -93,7 +93,7 @@ def _with_slacks(
     box: tuple[np.ndarray, np.ndarray],
     penalty: np.ndarray,
 ) -> _Program:
-    """Return the programs of `solve_penalized` with x = (p, violations): one violation, never negative, for each constraint."""
+    """Return the programs of `solve_penalized` in x = (p, violations); each constraint has one violation, at least 0."""
     (a_rows, a), (c_rows, c), (low, high) = held, demands, box
     (s, d), me, mi = slope.shape, a.shape[1], c.shape[1]
     n = d + me + mi
@@ -129,18 +129,18 @@ def _interior_point(program: _Program, x: np.ndarray, slack: np.ndarray, dual: n
     quadratic, linear, rows, right = program
     s, m = right.shape
     scale = 1.0 + np.abs(linear).max(axis=1)
-    best, least, mark, improved = (x, dual), np.full(s, np.inf), np.full(s, np.inf), np.zeros(s, int)
+    best, least_residual, mark, improved = (x, dual), np.full(s, np.inf), np.full(s, np.inf), np.zeros(s, int)
     for k in range(_MAX_NEWTON_STEPS):
         stationary = _times(quadratic, x) + linear + _times(np.swapaxes(rows, 1, 2), dual)
         primal = _times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
-        # Keep the best point, since rounding may spoil a good one.
+        # The best point is stored, because rounding errors may make later points worse.
         residual = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
-        better = residual < least
+        better = residual < least_residual
         improved, mark = np.where(residual < 0.5 * mark, k, improved), np.where(residual < 0.5 * mark, residual, mark)
-        least = np.where(better, residual, least)
+        least_residual = np.where(better, residual, least_residual)
         best = np.where(better[:, None], x, best[0]), np.where(better[:, None], dual, best[1])
-        done = (least < 1e-11) | ((least < _NEAR_OPTIMUM) & (k - improved >= _STEPS_WITHOUT_PROGRESS))
+        done = (least_residual < 1e-11) | ((least_residual < _NEAR_OPTIMUM) & (k - improved >= _STEPS_WITHOUT_PROGRESS))
         if np.all(done):
             break
         dx, ds, dl = _predicted_and_corrected(program, stationary, primal, gap, slack, dual)

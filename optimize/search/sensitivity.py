@@ -17,15 +17,15 @@ _STEP = 0.01
 """Relative change of a free parameter by which its influence is computed."""
 
 
-def limits_of(problem: Problem, demands: Sequence[Demand], found: SearchResult, sides: np.ndarray) -> tuple[Limit, ...]:
+def limits_of(problem: Problem, demands: Sequence[Demand], result: SearchResult, sides: np.ndarray) -> tuple[Limit, ...]:
     """Return the limits of the best design: held quantities, demands and active bounds.
 
     **Arguments**: `sides` (number of demands, 2): the value of each demanded quantity, and its limit.
     """
-    best, m = found.best, problem.equalities
-    values, duals = found.point.values[best], found.optimality
+    best, m = result.best, problem.equalities
+    values, duals = result.point.values[best], result.optimality
     objective = abs(values[0]) if np.isfinite(values[0]) else np.nan
-    space = problem.space.within(*found.bounds)
+    space = problem.space.within(*result.bounds)
     rows: list[Limit] = []
 
     def gain(multiplier: float) -> float:
@@ -47,7 +47,7 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: SearchResult, 
         value, limit = float(sides[k, 0]), float(sides[k, 1])
         change = (float(share), gain(share), demand.written_unit)
         rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(violation), active, *change))
-    numbers = space.numbers(found.point.z[best])
+    numbers = space.numbers(result.point.z[best])
     low, high = (np.asarray(b) for b in (problem.space.low, problem.space.high))
     sizes = np.abs([low, high])
     edge = 1e-9 * np.where(problem.space.logs, sizes, np.max(sizes, axis=0))
@@ -65,12 +65,12 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: SearchResult, 
     return tuple(rows)
 
 
-def neighbours(problem: Problem, found: SearchResult) -> np.ndarray:
+def neighbours(problem: Problem, result: SearchResult) -> np.ndarray:
     """Return the free parameters (1 + 2 d, d), SI, of the best design and of its neighbours.
 
     In each neighbour one free parameter is 1 % smaller or larger.
     """
-    numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
+    numbers = problem.space.within(*result.bounds).numbers(result.point.z[result.best])
     off = np.diag(_STEP * numbers)
     return numbers + np.concatenate([np.zeros((1, len(numbers))), -off, off])
 
@@ -84,14 +84,17 @@ def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]
     return tuple(Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words()))
 
 
-def machines_of(problem: Problem, found: SearchResult, same: float) -> tuple[Machine, ...]:
-    """Return the distinct machines among the results of the searches, best first."""
-    values = np.where(found.violation < 10.0 * FEASIBILITY_TOLERANCE, found.point.values[:, 0], np.inf)
+def machines_of(problem: Problem, result: SearchResult, same: float) -> tuple[Machine, ...]:
+    """Return the distinct machines among the results of the searches, best first.
+
+    **Arguments**: `same`: distance of two designs, relative to the ranges, below which they are the same machine.
+    """
+    values = np.where(result.violation < 10.0 * FEASIBILITY_TOLERANCE, result.point.values[:, 0], np.inf)
     remaining = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
-    space, machines = problem.space.within(*found.bounds), []
+    space, machines = problem.space.within(*result.bounds), []
     while remaining:
-        first = found.point.z[remaining[0]]
-        near = [k for k in remaining if np.max(np.abs(found.point.z[k] - first)) < same]
+        first = result.point.z[remaining[0]]
+        near = [k for k in remaining if np.max(np.abs(result.point.z[k] - first)) < same]
         numbers = tuple(map(float, space.numbers(first)))
         machines.append(Machine(len(near), float(values[remaining[0]]), numbers))
         remaining = [k for k in remaining if k not in set(near)]

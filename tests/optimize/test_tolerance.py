@@ -59,7 +59,7 @@ def test_short_names_of_a_body_are_all_its_springs():
         "exciters[1].unbalance",
     ]
     (material,) = read_tolerances(scene, ["load=0..20kg"]).ranges
-    assert (material.found.name, material.low, material.high, material.is_added) == ("machine.mass", 0.0, 20.0, True)
+    assert (material.number.name, material.low, material.high, material.is_added) == ("machine.mass", 0.0, 20.0, True)
     with pytest.raises(jv.InputError, match=r"machine.mass\[1\]"):
         read_tolerances(scene, ["load[2]=0..20kg"])
 
@@ -70,4 +70,4 @@ def test_short_names_of_a_network_of_bodies():
     scene = jv.Scene(machine, exciters=[jv.Exciter(drive=jv.ConstantSpeed(60.0), unbalance=0.1)])
     errors = read_tolerances(scene, ["mass=1%", "damping=30%"]).errors
     assert errors[:2] == (("machine.bodies[0].mass", 0.01), ("machine.bodies[1].mass", 0.01)) and len(errors) == 6
-    assert read_tolerances(scene, ["load[2]=0..20kg"]).ranges[0].found.name == "machine.bodies[1].mass"
+    assert read_tolerances(scene, ["load[2]=0..20kg"]).ranges[0].number.name == "machine.bodies[1].mass"

@@ -13,7 +13,7 @@ from optimize import amplitude, fold_margin, foundation_force, phase, total
 from optimize.quantities import evaluation as answers_module
 from optimize.quantities.evaluation import Evaluation, TargetRecorder, guesses
 from optimize.quantities.jams import between
-from optimize.quantities.user_inputs import arguments, same_unit
+from optimize.quantities.user_inputs import count_required_arguments, same_unit
 
 SCENE = scene("two_mass")
 
@@ -126,8 +126,12 @@ def test_amplitudes_and_forces_of_each_tier():
 
 
 def test_what_users_give_is_read():
-    assert arguments(lambda s: s) == 1 and arguments(lambda s, m: s) == 2 and arguments(lambda s, m=3, *, k=2: s) == 1
-    assert arguments(lambda *s: s) == 0 and arguments(max) in (0, 1)
+    assert (
+        count_required_arguments(lambda s: s) == 1
+        and count_required_arguments(lambda s, m: s) == 2
+        and count_required_arguments(lambda s, m=3, *, k=2: s) == 1
+    )
+    assert count_required_arguments(lambda *s: s) == 0 and count_required_arguments(max) in (0, 1)
     assert same_unit("N", "kg m/s^2") and same_unit("", "dimensionless") and same_unit("rad/s", "rad/s")
     assert not same_unit("N", "kN") and not same_unit("N", "m") and not same_unit("nonsense", "N")
     for wrong in ("drive.speed", "machine.kind", "machine", "effects.mass", 3):

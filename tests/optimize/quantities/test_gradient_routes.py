@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.study.accuracy.gradient_check import _DIFFERENCE_STEPS, _NOISE_FACTOR, _extrapolated, _scale
+from jaxvib.study.accuracy.gradient_check import _DIFFERENCE_STEPS, _NOISE_FACTOR, _extrapolate, _scale
 from optimize import (
     amplitude,
     expected,
@@ -118,7 +118,7 @@ class Routes:
                 central[:, i, k] = (high - low) / (2.0 * step)
         judged = 0
         for q, rows in enumerate(central):
-            difference, noise, _ = (np.asarray(x) for x in zip(*(_extrapolated(row, value[q]) for row in rows), strict=True))
+            difference, noise, _ = (np.asarray(x) for x in zip(*(_extrapolate(row, value[q]) for row in rows), strict=True))
             scale = np.maximum(_scale(difference), 1e-3 * abs(value[q]))
             for name, slopes in found.items():
                 off, allowed = (
