@@ -27,8 +27,11 @@ _MAX_TIMING_SECONDS = 1.0
 
 
 class CostRow(NamedTuple):
-    """Cost of one method: `tier`, `method`, `dtype`, `setting` (a tolerance or a number of points, as text), relative `error`,
-    `seconds` of a compiled call, and `compile`, the additional seconds of the first call."""
+    """Cost of one method.
+
+    **Attributes**: names of the `tier`, the `method` and the `dtype`; `setting`: a tolerance or a number of points, as text;
+    relative `error`; `seconds` of a compiled call; `compile`: additional seconds of the first call.
+    """
 
     tier: str
     method: str
@@ -46,8 +49,8 @@ class Cost(Result):
 
     **Attributes**
 
-    - `quantity`: its name
-    - `reference`: list of its reference values; `reference_error`: their relative error
+    - `quantity`: name of the quantity
+    - `reference`: its reference values; `reference_error`: their relative error
     - `rows`: a `CostRow` for each tier, method, tolerance and dtype
     - `left_out`: for each tier that cannot compute the quantity, a sentence with the reason
     """
@@ -62,24 +65,26 @@ class Cost(Result):
 
     @validated
     def cheapest(self, error: float) -> CostRow | None:
-        """Return the row of the fastest method whose relative error is at most `error`, such as 1e-4.
+        """Return the row of the fastest method whose relative error, plus that of the reference, is at most `error`.
 
-        None if no row is accurate enough, or if the reference is not accurate enough.
+        **Arguments**: `error`: typical: 1e-2 to 1e-6.
+
+        **Returns** None if no method is accurate enough, or if the reference is not accurate enough.
         """
         if not self.reference_error < error:
             return None
-        able = [row for row in self.rows if row.error + self.reference_error <= error]
-        return min(able, key=lambda row: row.seconds, default=None)
+        accurate = [row for row in self.rows if row.error + self.reference_error <= error]
+        return min(accurate, key=lambda row: row.seconds, default=None)
 
     def summary(self) -> str:
         """Return the fastest method for each of `SHOWN_ERRORS`, and the omitted tiers, as text."""
         lines = [
             f"{self.quantity.replace('_', ' ')}: {len(self.rows)} methods, error of the reference {self.reference_error:.1e}"
         ]
-        for wanted in SHOWN_ERRORS:
-            row = self.cheapest(wanted)
-            way = "none here" if row is None else f"{', '.join(x for x in row[:4] if x)}: {row.seconds:.3g} s"
-            lines.append(f"  to {wanted:.0e}: {way}")
+        for limit in SHOWN_ERRORS:
+            row = self.cheapest(limit)
+            method = "none here" if row is None else f"{', '.join(x for x in row[:4] if x)}: {row.seconds:.3g} s"
+            lines.append(f"  to {limit:.0e}: {method}")
         return "\n".join([*lines, *(f"  {reason}" for reason in self.left_out)])
 
     @validated
@@ -96,8 +101,10 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
 
     Rings mark the fastest method for each of `SHOWN_ERRORS`.
 
-    **Arguments**: `costs`: a mapping from the title of each panel to its `Cost`; `ax`: as many axes to draw onto. **Returns**
-    a matplotlib figure, or the given `ax`.
+    **Arguments**: `costs`: a mapping from the title of each panel to its `Cost`; typical: 1 to 4 panels; `ax`: as many axes;
+    default: a new figure.
+
+    **Returns** a matplotlib figure, or the given `ax`.
 
     >>> import jaxvib as jv
     >>> rows = [CostRow("full", "Tsit5", "float64", f"{error:.0e}", error, seconds, 1.0)
@@ -124,7 +131,7 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
 
 
 def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
-    """Return the result of a call, the time of the fastest call, and the additional time of the first one, s."""
+    """Return the result of a call, the time of the fastest repetition, s, and the additional time of the first call, s."""
     begun = time.perf_counter()
     value = jax.block_until_ready(call())
     first, best, spent = time.perf_counter() - begun, np.inf, 0.0

@@ -20,15 +20,17 @@ SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
 
 
 class ExactJam(NamedTuple):
-    """Exact jam with many collocation points (`fine`), and with fewer (`coarse`) to estimate its error."""
+    """Exact jam of a `mode` with many collocation points (`fine`), and with fewer points (`coarse`), which gives the error."""
 
     mode: int
     fine: Orbit
     coarse: Orbit
 
     def length(self, scene: Scene, tolerance: float) -> float:
-        """Return the duration, s, of a run to a stable jam: the time in which deviations of its start decay to the tolerance,
-        plus the measuring window."""
+        """Return the duration, s, of a run to a stable jam, at most 2000 slow periods.
+
+        It is the time in which deviations of the start decay to the tolerance, plus the measuring window of 20 slow periods.
+        """
         rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
         window = slow_period(scene) * SLOW_PERIODS
         return min(window + np.log(1.0 / tolerance) / rate, slow_period(scene) * MOST_PERIODS)
@@ -54,17 +56,17 @@ def usual_mode(scene: Scene) -> int:
     rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
     if not rising:
         raise InputError("mode", "is missing, and no jam mode of this scene is stable by slope; give its number")
-    return rising[-2] if len(rising) > 1 else rising[-1]  # the loads of the last one turn almost with the rotor
+    return rising[-2] if len(rising) > 1 else rising[-1]  # in the last mode the loads turn almost with the rotor
 
 
 def collocation_points(scene: Scene, points: int) -> int:
-    """Return the number of collocation points: `points` on half a period, or the same spacing on a whole period without
-    half-turn symmetry."""
+    """Return the number of collocation points: `points` on half a period for a scene with half-turn symmetry, otherwise
+    2 `points` + 1 on the whole period."""
     return points if has_half_turn_symmetry(scene.all_effects) else 2 * points + 1
 
 
 def slow_period(scene: Scene) -> float:
-    """Return the slow period, s: the longest natural period of the carrier."""
+    """Return the slow period, s: the longest natural period of the carrier; a frequency of 0 is replaced by the rotor speed."""
     frequencies = natural_frequencies(scene)
     return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
 

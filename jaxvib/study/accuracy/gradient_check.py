@@ -34,8 +34,8 @@ _NOISE_FACTOR = 3.0
 """Factor on the error of finite differences below which a deviation counts as noise."""
 
 _MIN_LARGE_CHANGE, _MAX_ROUNDING_CHANGE = 1e-2, 1e4 * float(np.finfo(float).eps)
-"""Share of the largest change above which a change counts as about equally large; share of the quantity below which a change
-counts as rounding."""
+"""Share of the largest change above which the change at a small step counts as large; share of the quantity below which a
+change counts as rounding."""
 
 
 class GradientStatus(eqx.Enumeration):
@@ -121,9 +121,9 @@ class GradientCheck(Result):
             worst = np.max(np.where(np.isfinite(self.error), self.error, np.inf), axis=0)
         lines = [f"{self.message} (relative tolerance {self.tolerance:.0e}); numbers are p dq/dp, p: parameter, q: quantity"]
         for i in np.argsort(-worst):
-            found = ", ".join(f"{route} differs by {self.error[k, i]:.1e}" for k, route in enumerate(self.routes))
+            deviations = ", ".join(f"{route} differs by {self.error[k, i]:.1e}" for k, route in enumerate(self.routes))
             floor = f"finite differences accurate to {self.noise[i] / scale[i]:.1e} at a step of {self.step[i]:.1e}"
-            lines.append(f"  {self.numbers[i]}: {self.difference[i]:.9g}; {found}; {floor}")
+            lines.append(f"  {self.numbers[i]}: {self.difference[i]:.9g}; {deviations}; {floor}")
         if self.left_out:
             lines.append(f"  left out, at a bound: {', '.join(self.left_out)}")
         return "\n".join(lines)
@@ -162,7 +162,7 @@ def check_gradients(
     implicit: ImplicitRoute | None = None,
     tolerance: float = 1e-5,
 ) -> GradientCheck:
-    """Compare the derivatives of a quantity of a scene, by each route, with finite differences; useful in your own tests.
+    """Compare the derivatives of a quantity of a scene, by each route, with finite differences.
 
     Each parameter p of the scene is changed by relative steps h from 1e-2 to 1e-7. The central differences D are extrapolated
     once, which gives E:
@@ -173,9 +173,9 @@ def check_gradients(
       of these two differences is the possible error of E, called noise. Its causes are truncation at large steps, and rounding
       (at least eps |q|/h) and the tolerance of the quantity itself at small steps
     - A derivative differs if its distance from E is more than `tolerance` plus three times the noise
-    - The status is `chaotic`, even if the routes agree, if two conditions are met: steps of 1e-5 to 1e-7 change the quantity
-      about as much as the largest step, and a derivative predicts a change of this size for the smallest step. Disturbances
-      have then grown by more than 1e5. `growth` gives the time after which this happens
+    - The status is `chaotic`, even if the routes agree, if two conditions are met: steps of 1e-5 to 1e-7 change the quantity by
+      more than a hundredth of the largest change, and a derivative predicts such a change for the smallest step. Disturbances
+      have then grown by about 1e5. `growth` gives the time after which this happens
 
     **Arguments**
 
@@ -208,48 +208,50 @@ def check_gradients(
     scene = validate_scene(scene)
     if scene.drive.speed.dtype.itemsize < 8:
         raise InputError("scene", "is in single precision; differences need double: switch JAX to float64 before it is made")
-    asked = tuple(_MODES) if routes is None else routes
-    unknown = [route for route in asked if route not in _MODES]
-    if unknown or not (asked or implicit):
-        raise InputError("routes", f"are {quoted(list(asked))}; name some of {', '.join(_MODES)}")
+    requested = tuple(_MODES) if routes is None else routes
+    unknown = [route for route in requested if route not in _MODES]
+    if unknown or not (requested or implicit):
+        raise InputError("routes", f"are {quoted(list(requested))}; name some of {', '.join(_MODES)}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
         raise InputError("tolerance", f"is {quoted(tolerance)}; it must be a number between 0 and 1, such as 1e-5")
     numbers, scales, left_out = _changeable_parameters(scene, free)
-    at = np.asarray([float(each.read(scene)[0]) for each in numbers])
+    at = np.asarray([float(parameter.read(scene)[0]) for parameter in numbers])
 
     def put(shares: Array) -> Scene:
         return put_numbers(scene, numbers, at + shares * scales)
 
     def quantity_at(shares: Array) -> Array:
         """Return the quantity with each parameter changed by `shares` (n,) of its size."""
-        given = call_user(quantity, "quantity", put(shares))
-        if not is_real(given):
-            raise InputError("quantity", f"gives {quoted(given)}; it must give one real number")
-        return jnp.asarray(given)
+        returned = call_user(quantity, "quantity", put(shares))
+        if not is_real(returned):
+            raise InputError("quantity", f"gives {quoted(returned)}; it must give one real number")
+        return jnp.asarray(returned)
 
     no_change = jnp.zeros(len(numbers))
     value = quantity_at(no_change)
     if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
         raise InputError("quantity", f"gives {value.dtype} of shape {value.shape}; it must give one real number")
-    gradient = _gradients(quantity_at, no_change, asked, only_supported=routes is None)
+    gradient = _gradients(quantity_at, no_change, requested, only_supported=routes is None)
     if implicit is not None:
         gradient["implicit"] = np.asarray(_implicit(implicit, put, no_change), float)
-    sweep = np.asarray([[_central(quantity_at, len(numbers), i, h) for h in _DIFFERENCE_STEPS] for i in range(len(numbers))])
-    difference, noise, best = (np.asarray(x) for x in zip(*(_extrapolated(row, float(value)) for row in sweep), strict=True))
-    scale, routed = _scale(difference), np.stack(list(gradient.values()))
-    away = np.abs(routed - difference)
-    parts = any(_is_chaotic(row, slopes, float(value)) for row, slopes in zip(sweep, routed.T, strict=True))
+    sweep = np.asarray(
+        [[_central_difference(quantity_at, len(numbers), i, h) for h in _DIFFERENCE_STEPS] for i in range(len(numbers))]
+    )
+    difference, noise, best = (np.asarray(x) for x in zip(*(_extrapolate(row, float(value)) for row in sweep), strict=True))
+    scale, by_route = _scale(difference), np.stack(list(gradient.values()))
+    deviation = np.abs(by_route - difference)
+    is_chaotic = any(_is_chaotic(row, slopes, float(value)) for row, slopes in zip(sweep, by_route.T, strict=True))
     return GradientCheck(
-        status=member(GradientStatus, "chaotic" if parts else _compare_derivatives(away, noise, scale, tolerance)),
+        status=member(GradientStatus, "chaotic" if is_chaotic else _compare_derivatives(deviation, noise, scale, tolerance)),
         value=float(value),
-        numbers=tuple(each.name for each in numbers),
+        numbers=tuple(parameter.name for parameter in numbers),
         at=at,
         routes=tuple(gradient),
-        gradient=routed,
+        gradient=by_route,
         difference=difference,
         noise=noise,
         step=best,
-        error=away / scale,
+        error=deviation / scale,
         steps=np.asarray(_DIFFERENCE_STEPS),
         sweep=sweep,
         tolerance=float(tolerance),
@@ -260,16 +262,16 @@ def check_gradients(
 def _gradients(
     quantity_at: Callable[[Array], Array], at: Array, routes: Sequence[str], *, only_supported: bool
 ) -> dict[str, np.ndarray]:
-    """Return the derivatives (n,) by each route; with `only_supported`, forward mode is left out for runs that do not support
-    it."""
-    found: dict[str, np.ndarray] = {}
+    """Return the derivatives (n,) by each route. If `only_supported` is True, a mode that the runs in the quantity do not
+    support is left out; otherwise it raises an error."""
+    gradients: dict[str, np.ndarray] = {}
     for route in routes:
         try:
-            found[route] = np.asarray(_MODES[route](quantity_at)(at), float)
+            gradients[route] = np.asarray(_MODES[route](quantity_at)(at), float)
         except InputError as error:
             if not only_supported or error.field != "adjoint":
                 raise
-    return found
+    return gradients
 
 
 _MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]] = {"forward": jax.jacfwd, "reverse": jax.grad}
@@ -277,38 +279,38 @@ _MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]
 
 def _changeable_parameters(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber], np.ndarray, tuple[str, ...]]:
     """Return the checked parameters, the sizes to which their steps are relative, and the names of parameters at a bound."""
-    found, scales, left_out = [], [], []
+    parameters, scales, left_out = [], [], []
     for name in numbers_of(scene) if free is None else free:
-        for each in find_number(scene, name, "free").single(scene):
-            value = float(each.read(scene)[0])
-            scale = value or each.spec.typical or 0.0
+        for parameter in find_number(scene, name, "free").single(scene):
+            value = float(parameter.read(scene)[0])
+            scale = value or parameter.spec.typical or 0.0
             ends = value + _DIFFERENCE_STEPS[0] * scale * np.asarray([-1.0, 1.0])
-            if scale and np.all(each.spec.bounds.allow(ends)):
-                found.append(each)
+            if scale and np.all(parameter.spec.bounds.allow(ends)):
+                parameters.append(parameter)
                 scales.append(scale)
             else:
-                left_out.append(each.name)
-    if not found:
+                left_out.append(parameter.name)
+    if not parameters:
         raise InputError(
             "free", "contains no parameter that can change in both directions; name parameters that are not at their bounds"
         )
-    return found, np.asarray(scales), tuple(left_out)
+    return parameters, np.asarray(scales), tuple(left_out)
 
 
-def _central(quantity_at: Callable[[Array], Array], n: int, i: int, step: float) -> float:
+def _central_difference(quantity_at: Callable[[Array], Array], n: int, i: int, step: float) -> float:
     move = jnp.asarray(np.eye(n)[i] * step)
     return (float(quantity_at(move)) - float(quantity_at(-move))) / (2.0 * step)
 
 
-def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, float]:
-    """Return the derivative from central differences (k,) with decreasing steps, its error, and the best step."""
-    better = central[1:] + (central[1:] - central[:-1]) / (_STEP_RATIO**2 - 1.0)
-    apart = np.abs(np.diff(better))
+def _extrapolate(central: np.ndarray, value: float) -> tuple[float, float, float]:
+    """Return the derivative from central differences (k,) with decreasing steps, its possible error, and the best step."""
+    extrapolated = central[1:] + (central[1:] - central[:-1]) / (_STEP_RATIO**2 - 1.0)
+    changes = np.abs(np.diff(extrapolated))
     rounding = np.finfo(float).eps * abs(value) / np.asarray(_DIFFERENCE_STEPS[2:-1])
-    noise = np.maximum(np.maximum(apart[:-1], apart[1:]), rounding)
+    noise = np.maximum(np.maximum(changes[:-1], changes[1:]), rounding)
     # Steps below the resolution of the quantity give differences that agree with each other, but not with those of larger
     # steps.
-    inner = better[1:-1]
+    inner = extrapolated[1:-1]
     for k in range(1, noise.size):
         with np.errstate(invalid="ignore"):
             if np.any(np.abs(inner[k] - inner[:k]) > noise[:k] + noise[k]):
@@ -320,29 +322,31 @@ def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, floa
 
 
 def _is_chaotic(central: np.ndarray, slopes: np.ndarray, value: float) -> bool:
-    """Return True if small steps change the quantity as much as large ones, and a derivative (r,) predicts such a change.
+    """Return True if small steps change the quantity about as much as large steps, and a derivative predicts such a change.
+
+    **Arguments**: `central` (k,): central differences for all steps; `slopes` (r,): derivatives by each route.
 
     Noise also causes changes at small steps, but not large derivatives; a wrong derivative does not cause changes of the
     quantity.
     """
-    changed = 2.0 * np.abs(central) * np.asarray(_DIFFERENCE_STEPS)
-    most, small = float(np.max(changed)), float(np.median(changed[-5:]))
-    claimed = np.abs(slopes) * 2.0 * _DIFFERENCE_STEPS[-1]
-    return small > max(_MIN_LARGE_CHANGE * most, _MAX_ROUNDING_CHANGE * abs(value)) and bool(
-        np.any(claimed > _MIN_LARGE_CHANGE * most)
+    changes = 2.0 * np.abs(central) * np.asarray(_DIFFERENCE_STEPS)
+    largest, typical_small = float(np.max(changes)), float(np.median(changes[-5:]))
+    predicted = np.abs(slopes) * 2.0 * _DIFFERENCE_STEPS[-1]
+    return typical_small > max(_MIN_LARGE_CHANGE * largest, _MAX_ROUNDING_CHANGE * abs(value)) and bool(
+        np.any(predicted > _MIN_LARGE_CHANGE * largest)
     )
 
 
 def _scale(difference: np.ndarray) -> np.ndarray:
     size = np.abs(difference)
-    most = np.max(size[np.isfinite(size)], initial=0.0)
-    return np.maximum(size, _SMALL_DERIVATIVE_SHARE * most if most > 0.0 else np.finfo(float).tiny)
+    largest = np.max(size[np.isfinite(size)], initial=0.0)
+    return np.maximum(size, _SMALL_DERIVATIVE_SHARE * largest if largest > 0.0 else np.finfo(float).tiny)
 
 
-def _compare_derivatives(away: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: float) -> str:
-    if not (np.all(np.isfinite(away)) and np.all(np.isfinite(noise))):
+def _compare_derivatives(deviation: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: float) -> str:
+    if not (np.all(np.isfinite(deviation)) and np.all(np.isfinite(noise))):
         return "not_finite"
-    if np.any(away > tolerance * scale + _NOISE_FACTOR * noise):
+    if np.any(deviation > tolerance * scale + _NOISE_FACTOR * noise):
         return "differ"
     return "noisy" if np.any(_NOISE_FACTOR * noise > tolerance * scale) else "agree"
 

@@ -27,8 +27,8 @@ _GRADIENT_TOLERANCE = 1e-8
 _MAX_RECORDED_STEPS = 2**17
 """Maximum number of steps of a run with derivatives; such a run stores the end of each step."""
 
-_supports = operator.attrgetter("machine.stiffness")
-"""Stiffnesses of the supports of a scene."""
+_support_stiffness = operator.attrgetter("machine.stiffness")
+"""Function that returns the stiffnesses of the supports of a scene."""
 
 _Way: TypeAlias = tuple[str, str, str, Callable[[Array], Array | np.ndarray]]
 """Names of tier, method and setting, and the function from stiffnesses to the gradient."""
@@ -39,34 +39,36 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
 
     See `work_precision`.
     """
-    mode, supports = jam.mode, _supports(scene)
+    mode, supports = jam.mode, _support_stiffness(scene)
     stiffness = jnp.ravel(supports)
-    few, more, most = (collocation_points(scene, points) for points in (16, 24, 32))
+    points_coarse, points_medium, points_fine = (collocation_points(scene, points) for points in (16, 24, 32))
 
-    def at(k: Array) -> Scene:
-        return eqx.tree_at(_supports, scene, k.reshape(supports.shape))
+    def scene_with(k: Array) -> Scene:
+        return eqx.tree_at(_support_stiffness, scene, k.reshape(supports.shape))
 
-    def exact(k: Array, points: int = few) -> Array:
-        return jnp.max(jam_orbit(at(k), mode=mode, points=points).amplitude)
+    def exact_amplitude(k: Array, points: int = points_coarse) -> Array:
+        return jnp.max(jam_orbit(scene_with(k), mode=mode, points=points).amplitude)
 
-    def leading(k: Array) -> Array:
-        return jnp.max(jam_modes(at(k)).select(mode).amplitude)
+    def leading_amplitude(k: Array) -> Array:
+        return jnp.max(jam_modes(scene_with(k)).select(mode).amplitude)
 
-    fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
+    fine, coarse = (
+        np.asarray(jax.jacfwd(lambda k, p=p: exact_amplitude(k, p))(stiffness)) for p in (points_fine, points_medium)
+    )
     ways: list[_Way] = [
-        ("exact orbit", "implicit, reverse", f"{few} points", jax.jit(jax.grad(exact))),
-        ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
+        ("exact orbit", "implicit, reverse", f"{points_coarse} points", jax.jit(jax.grad(exact_amplitude))),
+        ("exact orbit", "implicit, forward", f"{points_coarse} points", jax.jit(jax.jacfwd(exact_amplitude))),
     ]
     left_out: list[str] = []
     light = jam_modes(scene).select(mode, throw=False)
     if not bool(light.status == JamStatus.found):
         left_out = [f"leading order, and full, which starts from it: {light.message}"]
     else:
-        ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
+        ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading_amplitude))))
         if not bool(jam.fine.stable):
             left_out = [unstable_reason("full", jam)]
         else:
-            ways += _by_runs(scene, at, jam, end)
+            ways += _ways_by_runs(scene, scene_with, jam, end)
     rows = [
         row_of(tier, method, setting, lambda f=f: f(stiffness), lambda slope: relative(slope, fine), repeats)
         for tier, method, setting, f in ways
@@ -74,14 +76,18 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
     return Cost("gradient", fine.tolist(), relative(coarse, fine), rows, tuple(left_out))
 
 
-def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
-    """Return the ways to compute the gradient from runs that start near a stable jam; `at(k)`: scene with stiffnesses k."""
+def _ways_by_runs(scene: Scene, scene_with: Callable[[Array], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
+    """Return the ways to compute the gradient from runs that start near a stable jam.
+
+    **Arguments**: `scene_with(k)`: the scene with the stiffnesses k (n,); `end` of the runs, s, None for that of
+    `ExactJam.length`.
+    """
     until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
     max_steps = min(enough_steps(frequency_bounds(scene)[0], jnp.asarray(until)), _MAX_RECORDED_STEPS)
 
-    def full(k: Array, adjoint: diffrax.AbstractAdjoint | None = None) -> Array:
+    def amplitude_of_run(k: Array, adjoint: diffrax.AbstractAdjoint | None = None) -> Array:
         run = simulate(
-            at(k),
+            scene_with(k),
             until,
             start="jam",
             mode=jam.mode,
@@ -93,10 +99,10 @@ def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: flo
         )
         return jnp.max(run.amplitude)
 
-    value = eqx.filter_jit(full)
+    value = eqx.filter_jit(amplitude_of_run)
     ways: list[tuple[str, Callable[[Array], Array | np.ndarray]]] = [
-        ("forward", jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
-        ("reverse", jax.jit(jax.grad(full))),
+        ("forward", jax.jit(jax.jacfwd(lambda k: amplitude_of_run(k, diffrax.ForwardMode())))),
+        ("reverse", jax.jit(jax.grad(amplitude_of_run))),
         ("finite differences", lambda k: _differences(value, k)),
     ]
     return [("full", name, f"{_GRADIENT_TOLERANCE:.0e}", way) for name, way in ways]
@@ -105,11 +111,11 @@ def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: flo
 def _differences(value: Callable[[Array], Array], at: Array) -> np.ndarray:
     """Return central differences with relative steps of 1e-5.
 
-    The entry of a stiffness that is 0 is 0, because its step would be 0.
+    For a stiffness of 0 the difference is set to 0, because its step would be 0.
     """
     steps = 1e-5 * np.asarray(at)
-    whole = np.zeros(len(steps))
+    gradient = np.zeros(len(steps))
     for k in np.flatnonzero(steps):
         move = np.eye(len(steps))[k] * steps[k]
-        whole[k] = (float(value(at + move)) - float(value(at - move))) / (2.0 * steps[k])
-    return whole
+        gradient[k] = (float(value(at + move)) - float(value(at - move))) / (2.0 * steps[k])
+    return gradient

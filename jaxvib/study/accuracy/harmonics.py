@@ -52,7 +52,7 @@ class HarmonicConvergence(Result):
         return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {estimate:.1e}" for n, error, estimate in rows)
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the error over the highest harmonic, a line for each load speed; estimates dashed.
+        """Plot the error over the highest harmonic, with a line for each load speed; the estimates are dashed lines.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -66,13 +66,13 @@ class HarmonicConvergence(Result):
 def harmonic_convergence(
     scene: Scene, omega: Sequence[Number], *, points: Sequence[int] = (4, 6, 8, 10, 12, 16, 20, 24)
 ) -> HarmonicConvergence:
-    """Return the error of exact jams over the number of collocation points; it decreases exponentially (spectral convergence).
+    """Return the errors of exact jams for several numbers of collocation points; they decrease exponentially.
 
     **Arguments**
 
     - `scene` of the jams
     - `omega`: load speeds, rad/s or text; typical: 1 to 5 speeds on the branch
-    - `points` of the collocation, ascending, see `jam_orbit`; typical: 4 to 24 (the default)
+    - `points`: numbers of collocation points, ascending, see `jam_orbit`; typical: 4 to 24 (the default)
 
     **Returns** `HarmonicConvergence`. **Raises** `InputError` if the points do not ascend, or if a speed is not positive.
 
@@ -100,8 +100,8 @@ def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
     model = jammed_bodies(jammed_model(scene))
     grid = grid_of(points, model.half_turn)
 
-    def one(w: Array) -> tuple[Array, Array]:
+    def speed_and_error(w: Array) -> tuple[Array, Array]:
         motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
         return motion.rotor_speed, branch_tangent(model, grid, motion).speed_error
 
-    return jax.vmap(one)(omega)
+    return jax.vmap(speed_and_error)(omega)

@@ -22,8 +22,11 @@ from jaxvib.units import numbers
 
 
 class TierValues(eqx.Module):
-    """Results of one tier, NaN if missing: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N, `stable` (n,);
-    `message` (n,): the outcome of each computation as a sentence, with the reason for a missing result."""
+    """Results of one tier for n masses, NaN for a missing result.
+
+    **Attributes**: `omega` (n,), rad/s; `amplitude` (n, nd), m (tilts: rad), and `foundation_force` (n,), N, zero to peak;
+    `stable` (n,); `message` (n,): the outcome of each computation as a sentence, with the reason for a missing result.
+    """
 
     omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "mass"))
     amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "mass", "coordinate"))
@@ -33,8 +36,11 @@ class TierValues(eqx.Module):
 
 
 class Tiers(Result):
-    """Jams by two tiers over the mass of a load: `mass` (n,), kg (the mean if loads differ); `leading` and `exact`:
-    `TierValues`."""
+    """Jams by two tiers over the mass of a load.
+
+    **Attributes**: `mass` (n,) of one load, kg (the mean if loads differ); `leading` and `exact`: `TierValues` of the two
+    tiers.
+    """
 
     status = Computed.done
 
@@ -81,7 +87,7 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
     **Arguments**
 
     - `scene` of the jam
-    - `factors` on the mass (and inertia) of the loads; typical: 0.1 to 10
+    - `factors` on the mass, and on the moment of inertia, of the loads; typical: 0.1 to 10
     - `mode`: a jam mode, see `jam_modes`; typical: 1, 3, 5
 
     **Returns** `Tiers`. **Raises** `InputError` for a mode out of 1 .. 2 nd + 1.
@@ -104,8 +110,10 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
             (loads.mass * factor, loads.drag * factor**2, None if loads.inertia is None else loads.inertia * factor),
             is_leaf=lambda x: x is None,
         )
-        now = eqx.tree_at(lambda s: s.loads, scene, heavier)
-        jams_of_masses.append((jam_modes(now).select(mode, throw=False), jam_orbit(now, mode=mode, throw=False)))
+        scene_of_mass = eqx.tree_at(lambda s: s.loads, scene, heavier)
+        jams_of_masses.append(
+            (jam_modes(scene_of_mass).select(mode, throw=False), jam_orbit(scene_of_mass, mode=mode, throw=False))
+        )
 
     def tier(which: int) -> TierValues:
         jams = [jams[which] for jams in jams_of_masses]

@@ -72,7 +72,7 @@ def work_precision(
     repeats: int = 3,
     progress: Callable[[str, float], None] | None = None,
 ) -> Cost:
-    """Compute a quantity of a scene by every tier, method, tolerance and dtype, with its error and computing time.
+    """Compute a quantity of a scene by every tier, method, tolerance and dtype, and measure its error and computing time.
 
     - "amplitude" and "foundation_force" of a jam mode, if exact jams of the scene can be computed. The tiers are leading order,
       exact orbit, averaged equations and full equations; the last two are integrated from the leading-order motion. The
@@ -93,17 +93,18 @@ def work_precision(
     - `quantity`: one of `QUANTITIES`, the names above
     - `mode`: a jam mode; default: the second-highest mode that is stable by slope, or the only one (in the highest mode the
       loads turn almost with the rotor)
-    - `until`, s or text; default: 20 times the longest natural period of the carrier. For a jam, the time is added in which
-      deviations of the start decay to the tolerance of the run, according to the largest Floquet multiplier
+    - `until`: end of the runs, s or text; default: 20 times the longest natural period of the carrier. For a jam, the time is
+      added in which deviations of the start decay to the tolerance of the run, according to the largest Floquet multiplier, up
+      to a total of 2000 times this period
     - `tolerances` of time integration, at least one; typical: 1e-3 to 1e-11 (the default)
     - `solvers`: names of methods from `SOLVERS`
     - `repeats`: number of timings of each method, fewer if a call takes seconds; the shortest time is reported; typical: 3 (the
       default)
-    - `progress`: a function that is called with the name of each method and the finished share of all of them (0 to 1); not
-      for the "gradient"
+    - `progress`: a function that is called with the name of each method and the finished share of all methods (0 to 1); it is
+      not called for the "gradient"
 
-    **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, no tolerance, a scene in single precision, a
-    gradient of a scene without an exact jam; and the errors of `jam_modes` and `simulate`.
+    **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, an empty list of tolerances, a scene in
+    single precision, and a gradient of a scene without an exact jam; and the errors of `jam_modes` and `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -155,9 +156,9 @@ class _Request:
         """Return the row of a method, and report it to `progress`."""
         if self.progress is not None:
             single = len(self.tolerances) if "default" in self.solvers else 0
-            most = 2 + len(_ORBIT_POINTS) + len(_ENVELOPE_TOLERANCES) + len(self.tolerances) * len(self.solvers) + single
+            row_count = 2 + len(_ORBIT_POINTS) + len(_ENVELOPE_TOLERANCES) + len(self.tolerances) * len(self.solvers) + single
             name = ", ".join(filter(None, (tier, method, setting)))
-            call_user(self.progress, "progress", name, min(self.finished / most, 1.0))
+            call_user(self.progress, "progress", name, min(self.finished / row_count, 1.0))
         self.finished += 1
         return row_of(tier, method, setting, call, error, self.repeats, dtype)
 
@@ -209,7 +210,7 @@ def _steady(request: _Request, quantity: str, jam: ExactJam, end: float | None) 
 
 
 def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str) -> Cost:
-    """Return the cost of a quantity of a motion without a jam, measured at the end of a run from rest."""
+    """Return the cost of a quantity of a scene without an exact jam, measured at the end of a run from rest."""
     end = SLOW_PERIODS * slow_period(request.scene) if end is None else end
 
     def read(found: Result) -> Array:
@@ -219,8 +220,8 @@ def _at_the_end(request: _Request, quantity: str, end: float | None, reason: str
 
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
-        """Return the reference value. It is computed at its first use, so that the compilation of its program is timed in a
-        row."""
+        """Return the reference value. It is computed when it is first used, after the timing of the first row; otherwise the
+        compilation of its program would be missing in the times of that row."""
         run = simulate(request.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
         return np.ravel(np.asarray(read(run), float))
 
@@ -235,7 +236,10 @@ def _integrated(
     start: State,
     length: Callable[[float], float],
 ) -> tuple[list[CostRow], list[str]]:
-    """Return rows of the quantity at the end of averaged and full runs, with a `length` for each tolerance."""
+    """Return rows of the quantity at the end of averaged and full runs, and reasons for rows that are left out.
+
+    **Arguments**: `length(tolerance)`: duration of a run, s.
+    """
     full, rows, left_out = _full(request, start, length, lambda run: error(read(run))), [], []
     for tolerance in _ENVELOPE_TOLERANCES:
         end = length(tolerance)
@@ -253,12 +257,13 @@ def _integrated(
 
 
 def _full(request: _Request, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
-    """Return rows of full runs by every solver to every tolerance, in double and (default method) in single precision."""
+    """Return rows of full runs by every solver with every tolerance, in double precision, and by the default method also in
+    single precision."""
     ends = {tolerance: length(tolerance) for tolerance in request.tolerances}
     fastest, _ = frequency_bounds(request.scene)
-    steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # one number for all runs, since it is part of the program
+    steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # the same for all runs, because it is part of the program
 
-    def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:
+    def rows(scene: Scene, start: State, name: str, dtype: str, min_tolerance: float = 0.0) -> list[CostRow]:
         solver = SOLVERS[name]()
 
         def run(tolerance: float) -> Run:
@@ -277,14 +282,14 @@ def _full(request: _Request, start: State, length: Callable[[float], float], err
         return [
             request.row("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, dtype)
             for tolerance in request.tolerances
-            if tolerance >= least
+            if tolerance >= min_tolerance
         ]
 
-    found = [row for name in request.solvers for row in rows(request.scene, start, name, "float64")]
+    all_rows = [row for name in request.solvers for row in rows(request.scene, start, name, "float64")]
     if "default" in request.solvers:
         with jax.enable_x64(False):
-            found += rows(_single(request.scene), _single(start), "default", "float32", _MIN_SINGLE_TOLERANCE)
-    return found
+            all_rows += rows(_single(request.scene), _single(start), "default", "float32", _MIN_SINGLE_TOLERANCE)
+    return all_rows
 
 
 def _compiled(function: Callable[[Scene], Array], scene: Scene) -> Callable[[], Array]:
@@ -294,22 +299,22 @@ def _compiled(function: Callable[[Scene], Array], scene: Scene) -> Callable[[], 
 
 def _final_state(request: _Request, end: float | None) -> Cost:
     end = SLOW_PERIODS * slow_period(request.scene) if end is None else end
-    best = functools.cache(lambda: simulate(request.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
+    reference_run = functools.cache(lambda: simulate(request.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
 
     @functools.cache
     def scale() -> State:
-        return error_scale(best().window.state, natural_units(request.scene))
+        return error_scale(reference_run().window.state, natural_units(request.scene))
 
     def error(run: Run) -> float:
-        last, exact = _last(run), _last(best())
+        last, exact = _last(run), _last(reference_run())
         single = run.error.dtype.itemsize < 8  # in single precision the number of whole turns of angles is unknown
         value = float(scaled_error(with_nearest_turns(last, exact) if single else last, exact, scale()))
         return value if np.isfinite(value) else np.inf
 
     rows = _full(request, initial_state(request.scene), lambda tolerance: end, error)
     reason = "leading order, exact orbit, envelope: these do not determine the phase, which is part of the final state"
-    parts = jax.tree.leaves(jax.tree.map(lambda x, unit: np.ravel(x / unit), _last(best()), scale()))
-    return Cost("final_state", np.concatenate(parts).tolist(), float(best().error), rows, (reason,))
+    scaled_entries = jax.tree.leaves(jax.tree.map(lambda x, unit: np.ravel(x / unit), _last(reference_run()), scale()))
+    return Cost("final_state", np.concatenate(scaled_entries).tolist(), float(reference_run().error), rows, (reason,))
 
 
 def _last(run: Run) -> State:

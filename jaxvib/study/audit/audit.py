@@ -29,7 +29,7 @@ from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number
 
 _TIER_STEPS = 3
-"""Time of the comparison of all tiers, in times of one effect, for the share that `progress` reports."""
+"""Assumed time of the comparison of all tiers, in units of the time of one effect, for the share that `progress` reports."""
 
 
 class AuditStatus(eqx.Enumeration):
@@ -82,12 +82,12 @@ class Audit(Result):
         lines = [f"{self.motion}: {self.kind}; {self.message}"]
         for row in self.effects:
             change = "change unknown" if math.isnan(row.change) else f"changes up to {100.0 * row.change:.3g} %"
-            where = "" if row.present else ", not in the scene"
-            lines.append(f"  {row.effect}{where}: {row.advice} ({change}, {row.operations:+d} operations)")
+            presence = "" if row.present else ", not in the scene"
+            lines.append(f"  {row.effect}{presence}: {row.advice} ({change}, {row.operations:+d} operations)")
         for tier in self.tiers:
             lines.append(f"  {tier.tier}: {tier.words()}")
-        for found in self.numbers:
-            lines.append(f"  {found.name} = {found.value:.3g}: {found.advice}; {found.note}")
+        for number_row in self.numbers:
+            lines.append(f"  {number_row.name} = {number_row.value:.3g}: {number_row.advice}; {number_row.note}")
         return "\n".join(lines)
 
     @validated
@@ -118,9 +118,9 @@ def audit(
     repeats: int = 3,
     progress: Callable[[str, float], None] | None = None,
 ) -> Audit:
-    """Compute by how much each effect and each tier changes the results of a scene, and their cost.
+    """Compute by how much each effect and each tier changes the results of a scene, and the cost of each.
 
-    The audit shows which effects are negligible, and which ones the scene lacks.
+    The audit shows which effects of a scene are negligible, and which effects the scene lacks.
 
     - Each effect of the scene is removed. Each effect that the scene lacks and could have is added, with typical values
       (`Effect.typical`). The same quantities of both scenes are compared
@@ -135,12 +135,12 @@ def audit(
     - `scene` to audit
     - `accuracy`: the relative change below which an effect is negligible; typical: 0.001 to 0.05 (default 0.01)
     - `mode`: the jam mode; default: the second-highest of the modes that are stable by slope, or the only one
-    - `until`, s or text: the end of a run; default: 100 times the longest natural period of the carrier, plus twice the time of
+    - `until`: the end of a run, s or text; default: 100 times the longest natural period of the carrier, plus twice the time of
       the last jump of the drive's acceleration
     - `start` of the run: "rest", "turning" (loads evenly spread, at the rotor speed) or a `State`. If it is given, a run is
       compared, and not a jam; default of the run: "turning" if the rotor speed is constant, otherwise "rest"
-    - `possible`: effects to add, in place of those of the package; `()` for none
-    - `tiers`: True to compute every tier as well
+    - `possible`: effects to add, in place of the effects of the package; typical: 1 to 3 effects; `()` for none
+    - `tiers`: True (the default) to compute every tier as well
     - `repeats`: number of timings of a run of 100 turns, of which the shortest is reported; typical: 3 (the default); 0 for no
       timings, which saves a compilation for each effect
     - `progress`: a function that is called with the name of each step and the finished share of all steps (0 to 1)
@@ -171,15 +171,15 @@ def audit(
     comparison, description = _comparison(scene, mode, end, start)
     repeated = RepeatedComparison(comparison, repeats)
     report("the scene", 0.0)
-    own = repeated.values(scene, repeated.tier(scene))
+    values = repeated.values(scene, repeated.tier(scene))
     until = comparison.until if isinstance(comparison, RunComparison) else None
     # The scale of a machine that almost does not move is the unbalance radius of its loads.
-    amplitude = [a * (own.magnified / MIN_AMPLITUDE_SHARE if own.magnified > 1.0 else 1.0) for a in own.amplitude]
+    amplitude = [a * (values.magnified / MIN_AMPLITUDE_SHARE if values.magnified > 1.0 else 1.0) for a in values.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     status = "done"
-    if not np.isfinite(own.omega):
+    if not np.isfinite(values.omega):
         status = "failed"
-    elif not own.uncertainty <= 0.5 * accuracy:
+    elif not values.uncertainty <= 0.5 * accuracy:
         status = "unsettled"
     seconds, compiling = repeated.times(scene)
     steps = 1 + len(variants) + (_TIER_STEPS if tiers else 0)
@@ -193,23 +193,23 @@ def audit(
         status=member(AuditStatus, status),
         accuracy=float(accuracy),
         motion=description,
-        kind=own.words,
-        omega=own.omega,
-        amplitude=np.asarray(own.amplitude),
-        foundation_force=own.foundation_force,
-        fold=own.fold,
+        kind=values.words,
+        omega=values.omega,
+        amplitude=np.asarray(values.amplitude),
+        foundation_force=values.foundation_force,
+        fold=values.fold,
         operations=field_operations(scene),
         seconds=seconds,
         compile=compiling,
         effects=effects,
-        tiers=tier_rows(scene, comparison, own, repeats) if tiers else [],
-        numbers=[_with_computed_advice(row, effects) for row in dimensionless_numbers(scene, own, accuracy)],
+        tiers=tier_rows(scene, comparison, values, repeats) if tiers else [],
+        numbers=[_with_computed_advice(row, effects) for row in dimensionless_numbers(scene, values, accuracy)],
         coordinates=scene.machine.structure().coordinates,
     )
 
 
 def _with_computed_advice(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
-    """Return the row of a dimensionless number, with the advice from the audit of its effect if that has a clear result."""
+    """Return the row of a dimensionless number, with the advice on its effect in the audit if the audit has a clear result."""
     for effect in effects:
         if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
             return row._replace(advice=effect.advice, note=f"{row.note}; the advice is that of the computed effect")

@@ -33,12 +33,12 @@ _TURNS, _TOLERANCE, _MAX_STEPS = 100, 1e-8, 2**24
 
 
 class EffectRow(NamedTuple):
-    """One effect of an audit.
+    """Changes by one effect of an audit, and its cost.
 
     **Attributes**
 
-    - `effect`: its name; `present`: True if the scene has it (it was removed), False if not (it was added); `tier` of the
-      computation
+    - `effect`: its name; `present`: True if the scene has the effect, which was removed, False if the effect was added; `tier`
+      of the computation
     - changes caused by the effect, relative to the value for the scene: `amplitude` (of the coordinate with the largest change;
       relative to the largest amplitude with the same unit, or to a hundredth of the unbalance radius of the loads if the
       machine hardly moves), `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN if
@@ -47,7 +47,7 @@ class EffectRow(NamedTuple):
     - cost of the effect (value with the effect minus value without it): `operations` of the equations of motion; `seconds` of a
       run of 100 turns; `compile`: processor time to trace and compile that run, s; NaN without timings. Small differences of
       times are timing noise
-    - `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `note`: the reason
+    - `advice`: "needed", "perhaps needed", "negligible" or "cannot tell"; `note`: the reason
     """
 
     effect: str
@@ -66,13 +66,13 @@ class EffectRow(NamedTuple):
 
     @property
     def change(self) -> float:
-        """Largest modulus of the relative changes; NaN if no change is known."""
-        known = [abs(x) for x in (self.amplitude, self.foundation_force, self.omega, self.fold) if not math.isnan(x)]
-        return max(known, default=math.nan)
+        """Largest modulus of the relative changes; NaN if all changes are NaN."""
+        known_changes = [abs(x) for x in (self.amplitude, self.foundation_force, self.omega, self.fold) if not math.isnan(x)]
+        return max(known_changes, default=math.nan)
 
 
 class RepeatedComparison:
-    """A comparison and its values for several scenes, each computed once.
+    """Comparison of several scenes that computes the values and times of each scene once.
 
     **Arguments**: `comparison`: a `JamComparison` or `RunComparison`; `repeats`: number of timings, 0 for none.
     """
@@ -89,7 +89,7 @@ class RepeatedComparison:
     def values(self, scene: Scene, tier: str) -> MotionValues:
         """Return the values of the motion of a scene by a tier."""
         exact = tier == "exact orbit"
-        if (id(scene), exact) not in self._values:  # stored with its scene, whose id stays unique this way
+        if (id(scene), exact) not in self._values:  # the scene is stored too; its id cannot then be used again
             self._values[id(scene), exact] = scene, (self.comparison.exact if exact else self.comparison.full)(scene)
         return self._values[id(scene), exact][1]
 
@@ -137,17 +137,20 @@ def field_operations(scene: Scene) -> int:
 
 
 def relative_changes(new: MotionValues, old: MotionValues, own: MotionValues, units: tuple[str, ...]) -> dict[str, float]:
-    """Return the changes from `old` to `new`, relative to the values `own`, with the keys `CHANGES`; see `EffectRow`."""
-    moved, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
+    """Return the changes from `old` to `new`, relative to the values `own` of the audited scene, by the names in `CHANGES`.
+
+    **Arguments**: `units` (nd,): unit of each coordinate.
+    """
+    differences, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
     largest = {unit: max(x for x, u in zip(size, units, strict=True) if u == unit) for unit in units}
-    shares = [float(d) / largest[u] if largest[u] > 0.0 else math.nan for d, u in zip(moved, units, strict=True)]
-    known = [x for x in shares if not math.isnan(x)]
-    found = {"amplitude": float(max(known, key=abs)) if known else math.nan}
+    shares = [float(d) / largest[u] if largest[u] > 0.0 else math.nan for d, u in zip(differences, units, strict=True)]
+    known_shares = [x for x in shares if not math.isnan(x)]
+    changes = {"amplitude": float(max(known_shares, key=abs)) if known_shares else math.nan}
     for name in CHANGES[1:]:
         before, after, scale = getattr(old, name), getattr(new, name), getattr(own, name)
         scale = own.magnified * scale if name == "foundation_force" else scale
-        found[name] = (after - before) / abs(scale) if scale else math.nan
-    return found
+        changes[name] = (after - before) / abs(scale) if scale else math.nan
+    return changes
 
 
 def _size(values: MotionValues) -> float:
@@ -156,19 +159,19 @@ def _size(values: MotionValues) -> float:
 
 
 def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, accuracy: float) -> EffectRow:
-    """Return the row on the effect by which `variant` differs from `scene`, judged at the relative `accuracy`."""
+    """Return the row of the effect by which `variant` differs from `scene`. The advice is for the relative `accuracy`."""
     tier = repeated.tier(scene, variant.scene)
     own, other = repeated.values(scene, tier), repeated.values(variant.scene, tier)
     new, old = (own, other) if variant.present else (other, own)
     changes = relative_changes(new, old, own, scene.machine.structure().units)
-    sizes = [(len(each.all_effects), len(without_excluded_effects(each).all_effects)) for each in (scene, variant.scene)]
+    sizes = [(len(varied.all_effects), len(without_excluded_effects(varied).all_effects)) for varied in (scene, variant.scene)]
     if sizes[0][0] != sizes[1][0] and sizes[0][1] == sizes[1][1]:
-        changes["fold"] = math.nan  # theories of jams omit this effect, so that both folds are equal
+        changes["fold"] = math.nan  # folds are computed without this effect; therefore both folds are equal
     # The uncertainties of both motions, relative to the motion of this scene.
     uncertainty = own.uncertainty + other.uncertainty * _size(other) / _size(own)
     sign = 1 if variant.present else -1
     cost = sign * (field_operations(scene) - field_operations(variant.scene))
-    ours, theirs = repeated.times(scene), repeated.times(variant.scene)
+    own_times, other_times = repeated.times(scene), repeated.times(variant.scene)
     row = EffectRow(
         variant.name,
         variant.present,
@@ -176,8 +179,8 @@ def effect_row(repeated: RepeatedComparison, scene: Scene, variant: Variant, acc
         **changes,
         uncertainty=uncertainty,
         operations=cost,
-        seconds=sign * (ours[0] - theirs[0]),
-        compile=sign * (ours[1] - theirs[1]),
+        seconds=sign * (own_times[0] - other_times[0]),
+        compile=sign * (own_times[1] - other_times[1]),
         advice="",
         note=variant.note,
     )

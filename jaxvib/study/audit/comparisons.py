@@ -1,4 +1,4 @@
-"""Motions that are compared between two scenes: a jam, or the end of a run."""
+"""Motions by which an audit compares two scenes: a jam, or the end of a run."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _WINDOW_PERIODS = 100
 loads."""
 
 MIN_AMPLITUDE_SHARE = 0.01
-"""Smallest scale of amplitudes, in units of the unbalance radius S/M of the loads; amplitudes of a balanced rotor are
-smaller."""
+"""Smallest scale of amplitudes, in units of the unbalance radius S/M of the loads. It is used for machines that hardly move,
+such as a balanced rotor."""
 
 _GRID_SPEEDS = 100
 """Number of load speeds in the grid with which an exact fold is bracketed."""
@@ -46,7 +46,7 @@ class MotionValues(NamedTuple):
 
     **Attributes**
 
-    - `kind`: text that differs for different kinds of motion; `remark` on the computation
+    - `kind`: name of the kind of motion; `remark` on the computation, "" for none
     - `omega` of the loads, rad/s; `amplitude` of each coordinate, m (rad for tilts); `foundation_force` N
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or if it was not computed
     - `uncertainty`: relative uncertainty of these values
@@ -72,7 +72,8 @@ class MotionValues(NamedTuple):
 
 
 class JamComparison(NamedTuple):
-    """Comparison of the jam `mode`, by its exact orbit, or by a run that starts near it if that theory excludes the scene."""
+    """Comparison of the jam `mode`, by its exact orbit, or, if that theory does not support the scene, by a run that starts
+    near the jam."""
 
     mode: int
 
@@ -89,7 +90,7 @@ class JamComparison(NamedTuple):
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
         exists = bool(np.isfinite(orbit.omega))
         kind = f"jam mode {self.mode}, {orbit.judgement}" if exists else f"no jam mode {self.mode}"
-        # The motion of loads that would separate is a different one; other statuses concern the computation only.
+        # If the loads would separate, the real motion is another one; other statuses concern the computation only.
         if exists and bool(orbit.status == OrbitStatus.would_separate):
             kind = f"{kind}, but the loads separate"
         computed = not exists or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)
@@ -117,7 +118,7 @@ class JamComparison(NamedTuple):
     def full(self, scene: Scene) -> MotionValues:
         """Return the values of the full equations, integrated from near the exact jam until they have settled."""
         run = settle(scene, start=self.state(scene), throw=False)
-        return _read(scene, run, fold_speed(without_excluded_effects(scene), float(run.omega)))
+        return _values_of_run(scene, run, fold_speed(without_excluded_effects(scene), float(run.omega)))
 
 
 class RunComparison(NamedTuple):
@@ -141,27 +142,27 @@ class RunComparison(NamedTuple):
         return initial_state(scene, "rest")
 
     def has_exact_orbit(self, scene: Scene) -> bool:
-        """Return False, because a run has no exact orbit."""
+        """Return False, because the motion of a run is not an exact orbit."""
         return False
 
     def exact(self, scene: Scene) -> MotionValues:
-        """Raise an error; it is never called."""
+        """Raise `NotImplementedError`; `has_exact_orbit` is False."""
         raise NotImplementedError
 
     def full(self, scene: Scene) -> MotionValues:
-        """Return the values of the full equations."""
+        """Return the values at the end of a run with the full equations."""
         start = self.state(scene)
         run = simulate(
             scene, self.until, start=start, save="window", window_periods=_WINDOW_PERIODS, estimate=False, throw=False
         )
-        return _read(scene, run, math.nan)
+        return _values_of_run(scene, run, math.nan)
 
     @classmethod
     def of_arguments(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunComparison:
         """Return a comparison by a run.
 
-        By default the run ends at 5 `SLOW_PERIODS` slow periods plus twice the time of the last jump of the drive's
-        acceleration.
+        By default the run ends at 100 slow periods plus twice the time of the last jump of the drive's acceleration. It starts
+        with "turning" if the rotor speed is constant, otherwise from "rest".
         """
         if start is None:
             start = "turning" if scene.drive.constant else "rest"
@@ -174,9 +175,9 @@ class RunComparison(NamedTuple):
 
 
 def without_excluded_effects(scene: Scene) -> Scene:
-    """Return the scene without effects that theories of jams exclude, such as imbalance, which turns at another speed."""
-    kept = tuple(e for e in scene.all_effects if all(isinstance(term, PERIODIC_JAM_TERMS) for term in e.terms()))
-    return scene if len(kept) == len(scene.all_effects) else scene.replace(effects=kept)
+    """Return the scene without effects that theories of jams exclude, such as an imbalance, which turns with the rotor."""
+    supported = tuple(e for e in scene.all_effects if all(isinstance(term, PERIODIC_JAM_TERMS) for term in e.terms()))
+    return scene if len(supported) == len(scene.all_effects) else scene.replace(effects=supported)
 
 
 def turning_state(scene: Scene) -> State:
@@ -190,8 +191,8 @@ def turning_state(scene: Scene) -> State:
     return with_spin(scene, State(still, still, (spread, *others), rate, rotor))
 
 
-def mean_torque(scene: Scene, omega: float) -> float:
-    """Return the mean torque, N m, by which the drag of the rotor drives loads with the speed `omega`, rad/s."""
+def total_drag_torque(scene: Scene, omega: float) -> float:
+    """Return the torque, N m, by which drag drives all loads together, for loads with the speed `omega`, rad/s."""
     n = scene.loads.count
     u = scene.loads.rest()
     rate = (jnp.full((n,), omega), *(jnp.zeros((n,)) for _ in u[1:]))
@@ -202,8 +203,8 @@ def mean_torque(scene: Scene, omega: float) -> float:
 def fold_speed(scene: Scene, omega: float) -> float:
     """Return the rotor speed, rad/s, of the fold at which the exact jam with load speed `omega` ends.
 
-    This is the next fold at higher load speeds, otherwise the next one at lower load speeds. It is NaN if there is none, or if
-    theories of jams exclude the scene.
+    This is the next fold at higher load speeds or, if there is none, the next fold at lower load speeds. It is NaN if there is
+    no fold, or if theories of jams do not support the scene.
     """
     try:
         folds = jam_modes(scene).folds
@@ -214,7 +215,7 @@ def fold_speed(scene: Scene, omega: float) -> float:
     if not light.size or not np.isfinite(omega):
         return math.nan
     near = float(above[0]) if above.size else float(below[-1])
-    low, high, found = 0.97 * near, 1.03 * near, math.nan
+    low, high, rotor_speed = 0.97 * near, 1.03 * near, math.nan
     for _ in range(2):
         grid = np.linspace(low, high, _GRID_SPEEDS)
         speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(grid)[None]))
@@ -224,19 +225,19 @@ def fold_speed(scene: Scene, omega: float) -> float:
             return math.nan
         k = int(changes[np.argmin(np.abs(grid[changes] - near))])
         low, high = float(grid[k]), float(grid[k + 1])
-        found = float(speed[k] if abs(slope[k]) < abs(slope[k + 1]) else speed[k + 1])
-    return found
+        rotor_speed = float(speed[k] if abs(slope[k]) < abs(slope[k + 1]) else speed[k + 1])
+    return rotor_speed
 
 
-def _read(scene: Scene, run: Run, fold: float) -> MotionValues:
-    ended = bool(run.finished)
-    kind = status_name(run.regime.name) if ended else f"failed: {status_name(run.status)}"
+def _values_of_run(scene: Scene, run: Run, fold: float) -> MotionValues:
+    has_finished = bool(run.finished)
+    kind = status_name(run.regime.name) if has_finished else f"failed: {status_name(run.status)}"
     drift, amplitude = float(run.drift), np.asarray(run.amplitude)
-    moved = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
+    largest_displacement = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
     unit = float(natural_units(scene).displacement)
-    magnified = max(1.0, MIN_AMPLITUDE_SHARE * unit / moved) if moved > 0.0 else 1.0
-    # The drift was measured relative to a scale with another lower limit.
-    drift *= max(moved, measure.MIN_CHANGE_SCALE * unit) / max(moved, MIN_AMPLITUDE_SHARE * unit)
+    magnified = max(1.0, MIN_AMPLITUDE_SHARE * unit / largest_displacement) if largest_displacement > 0.0 else 1.0
+    # The drift of a run is relative to a scale with another lower limit, `measure.MIN_CHANGE_SCALE`.
+    drift *= max(largest_displacement, measure.MIN_CHANGE_SCALE * unit) / max(largest_displacement, MIN_AMPLITUDE_SHARE * unit)
     return MotionValues(
         kind,
         float(run.omega),

@@ -13,7 +13,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.machine.effects.base import has_term, total_gravity
 from jaxvib.machine.effects.terms import ContactFriction, LoadInteraction, SupportForce
 from jaxvib.machine.scene import Scene
-from jaxvib.study.audit.comparisons import MotionValues, mean_torque
+from jaxvib.study.audit.comparisons import MotionValues, total_drag_torque
 
 _G = 9.81
 _STEEL = 7850.0
@@ -35,18 +35,21 @@ class NumberRow(NamedTuple):
 
 
 def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -> list[NumberRow]:
-    """Compute the dimensionless numbers of effects that `scene` lacks, for the motion `values` and a relative `accuracy`.
+    """Return the dimensionless numbers of effects that `scene` lacks.
+
+    **Arguments**: `values` of the motion; relative `accuracy`, which is the limit of the numbers that are shares.
 
     - gravity on the loads: g/(R Omega^2), its share in the normal force of a load on its track
     - crowding: the share of the track that the diameters of the loads fill, N arcsin(r/R)/pi, and the share of the unbalance
       that is lost if they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R. Without a `ball_radius`, r is the radius of
       steel balls of the same mass
-    - distance: smallest distance between two loads, in diameters, if the scene has no contact between loads
+    - contact: diameter of the loads divided by the smallest distance of two loads, if the scene has no contact between loads
     - dry friction divided by viscous friction: friction of a ball bearing, or of steel on steel, divided by the drag torque
       b_W R^2 (n - Omega)
-    - gyroscopic, if the machine cannot tilt: inertia of the loads about the axis, divided by that of the machine about a tilt
-      with the radius of gyration R
-    - lift: foundation force divided by the weight; above 1, supports under the machine would have to pull
+    - gyroscopic, if the machine cannot tilt: sum kappa m / M, the inertia sum kappa m R^2 of the loads about the axis, divided
+      by the inertia M R^2 that the machine would have about a tilt with the radius of gyration R
+    - lift, for machines that move up and down: foundation force divided by the weight; above 1, supports under the machine
+      would have to pull
 
     Effects of the scene have no row. **Returns** a list of `NumberRow`.
 
@@ -54,8 +57,8 @@ def dimensionless_numbers(scene: Scene, values: MotionValues, accuracy: float) -
     """
     if not np.isfinite(values.omega) or values.omega == 0.0:
         return []
-    found = [make(scene, values, accuracy) for make in _NUMBERS]
-    return [row for row in found if row is not None]
+    rows = [compute(scene, values, accuracy) for compute in _NUMBERS]
+    return [row for row in rows if row is not None]
 
 
 def gravity_share(radius: float, omega: float, g: float = _G) -> float:
@@ -79,10 +82,11 @@ def _arm(scene: Scene) -> float:
 
 
 def _ball_radius(scene: Scene) -> tuple[float, str] | None:
-    """Return the radius of the loads, or of steel balls of their mass, with its origin; None for loads on bearings."""
-    own = getattr(scene.loads, "ball_radius", None)
-    if own is not None:
-        return float(own), ""
+    """Return the radius of the loads, m, and "", or the radius of steel balls of the same mass and a text that states this;
+    None for loads on bearings without a radius."""
+    stated = getattr(scene.loads, "ball_radius", None)
+    if stated is not None:
+        return float(stated), ""
     if scene.loads.has_bearing:
         return None
     radius = (3.0 * float(np.mean(np.asarray(scene.loads.mass))) / (4.0 * math.pi * _STEEL)) ** (1.0 / 3.0)
@@ -97,20 +101,21 @@ def _gravity(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow |
 
 
 def _crowding(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
-    own, n = _ball_radius(scene), scene.loads.count
-    if own is None or n < 2 or not scene.loads.circular:
+    ball, n = _ball_radius(scene), scene.loads.count
+    if ball is None or n < 2 or not scene.loads.circular:
         return None
-    ratio = own[0] / _arm(scene)
+    radius, origin = ball
+    ratio = radius / _arm(scene)
     half = math.asin(min(ratio, 1.0))
     filled = n * half / math.pi
     if filled >= 1.0:
-        note = f"{own[1]}the loads do not fit on the track: use lighter loads, or more than one track"
+        note = f"{origin}the loads do not fit on the track: use lighter loads, or more than one track"
         return NumberRow("crowding: N arcsin(r/R)/pi", filled, 1.0, "perhaps needed", note)
-    if not own[1]:
+    if not origin:
         return None
     lost = 1.0 - math.sin(n * half) / (n * math.sin(half))
     note = (
-        f"{own[1]}side by side they fill {100.0 * filled:.3g} % of the track and lose this share of unbalance: give ball_radius"
+        f"{origin}side by side they fill {100.0 * filled:.3g} % of the track and lose this share of unbalance: give ball_radius"
     )
     return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, note)
 
@@ -123,7 +128,7 @@ def _distance(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
 
 
 def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:
-    drag = mean_torque(scene, values.omega)
+    drag = total_drag_torque(scene, values.omega)
     if has_term(scene.all_effects, ContactFriction) or not drag > 0.0:
         return None
     arm, n = _arm(scene), scene.loads.count
@@ -132,10 +137,11 @@ def _friction(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow 
         lever, of = 0.5 * _BEARING * _BEARING_WIDTH * arm, f"mu2 = {_BEARING:g}, {1e3 * _BEARING_WIDTH * arm:.3g} mm wide"
         note, name = f"of a ball bearing ({of}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
     else:
-        own = _ball_radius(scene)
-        assert own is not None
-        lever, name = _ROLLING / own[0] * arm, "rolling: k (R/r) m R Omega^2 / drag torque"
-        note = f"{own[1]}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"
+        ball = _ball_radius(scene)
+        assert ball is not None
+        radius, origin = ball
+        lever, name = _ROLLING / radius * arm, "rolling: k (R/r) m R Omega^2 / drag torque"
+        note = f"{origin}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"
     return _row(name, lever * normal_force / drag, accuracy, note)
 
 
@@ -144,13 +150,13 @@ def _gyroscopic(scene: Scene, values: MotionValues, accuracy: float) -> NumberRo
         return None
     model = linear_model(scene)
     (port,) = model.mount.rows
-    whole = float(1.0 / (port @ jnp.linalg.solve(model.mass, port.T))[0, 0])
+    effective_mass = float(1.0 / (port @ jnp.linalg.solve(model.mass, port.T))[0, 0])
     n = scene.loads.count
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.inertia_factor() * scene.loads.mass, (n,))))
     note = (
         "the model has no tilts: if the machine can tilt, the rotating loads couple its tilts (as the inertia of a rotor does)"
     )
-    return _row("gyroscopic: sum kappa m / M", loads / whole, accuracy, note)
+    return _row("gyroscopic: sum kappa m / M", loads / effective_mass, accuracy, note)
 
 
 def _lift(scene: Scene, values: MotionValues, accuracy: float) -> NumberRow | None:

@@ -1,4 +1,4 @@
-"""Cost of effects, drives and coordinates: operations that they add to the traced equations of motion."""
+"""Cost of effects, drives, machines and loads: the operations that they add to the traced equations of motion."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ T = TypeVar("T")
 class OperationCount(NamedTuple):
     """Number of operations in the equations of motion of a scene with a given part.
 
-    **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations` with the part; `added`:
-    increase compared with the reference scene that `beside` describes.
+    **Attributes**: `part` ("effect", "drive", "machine", "loads") and its `kind`; `operations`: number of operations with the
+    part; `added`: increase over the reference scene; `beside`: machine, loads and drive of the reference scene as text.
     """
 
     part: str
@@ -39,9 +39,11 @@ class OperationCount(NamedTuple):
 def operation_counts() -> list[OperationCount]:
     """Count the operations that each effect, drive, machine and kind of loads adds to the equations of motion.
 
-    The reference scene is a platform with one ball and a constant rotor speed. An effect that this scene cannot have is
-    counted in the simplest scene that can have it. The counts do not depend on the values of the parameters. **Returns** a
-    list of `OperationCount`.
+    The reference scene is a platform with one ball and a constant rotor speed, for kinds of loads a planar rotor with one ball.
+    An effect that the platform with a ball cannot have is counted with other loads, or on a rotor with tilt, see `beside`. The
+    counts do not depend on the values of the parameters.
+
+    **Returns** a list of `OperationCount`.
 
     >>> rows = operation_counts()
     >>> [row.added for row in rows if row.kind == "constant_speed"], min(row.added for row in rows if row.part == "effect") > 0
@@ -77,33 +79,39 @@ def operation_counts() -> list[OperationCount]:
     constant = ConstantSpeed(1.0)
 
     def row(part: str, kind: str, scene: Scene, beside: Scene) -> OperationCount:
-        whole, base = field_operations(scene), field_operations(beside)
+        operations_with, operations_beside = field_operations(scene), field_operations(beside)
         name = f"{beside.machine.kind}, {beside.loads.kind}, {beside.drive.kind}"
-        return OperationCount(part, kind, whole, whole - base, name)
+        return OperationCount(part, kind, operations_with, operations_with - operations_beside, name)
 
     platform, planar = (Scene(machines[kind], loads["ball"], constant) for kind in ("one_mass", "planar_rotor"))
-    found = [
+    counts = [
         row("drive", kind, Scene(platform.machine, platform.loads, _build_with_halves(drive)), platform)
         for kind, drive in DRIVES.items()
     ]
     for kind, machine in machines.items():
-        each = balls(**{**sized, "count": 2}) if "stations" in kind else platform.loads
-        found.append(row("machine", kind, Scene(machine, each, constant), platform))
-    found += [row("loads", kind, Scene(planar.machine, each, constant), planar) for kind, each in loads.items()]
-    hosts = [Scene(machines[m], each, constant) for m in ("one_mass", "rotor, loads at one station") for each in loads.values()]
+        loads_of_kind = balls(**{**sized, "count": 2}) if "stations" in kind else platform.loads
+        counts.append(row("machine", kind, Scene(machine, loads_of_kind, constant), platform))
+    counts += [
+        row("loads", kind, Scene(planar.machine, loads_of_kind, constant), planar) for kind, loads_of_kind in loads.items()
+    ]
+    hosts = [
+        Scene(machines[m], loads_of_kind, constant)
+        for m in ("one_mass", "rotor, loads at one station")
+        for loads_of_kind in loads.values()
+    ]
     for kind, effect in EFFECTS.items():
         for host in hosts:
             with contextlib.suppress(InputError):  # this machine or these loads cannot have the effect
-                found.append(
+                counts.append(
                     row("effect", kind, Scene(host.machine, host.loads, constant, (_build_with_halves(effect),)), host)
                 )
                 break
-    return found
+    return counts
 
 
 def _build_with_halves(build: Callable[..., T]) -> T:
-    """Build an effect or a drive; required parameters are 0.5, or a special value if 0.5 is not allowed."""
-    needed = {
+    """Build an effect or a drive whose required parameters are 0.5, or a special value if 0.5 is not allowed."""
+    special_values = {
         "motor": DCMotor(1.0, 1.0, 1.0),
         "reference": ConstantSpeed(1.0),
         "breakdown_ratio": 2.0,
@@ -112,8 +120,10 @@ def _build_with_halves(build: Callable[..., T]) -> T:
         "speeds": [0.5, 1.0],
         "torques": [0.5, -0.5],
     }
-    required = [each.name for each in inspect.signature(build).parameters.values() if each.default is each.empty]
-    return build(**{name: needed.get(name, 0.5) for name in required})
+    required = [
+        parameter.name for parameter in inspect.signature(build).parameters.values() if parameter.default is parameter.empty
+    ]
+    return build(**{name: special_values.get(name, 0.5) for name in required})
 
 
 def _rotor(stations: Numbers) -> Machine:

@@ -25,16 +25,16 @@ from jaxvib.study.audit.comparisons import JamComparison, MotionValues, RunCompa
 
 
 class TierRow(NamedTuple):
-    """One tier of an audit.
+    """Errors of one tier of an audit, and its computing time.
 
     **Attributes**
 
-    - `tier`: its name; `applicable`: True if it can compute the audit's quantities for the scene
-    - `amplitude`, `foundation_force`, `omega`: the error of this quantity relative to the best tier, not the quantity itself;
-      for `amplitude` that of the coordinate with the largest error, in units of the largest amplitude; NaN if `applicable` is
-      False
-    - `seconds` of a computation, and additional seconds of the first one, `compile`; NaN without timings
-    - `note`: its purpose, or the reason why it cannot compute the quantities
+    - `tier`: its name; `applicable`: True if it can compute the quantities of the audit for the scene
+    - `amplitude`, `foundation_force`, `omega`: the relative error of this quantity, compared with the best tier, not the
+      quantity itself; for `amplitude` the error of the coordinate with the largest error, in units of the largest amplitude;
+      NaN if `applicable` is False
+    - `seconds` of a computation; `compile`: additional seconds of the first computation; NaN without timings
+    - `note`: purpose of the tier, or the reason why it cannot compute the quantities
     """
 
     tier: str
@@ -50,42 +50,47 @@ class TierRow(NamedTuple):
         """Return the row as text."""
         if not self.applicable:
             return f"not applicable; {self.note}"
-        off = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))
-        took = "" if math.isnan(self.seconds) else f", {self.seconds:.2g} s"
-        return f"error {100.0 * off:.2g} %{took}; {self.note}"
+        largest_error = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))
+        time_text = "" if math.isnan(self.seconds) else f", {self.seconds:.2g} s"
+        return f"error {100.0 * largest_error:.2g} %{time_text}; {self.note}"
 
 
 def tier_rows(scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues, repeats: int) -> list[TierRow]:
-    """Return a row for each of `TIERS`. `reference` contains the values of the best tier; no timings if `repeats` is 0."""
+    """Return a row for each of `TIERS`.
+
+    **Arguments**: `reference`: values of the best tier; `repeats`: number of timings, 0 for none.
+    """
     return [_row(tier, scene, comparison, reference, repeats) for tier in TIERS]
 
 
 def _row(tier: Tier, scene: Scene, comparison: JamComparison | RunComparison, reference: MotionValues, repeats: int) -> TierRow:
-    nothing = (math.nan,) * 5
+    unknown_numbers = (math.nan,) * 5
     refusal = tier.refusal(scene)
     if refusal is not None:
-        return TierRow(tier.name, False, *nothing, note=refusal)
+        return TierRow(tier.name, False, *unknown_numbers, note=refusal)
     call = _call(tier, scene, comparison, reference)
     if isinstance(call, str):
-        return TierRow(tier.name, False, *nothing, note=call)
+        return TierRow(tier.name, False, *unknown_numbers, note=call)
     try:
-        found, seconds, compiling = timed(call, repeats) if repeats else (call(), math.nan, math.nan)
+        result, seconds, compiling = timed(call, repeats) if repeats else (call(), math.nan, math.nan)
     except (InputError, ComputationError) as problem:
-        return TierRow(tier.name, False, *nothing, note=str(problem))
-    amplitude, size = np.abs(np.asarray(found.amplitude)), np.asarray(reference.amplitude)
+        return TierRow(tier.name, False, *unknown_numbers, note=str(problem))
+    amplitude, size = np.abs(np.asarray(result.amplitude)), np.asarray(reference.amplitude)
     if not np.all(np.isfinite(amplitude)):
-        status = getattr(found, "status", None)
-        return TierRow(tier.name, False, *nothing, note="this motion does not exist" if status is None else status_name(status))
+        status = getattr(result, "status", None)
+        return TierRow(
+            tier.name, False, *unknown_numbers, note="this motion does not exist" if status is None else status_name(status)
+        )
     note = tier.purpose
-    if isinstance(comparison, JamComparison) and isinstance(found, MotionValues) and found.kind != "jammed":
-        note = f"the run left the jam: {found.kind}"
-    off = (amplitude - size) / np.max(size)
+    if isinstance(comparison, JamComparison) and isinstance(result, MotionValues) and result.kind != "jammed":
+        note = f"the run left the jam: {result.kind}"
+    errors = (amplitude - size) / np.max(size)
     return TierRow(
         tier.name,
         True,
-        float(off[np.argmax(np.abs(off))]),
-        float(found.foundation_force) / reference.foundation_force - 1.0,
-        float(found.omega) / reference.omega - 1.0,
+        float(errors[np.argmax(np.abs(errors))]),
+        float(result.foundation_force) / reference.foundation_force - 1.0,
+        float(result.omega) / reference.omega - 1.0,
         seconds,
         compiling,
         note,
@@ -135,8 +140,8 @@ class Tier(NamedTuple):
     """Method to compute a jam.
 
     **Attributes**: `name`; `purpose`: text; `require(scene)` raises `InputError` if the tier does not support the scene, and
-    names the property that a part of the scene lacks; `jam(scene, mode, until)` returns the result for a jam mode, integrated
-    to the time `until`, s, if the tier integrates in time.
+    names the property that a part of the scene lacks; `jam(scene, mode, until)` returns the result for a jam mode; the averaged
+    equations are integrated to the time `until`, s.
     """
 
     name: str
@@ -145,7 +150,7 @@ class Tier(NamedTuple):
     jam: Callable[[Scene, int, float], JamValues]
 
     def refusal(self, scene: Scene) -> str | None:
-        """Return a sentence with the reason why the tier does not support the scene, or None if it does.
+        """Return a sentence with the reason why the tier does not support the scene; None if the tier supports it.
 
         >>> import jaxvib as jv
         >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
@@ -186,4 +191,4 @@ TIERS = (
         lambda scene, mode, until: settle(scene, mode=mode, throw=False),
     ),
 )
-"""Tiers in order of cost; the last one supports every scene."""
+"""Tiers in the order of their computing time; the last tier supports every scene."""

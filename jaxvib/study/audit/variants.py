@@ -22,8 +22,11 @@ _DROOP = 0.015
 
 
 class Variant(NamedTuple):
-    """Variant of the audited scene with one effect added or removed: `name` of the effect; `present`: True if the audited scene
-    has it; the varied `scene`; `note`: the values with which it was added."""
+    """Variant of the audited scene with one effect added or removed.
+
+    **Attributes**: `name` of the effect; `present`: True if the audited scene has the effect; `scene`: the variant; `note`: the
+    values of an added effect.
+    """
 
     name: str
     present: bool
@@ -54,10 +57,9 @@ class WithoutGyroscopic(Machine):
 
 
 def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
-    """Yield variants of the scene without one of its effects, without gyroscopic coupling, and with unlimited power of its
-    motor.
+    """Yield variants of the scene without one of its effects, without gyroscopic coupling, and with a drive of unlimited power.
 
-    With unlimited power the rotor speed rises to that of the motor during half the time `until`, s.
+    With unlimited power the rotor speed rises smoothly to the no-load speed of the motor during half the time `until`, s.
     """
     kinds = [effect.kind for effect in scene.all_effects]
     for k, effect in enumerate(scene.all_effects):
@@ -82,8 +84,8 @@ def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[
     present = {effect.kind for effect in scene.all_effects if not effect.repeatable}
     for effect in given or ():
         if effect.kind not in present:
-            more = scene.replace(effects=(*scene.all_effects, effect))
-            yield Variant(effect.kind, False, more, "as given")
+            with_effect = scene.replace(effects=(*scene.all_effects, effect))
+            yield Variant(effect.kind, False, with_effect, "as given")
     if given is not None:
         return
     present_kinds = {effect.kind for effect in scene.all_effects}
@@ -91,10 +93,10 @@ def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[
         if kind in present_kinds:
             continue
         with contextlib.suppress(InputError):  # this machine or these loads cannot have the effect
-            usual = effect.typical(scene.machine, scene.loads, scene.drive.speed, jnp.asarray(amplitude))
-            if usual is not None:
-                more = scene.replace(effects=(*scene.all_effects, usual.effect))
-                yield Variant(kind, False, more, usual.note)
+            typical = effect.typical(scene.machine, scene.loads, scene.drive.speed, jnp.asarray(amplitude))
+            if typical is not None:
+                with_effect = scene.replace(effects=(*scene.all_effects, typical.effect))
+                yield Variant(kind, False, with_effect, typical.note)
     if scene.drive.constant:
         slower = ConstantSpeed(scene.drive.speed * (1.0 - _DROOP))
         note = f"a motor that loses {100.0 * _DROOP:g} % of its speed: induction_motor, dc_motor"

@@ -93,7 +93,7 @@ class Decrement(Result):
 
 
 def turning_points(record: Record) -> TurningPoints:
-    """Return the turning points of a recorded swing, each computed from all samples within a sixth of a period about it.
+    """Return the turning points of a recorded swing, each from the samples within a sixth of a period before and after it.
 
     The arc c + a cos(v t) + b sin(v t) is fitted to these samples; its extremum is the turning point. With v = w sqrt(cos A),
     where w is the frequency of small swings and A the amplitude, the fourth derivative of the arc at the turning point is also
@@ -111,24 +111,26 @@ def turning_points(record: Record) -> TurningPoints:
     Source: this package.
     """
     t, f = record.time, record.angle
-    rough = np.diff(f, 4)
-    noise = float(np.median(np.abs(rough))) / 0.6745 / np.sqrt(70.0)  # fourth differences of a smooth signal are negligible
-    peaks = _regular(t, _alternating(f, max(8.0 * noise, 1e-3 * float(np.ptp(f)))))
+    fourth_differences = np.diff(f, 4)
+    noise = (
+        float(np.median(np.abs(fourth_differences))) / 0.6745 / np.sqrt(70.0)
+    )  # fourth differences of a smooth signal are negligible
+    peaks = _longest_regular_sequence(t, _alternating_extrema(f, max(8.0 * noise, 1e-3 * float(np.ptp(f)))))
     if len(peaks) < 3:
         raise InputError(record.name, f"has {len(peaks)} turning points; at least 3 are needed, record more of the swing")
     frequency = np.pi / float(np.median(np.diff(t[peaks])))
     ends = f[peaks]
     middle = float(np.mean((ends[:-2] + 2.0 * ends[1:-1] + ends[2:]) / 4.0))
     small = np.pi * (len(peaks) - 1) / float(np.sum(np.diff(t[peaks]) / period_stretch(np.abs(np.diff(ends)) / 2.0)))
-    times, angles, gains, squares, spare = [], [], [], 0.0, 0
+    times, angles, gains, squares, degrees_of_freedom = [], [], [], 0.0, 0
     for k in peaks:
         if t[k] - t[0] < 0.5 / frequency or t[-1] - t[k] < 0.5 / frequency:
             continue
         size = min(abs(f[k] - middle), np.pi)
-        away = np.abs(frequency * (t - t[k]))
+        phase_distance = np.abs(frequency * (t - t[k]))
         # The arc describes a large swing only close to the turning point; a record with few samples needs the whole sixth.
-        near = away <= np.pi / 3.0 / (1.0 + size**2 / 3.0)
-        near = near if np.count_nonzero(near) >= 9 else away <= np.pi / 3.0
+        near = phase_distance <= np.pi / 3.0 / (1.0 + size**2 / 3.0)
+        near = near if np.count_nonzero(near) >= 9 else phase_distance <= np.pi / 3.0
         # Time x in units of 1/w and square = (v/w)^2, which is negative beyond 90 deg: the arc is then a hyperbolic cosine.
         square = float(np.cos(size))
         x = small * (t[near] - t[k])
@@ -148,14 +150,14 @@ def turning_points(record: Record) -> TurningPoints:
         angles.append(float(gradient @ np.array([c, a, b])))
         gains.append(gradient @ inverse @ gradient)
         squares += float(np.sum((f[near] - basis @ np.array([c, a, b])) ** 2))
-        spare += len(x) - 3
+        degrees_of_freedom += len(x) - 3
     if len(times) < 3:
         raise InputError(
             record.name,
             f"has {len(times)} turning points that are far enough from both ends; at least 3 are "
             "needed, record more of the swing",
         )
-    noise = np.sqrt(squares / spare)
+    noise = np.sqrt(squares / degrees_of_freedom)
     return TurningPoints(np.array(times), np.array(angles), noise * np.sqrt(gains), float(noise))
 
 
@@ -166,30 +168,33 @@ def _arcs(x: np.ndarray, square: float) -> np.ndarray:
 
 
 def period_stretch(amplitude: np.ndarray) -> np.ndarray:
-    """Return the period of a swing of that amplitude, rad, relative to that of small swings."""
+    """Return the period of a swing of the `amplitude`, rad, divided by that of small swings: 1 + A^2/16 + 11 A^4/3072."""
     return 1.0 + amplitude**2 / 16.0 + 11.0 * amplitude**4 / 3072.0
 
 
-def _alternating(f: np.ndarray, least: float) -> list[int]:
-    """Return indices of alternating maxima and minima, after each of which the angle changes by at least `least`; no end
-    points."""
-    found: list[int] = []
+def _alternating_extrema(f: np.ndarray, min_change: float) -> list[int]:
+    """Return the indices of alternating maxima and minima, after each of which the angle `f` changes by more than `min_change`.
+
+    The first and the last sample are not included.
+    """
+    extrema: list[int] = []
     high = low = 0
     rising: bool | None = None
     for k in range(1, f.size):
         high = k if f[k] > f[high] else high
         low = k if f[k] < f[low] else low
-        if rising is not False and f[high] - f[k] > least:
-            found.append(high)
+        if rising is not False and f[high] - f[k] > min_change:
+            extrema.append(high)
             rising, low = False, k
-        elif rising is not True and f[k] - f[low] > least:
-            found.append(low)
+        elif rising is not True and f[k] - f[low] > min_change:
+            extrema.append(low)
             rising, high = True, k
-    return [k for k in found if 0 < k < f.size - 1]
+    return [k for k in extrema if 0 < k < f.size - 1]
 
 
-def _regular(t: np.ndarray, peaks: list[int]) -> list[int]:
-    """Return the longest sequence of regular turning points; this excludes noise at rest and the release by hand."""
+def _longest_regular_sequence(t: np.ndarray, peaks: list[int]) -> list[int]:
+    """Return the longest sequence of turning points at regular intervals; noise at rest and the release by hand are
+    excluded."""
     steps = np.diff(t[peaks])
     even = [True, *((steps[1:] < 1.6 * steps[:-1]) & (steps[1:] > 0.6 * steps[:-1])), False]
     cuts = [0, *(k for k, is_even in enumerate(even) if not is_even)]
@@ -207,7 +212,7 @@ def ten_periods(
         mu1 = J [G(phi_1) - G(phi_11)] / (10 T),     G' = sin A / (4 [E/K - cos^2(A/2)]) = 2/A - 5 A/48 - ...
 
     - Small swings with viscous friction shrink by exp(-mu1 t/(2 J)), hence 2 J ln(ratio)/(10 T)
-    - In one period, a large swing of amplitude A loses the energy mu1 times the integral of the angular speed over the angle.
+    - In one period, a large swing of amplitude A loses an energy of mu1 times the integral of the angular speed over the angle.
       With the complete elliptic integrals K and E of modulus sin(A/2) it follows that A' = -(mu1/J)/G'(A). The second line is
       the integral of this equation, and it is used here. Beyond 60 deg an error of 0.1 % remains, which the interval includes
     - Beyond 90 deg the error of the turning points is unknown, and the interval is 0 to infinity; `identify` gives a finite
@@ -223,10 +228,10 @@ def ten_periods(
       swing
     - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
       interval; typical: 0.01 to 0.03 (default 0)
-    - `turns`: turning points of the record, if they are known already
+    - `turns`: the `turning_points` of the record; default: they are computed
 
-    **Returns** `Decrement`; typical: mu1 of 3e-4 to 2e-3 N m s, 0.0015 in the source. **Raises** `InputError` if the record is
-    shorter.
+    **Returns** `Decrement`; typical: mu1 of 3e-4 to 2e-3 N m s, 0.0015 in the source. **Raises** `InputError` if the record has
+    fewer periods.
 
     >>> import numpy as np, jaxvib as jv
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
@@ -239,12 +244,12 @@ def ten_periods(
     """
     n = 2 * count(periods, "periods")
     turns = turning_points(record) if turns is None else turns
-    a, when = turns.amplitude, (turns.time[1:] + turns.time[:-1]) / 2.0
+    a, middles = turns.amplitude, (turns.time[1:] + turns.time[:-1]) / 2.0
     pairs = a.size - n
     if pairs < 1:
-        there = f"has {a.size / 2.0:g} periods between turning points"
-        raise InputError(record.name, f"{there}; {periods + 0.5:g} are needed; record longer or give fewer periods")
-    span = when[n : n + pairs] - when[:pairs]
+        problem = f"has {a.size / 2.0:g} periods between turning points"
+        raise InputError(record.name, f"{problem}; {periods + 0.5:g} are needed; record longer or give fewer periods")
+    span = middles[n : n + pairs] - middles[:pairs]
     factor = 2.0 * float(pendulum.total_inertia) / span
     estimates = factor * _log_decrement(a[:pairs], a[n:])
 
@@ -258,7 +263,7 @@ def ten_periods(
             slopes[k, where] -= change
     covariance = (slopes * turns.error**2) @ slopes.T
     value, error = float(np.mean(estimates)), float(np.sqrt(np.mean(covariance)))
-    apart = covariance[0, 0] + covariance[-1, -1] - 2.0 * covariance[0, -1]
+    variance_of_drift = covariance[0, 0] + covariance[-1, -1] - 2.0 * covariance[0, -1]
     viscous = interval(value, error, 1.959964, float(np.hypot(instrument, _LARGE_AMPLITUDE_ERROR * (a[0] > _LARGE_AMPLITUDE))))
     if a[0] > _MAX_AMPLITUDE:
         viscous = Estimate(value, np.inf, 0.0, np.inf)
@@ -267,7 +272,7 @@ def ten_periods(
         estimates=estimates,
         amplitude=a[:pairs],
         scatter=float(np.max(np.abs(estimates / value - 1.0))),
-        drift=float((estimates[-1] - estimates[0]) / np.sqrt(apart)) if pairs > 1 else 0.0,
+        drift=float((estimates[-1] - estimates[0]) / np.sqrt(variance_of_drift)) if pairs > 1 else 0.0,
         period=float(np.mean(span)) / periods,
         periods=periods,
     )

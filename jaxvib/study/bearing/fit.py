@@ -41,9 +41,13 @@ class Unknowns(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Result of a fit with p unknowns and n samples: the `unknowns`; their `covariance` (p, p), in the same order, from the
-    Fisher information and the estimated noise, valid for white noise; `slopes` (n, p), derivatives of the fitted angles;
-    `residual` (n,) rad, fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
+    """Result of a fit with p unknowns and n samples.
+
+    **Attributes**: the `unknowns`; their `covariance` (p, p), in the same order, from the Fisher information and the estimated
+    noise, valid for white noise; `slopes` (n, p): derivatives of the fitted angles by the unknowns; `residual` (n,), rad:
+    fitted minus recorded angle; `noise`, rad: standard deviation of a sample; `stopped_at`, s from the first sample, NaN if the
+    pendulum swings to the end; `converged`: True if the fit converged.
+    """
 
     unknowns: Unknowns
     covariance: Array
@@ -57,9 +61,10 @@ class Fit(NamedTuple):
 def first_guess(
     pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool, air: bool = False, torque: bool = False
 ) -> tuple[Unknowns, Array]:
-    """Return the initial parameters of a fit, from the turning points, and the smoothing width of dry friction.
+    """Return the initial parameters of a fit, from the turning points, and the smoothing width of dry friction, rad/s.
 
-    **Arguments**: `dry`, `air`, `torque`: True for unknowns of the fit; the drag of the air and the torque are 0 at first.
+    **Arguments**: `dry`, `air`, `torque`: True if this part of the law is an unknown of the fit; the initial drag of the air
+    and the initial torque are 0.
 
     A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction and 2 T_f/(m g l) to dry friction.
     """
@@ -95,7 +100,7 @@ def first_guess(
 def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
     """Return an upper bound of the number of integration steps.
 
-    It is rounded up to a power of 2, so that records of many different lengths share a few compiled programs.
+    The bound is rounded up to a power of 2. Records of many different lengths then share a few compiled programs.
     """
     return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
 
@@ -104,9 +109,10 @@ def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
 def fit_swing(
     pendulum: BearingPendulum, time: Array, angle: Array, weight: Array, start: Unknowns, width: Array, max_steps: int
 ) -> Fit:
-    """Return the least-squares fit behind `identify`, for `vmap` over records.
+    """Return the least-squares fit of `identify`; `vmap` over records is supported.
 
-    **Arguments**: `time` (n,) s from 0; `angle` (n,) rad; `weight` (n,), 1 for samples that count and 0 for the others.
+    **Arguments**: `time` (n,), s, from 0; `angle` (n,), rad; `weight` (n,): 1 for samples that count and 0 for the others;
+    `start`: initial unknowns; `width` of the smoothed dry friction, rad/s.
     """
     size = jnp.std(angle) * jnp.sqrt(2.0)
     inertia, length = pendulum.total_inertia, pendulum.length
@@ -159,7 +165,7 @@ def fit_swing(
 
 
 def _scale(pendulum: BearingPendulum, start: Unknowns, size: Array, duration: Array) -> Unknowns:
-    """Return the size of each unknown, from the amplitude and the duration of the record."""
+    """Return the typical size of each unknown, from the amplitude `size`, rad, and the `duration`, s, of the record."""
     inertia, law, rate = pendulum.total_inertia, start.friction, size * start.frequency
     return Unknowns(
         angle=size,

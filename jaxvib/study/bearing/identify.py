@@ -29,7 +29,7 @@ _MAX_HALF_PERIODS = 1.3
 rest; for a swinging pendulum it is at most 1.2."""
 
 _PATTERN_PROBABILITY = 1e-5
-"""Probability of the status `patterned` for a record whose residuals are pure noise."""
+"""Probability with which the F test of residuals that are pure noise gives the status `patterned`."""
 
 _MAX_FREQUENCY_DIFFERENCE = 0.05
 """Relative difference of frequencies, in addition to instrument errors, above which errors of length and mass cannot explain
@@ -62,7 +62,7 @@ class Identified(Result):
     - `correlation` of the errors of mu1 and mu2 (NaN without mu2)
     - `frequency` of small swings, rad/s; `offset`: the recorded angle of the rest position, rad; `angle` from it, rad, and
       `rate`, rad/s, at the first sample: an `Estimate` each
-    - `inertia`, kg m^2: J that follows from the frequency, with the mass and length of the pendulum
+    - `inertia`, kg m^2: J that follows from the frequency, with the mass, the length and the g of the pendulum
     - `noise`: standard deviation of a sample, rad
     - `pattern`: correlation of neighbouring residuals, 0 for noise
     - `structure`: F statistic of the residuals for slow changes and for vibrations at the frequency of the swing and its
@@ -100,8 +100,8 @@ class Identified(Result):
 
     def summary(self) -> str:
         """Return the estimates with their intervals as text."""
-        more = (("mu2", self.dry, ""), ("air drag", self.air, " N m s^2"), ("torque", self.torque, " N m"))
-        parts = [f"{name} {shown(each)}{unit}" for name, each, unit in more if each is not None]
+        further = (("mu2", self.dry, ""), ("air drag", self.air, " N m s^2"), ("torque", self.torque, " N m"))
+        parts = [f"{name} {shown(estimate)}{unit}" for name, estimate, unit in further if estimate is not None]
         lines = [", ".join([f"mu1 {shown(self.viscous)} N m s", *parts])]
         if self.decrement is not None:
             lines.append(f"formula of {self.decrement.periods} periods: mu1 {shown(self.decrement.viscous)} N m s")
@@ -129,15 +129,15 @@ def identify_bearing(
     instrument: float = 0.0,
     throw: bool = True,
 ) -> Identified:
-    """Return mu1, and if requested mu2, the drag of the air and a constant torque, of a bearing from a whole recorded swing.
+    """Identify mu1 of a bearing, and if requested mu2, the drag of the air and a constant torque, from a whole recorded swing.
 
         record(t_i) = offset + f(t_i) + noise
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width) - b |f'| f' + M
 
     - Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
       Levenberg and Marquardt's method with forward-mode derivatives through the integration
-    - The frequency is a free parameter, because the size of a pendulum is never known accurately enough to predict the phase of
-      many swings. The factor g is adapted to it. J is taken from `pendulum`, so that mu1 is proportional to this J
+    - The frequency is a free parameter, because the dimensions of a pendulum are never known accurately enough to predict the
+      phase of many swings; g is adapted to the frequency. J is taken from `pendulum`; therefore mu1 is proportional to this J
     - Samples before the release, and samples after the last clear turning point (the pendulum is at rest, or its swing is below
       the noise), are not used: the position at which it comes to rest is not a smooth function of the friction
     - `width` is 0.005 of the speed of the smallest swing. This reduces the dry friction of the smallest swing by 0.001 %, and
@@ -151,7 +151,7 @@ def identify_bearing(
     - `air`: True to identify b as well; `torque`: True to identify M as well. Only large swings distinguish M from the offset
     - `instrument`: relative uncertainty of J, from ruler and scales; its square is added to that of the half-width of the
       intervals; typical: 0.01 to 0.03 (0.03 in the source; default 0)
-    - `throw`: raise if no fit is found
+    - `throw`: True to raise `ComputationError` if no fit is found; otherwise the status shows it
 
     **Returns** `Identified`. **Raises** `InputError` for a record that cannot be fitted, `ComputationError` "not_converged".
 
@@ -178,18 +178,20 @@ def identify_bearing(
         # values, a fit that includes the samples at rest converges to the wrong half swing.
         start = fit_swing(*arguments, jnp.asarray(large), start, width, steps).unknowns
     fit = fit_swing(*arguments, jnp.asarray(swinging), start, width, steps)
-    found = _interpret_fit(pendulum, swing, turns, fit, float(width), instrument, until)
-    if found.status_name == "patterned":
-        note = _better_law(found, jnp.asarray(swinging), fit.unknowns, width, steps)
-        found = dataclasses.replace(found, notes=(*found.notes, *note))
-    if throw and bool(found.status == IdentifyStatus.not_converged):
-        raise ComputationError("not_converged", f"{record.name}: {found.message}")
-    return found
+    result = _interpret_fit(pendulum, swing, turns, fit, float(width), instrument, until)
+    if result.status_name == "patterned":
+        note = _better_law(result, jnp.asarray(swinging), fit.unknowns, width, steps)
+        result = dataclasses.replace(result, notes=(*result.notes, *note))
+    if throw and bool(result.status == IdentifyStatus.not_converged):
+        raise ComputationError("not_converged", f"{record.name}: {result.message}")
+    return result
 
 
 def _decay_time(turns: TurningPoints) -> float:
-    """Return the time at which the swing has decayed to a tenth, at least that of the fifth turning point; infinite if
-    never."""
+    """Return the time, s, at which the swing has decayed to a tenth, at least that of the fifth turning point.
+
+    **Returns** infinity if the swing does not decay to a tenth.
+    """
     small = np.flatnonzero(turns.amplitude < 0.1 * turns.amplitude[0])
     return float(turns.time[max(small[0], 4)]) if small.size else math.inf
 
@@ -197,7 +199,7 @@ def _decay_time(turns: TurningPoints) -> float:
 def _interpret_fit(
     pendulum: BearingPendulum, record: Record, turns: TurningPoints, fit: Fit, width: float, instrument: float, until: float
 ) -> Identified:
-    """Return the fit with intervals, a status and notes."""
+    """Return the result of a fit with intervals, a status and notes."""
     values = [float(v) for v in jax.tree.leaves(fit.unknowns)]
     used = record.time <= until
     slopes, residuals = np.asarray(fit.slopes)[used], np.asarray(fit.residual)[used]
@@ -207,10 +209,10 @@ def _interpret_fit(
     errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     samples = int(np.count_nonzero(used))
     quantile = student_quantile(samples - len(values))
-    plain = [interval(v, float(e), quantile, 0.0) for v, e in zip(values, errors, strict=True)]
-    angle, rate, offset, frequency = plain[:4]
-    each = [interval(v, float(e), quantile, instrument) for v, e in zip(values[4:], errors[4:], strict=True)]
-    law = jax.tree.unflatten(jax.tree.structure(fit.unknowns.friction), each)
+    statistical = [interval(v, float(e), quantile, 0.0) for v, e in zip(values, errors, strict=True)]
+    angle, rate, offset, frequency = statistical[:4]
+    intervals = [interval(v, float(e), quantile, instrument) for v, e in zip(values[4:], errors[4:], strict=True)]
+    law = jax.tree.unflatten(jax.tree.structure(fit.unknowns.friction), intervals)
     viscous, dry = law.viscous, law.dry
     pattern = float(np.sum(residuals[1:] * residuals[:-1]) / np.sum(residuals**2)) if np.any(residuals) else 0.0
     structure, chance = _structure(record.time[used], residuals, turns, len(values))
@@ -218,7 +220,7 @@ def _interpret_fit(
 
     is_long, weight = turns.amplitude.size > 20, float(pendulum.mass * pendulum.g * pendulum.length)
     stop = float(fit.stopped_at) + float(record.time[0])
-    found = Identified(
+    result = Identified(
         status=IdentifyStatus.found,
         notes=(),
         viscous=viscous,
@@ -243,37 +245,37 @@ def _interpret_fit(
         pendulum=pendulum,
     )
     is_patterned = abs(pattern) > 4.0 / math.sqrt(samples) or chance < _PATTERN_PROBABILITY
-    is_patterned = is_patterned and found.noise > 10.0 * TOLERANCE
-    has_converged = bool(fit.converged) and found.noise <= 0.5 * float(np.std(record.angle[used]))
-    status = _status(found, has_converged=has_converged, is_patterned=is_patterned, instrument=instrument)
-    return dataclasses.replace(found, status=status, notes=tuple(_notes(found, is_patterned=is_patterned)))
+    is_patterned = is_patterned and result.noise > 10.0 * TOLERANCE
+    has_converged = bool(fit.converged) and result.noise <= 0.5 * float(np.std(record.angle[used]))
+    status = _status(result, has_converged=has_converged, is_patterned=is_patterned, instrument=instrument)
+    return dataclasses.replace(result, status=status, notes=tuple(_notes(result, is_patterned=is_patterned)))
 
 
-def _status(found: Identified, *, has_converged: bool, is_patterned: bool, instrument: float) -> IdentifyStatus:
+def _status(result: Identified, *, has_converged: bool, is_patterned: bool, instrument: float) -> IdentifyStatus:
     """Return the status of a fit from its intervals."""
-    coefficients = [each for each in (found.viscous, found.dry, found.air) if each is not None]
+    coefficients = [estimate for estimate in (result.viscous, result.dry, result.air) if estimate is not None]
     if not has_converged:
         return IdentifyStatus.not_converged
-    if any(each.high < 0.0 for each in coefficients):
+    if any(estimate.high < 0.0 for estimate in coefficients):
         return IdentifyStatus.negative
-    if all(each.low <= 0.0 for each in coefficients):
+    if all(estimate.low <= 0.0 for estimate in coefficients):
         return IdentifyStatus.undetermined
-    if abs(found.frequency.value / float(found.pendulum.frequency) - 1.0) > _MAX_FREQUENCY_DIFFERENCE + instrument:
+    if abs(result.frequency.value / float(result.pendulum.frequency) - 1.0) > _MAX_FREQUENCY_DIFFERENCE + instrument:
         return IdentifyStatus.contradicted
     return IdentifyStatus.patterned if is_patterned else IdentifyStatus.found
 
 
-def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
-    """Yield the notes about a fit, a sentence each."""
-    decrement, frequency, small = found.decrement, found.frequency.value, float(found.pendulum.frequency)
-    if decrement is not None and found.dry is None and decrement.drift > 4.0:
+def _notes(result: Identified, *, is_patterned: bool) -> Iterator[str]:
+    """Yield the notes about a fit; each is a sentence."""
+    decrement, frequency, small = result.decrement, result.frequency.value, float(result.pendulum.frequency)
+    if decrement is not None and result.dry is None and decrement.drift > 4.0:
         yield "the swing decays faster at small amplitudes, as with dry friction: identify mu2 as well"
     elif decrement is not None and decrement.drift < -4.0:
         yield "the swing decays more slowly at small amplitudes, as with air drag: mu1 is too large"
     if abs(frequency / small - 1.0) > 0.02:
         differs = f"the swing's frequency is {frequency:.4g} rad/s, the pendulum's length and inertia give {small:.4g}"
         yield f"{differs}: mu1 is proportional to the moment of inertia, check these values"
-    for name, estimate in (("mu1", found.viscous), ("mu2", found.dry), ("the drag of the air", found.air)):
+    for name, estimate in (("mu1", result.viscous), ("mu2", result.dry), ("the drag of the air", result.air)):
         if estimate is not None and estimate.low <= 0.0:
             is_below = estimate.high < 0.0
             yield (
@@ -281,10 +283,10 @@ def _notes(found: Identified, *, is_patterned: bool) -> Iterator[str]:
                 if is_below
                 else f"{name} cannot be distinguished from 0 in this record"
             )
-    if math.isfinite(found.stopped_at):
-        yield f"dry friction stops the pendulum at {found.stopped_at:.4g} s"
-    if np.any(found.record.time > found.until):
-        yield f"the record after {found.until:.4g} s is left out: the pendulum rests, or its swing is below the noise"
+    if math.isfinite(result.stopped_at):
+        yield f"dry friction stops the pendulum at {result.stopped_at:.4g} s"
+    if np.any(result.record.time > result.until):
+        yield f"the record after {result.until:.4g} s is left out: the pendulum rests, or its swing is below the noise"
     if is_patterned:
         yield "the residuals of the fit are not noise: the intervals include their correlation, but not the error of the law"
     if decrement is not None and decrement.is_drifting:
@@ -298,12 +300,13 @@ _CLEARLY = 4.0
 """Distance of a coefficient from 0, in standard errors, above which its part of the law is named."""
 
 _LESS_NOISE = 0.9
-"""Ratio of the residuals with a larger law to those without it, below which it fits clearly better."""
+"""Ratio of the residuals with further parts of the law to those without them, below which the larger law fits clearly
+better."""
 
 
-def _better_law(found: Identified, weight: Array, start: Unknowns, width: Array, steps: int) -> Iterator[str]:
+def _better_law(result: Identified, weight: Array, start: Unknowns, width: Array, steps: int) -> Iterator[str]:
     """Yield a sentence about the parts of the law of friction that the record needs in addition, from a fit with all parts."""
-    law, pendulum, record = start.friction, found.pendulum, found.record
+    law, pendulum, record = start.friction, result.pendulum, result.record
     missing = [name for name in _LAWS if getattr(law, name) is None]
     if not missing:
         return
@@ -313,7 +316,7 @@ def _better_law(found: Identified, weight: Array, start: Unknowns, width: Array,
     time = jnp.asarray(record.time - record.time[0])
     fit = fit_swing(pendulum, time, jnp.asarray(record.angle), weight, start, width, steps)
     used = np.asarray(weight) > 0.0
-    if not bool(fit.converged) or float(fit.noise) > _LESS_NOISE * found.noise:
+    if not bool(fit.converged) or float(fit.noise) > _LESS_NOISE * result.noise:
         return
     covariance = colored_covariance(np.asarray(fit.slopes)[used], np.asarray(fit.residual)[used])
     values, errors = fit.unknowns.friction, Friction(*np.sqrt(np.diagonal(covariance))[4:])
@@ -323,15 +326,19 @@ def _better_law(found: Identified, weight: Array, start: Unknowns, width: Array,
         if abs(value) > _CLEARLY * error and (name == "torque" or value > 0.0):
             needed.append(name)
     if needed:
-        words, options = " and ".join(_LAWS[each] for each in needed), ", ".join(f"{each}=True" for each in needed)
+        words, options = (
+            " and ".join(_LAWS[name_needed] for name_needed in needed),
+            ", ".join(f"{name_needed}=True" for name_needed in needed),
+        )
         yield (
-            f"a law with {words} fits clearly better: residuals of {float(fit.noise):.2g} rad in place of {found.noise:.2g} "
+            f"a law with {words} fits clearly better: residuals of {float(fit.noise):.2g} rad in place of {result.noise:.2g} "
             f"rad; identify with {options}"
         )
 
 
-def _structure(time: np.ndarray, residuals: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:
-    """Return the F statistic of n residuals after a fit of `found` parameters, and its probability if they are noise.
+def _structure(time: np.ndarray, residuals: np.ndarray, turns: TurningPoints, unknowns: int) -> tuple[float, float]:
+    """Return the F statistic of n residuals after a fit of so many `unknowns`, and its probability for residuals that are
+    noise.
 
     The residuals are compared with slow changes of the zero, and with slowly changing vibrations at one, two and three times
     the frequency of the swing. Another law of friction, a torque or another restoring force leaves such residuals.
@@ -346,9 +353,9 @@ def _structure(time: np.ndarray, residuals: np.ndarray, turns: TurningPoints, fo
     for k, order in ((1, 5), (2, 3), (3, 3)):
         columns += [slow[:, :order] * np.cos(k * phase)[:, None], slow[:, :order] * np.sin(k * phase)[:, None]]
     basis, _ = np.linalg.qr(np.concatenate(columns, axis=1))
-    known, free = basis.shape[1] - found, time.size - basis.shape[1]
+    pattern_count, free = basis.shape[1] - unknowns, time.size - basis.shape[1]
     if free < 8 or not np.any(residuals):
         return 1.0, 1.0
     explained = float(np.sum((basis.T @ residuals) ** 2))
-    statistic = explained / known / ((float(np.sum(residuals**2)) - explained) / free)
-    return statistic, float(fdtrc(known, free, statistic))
+    statistic = explained / pattern_count / ((float(np.sum(residuals**2)) - explained) / free)
+    return statistic, float(fdtrc(pattern_count, free, statistic))

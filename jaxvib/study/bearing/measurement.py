@@ -18,7 +18,7 @@ _FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "fr
 
 
 class Measurement(NamedTuple):
-    """Arguments of `identify`: `pendulum`, `record`, and the `options` dry, air, torque and instrument."""
+    """Arguments of `identify`: `pendulum`, `record`, and `options` (dry, air, torque, instrument)."""
 
     pendulum: BearingPendulum
     record: Record
@@ -48,11 +48,11 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
             raise InputError(name, f"is {quoted(table)}; it must be a table, write [{name}]")
     pendulum = build_part(BearingPendulum, tables.get("pendulum", {}), "pendulum")
     options = build_part(_options, tables.get("identify", {}), "identify")
-    part = tables.get("record", {})
-    for name in part:
+    record_table = tables.get("record", {})
+    for name in record_table:
         if name not in _FIELDS:
             raise InputError(f"record.{name}", f"is not a field here; {suggest_name(name, list(_FIELDS))}")
-    record = build_part(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
+    record = build_part(_record, {_FIELDS[name]: value for name, value in record_table.items()}, "record")(folder)
     return Measurement(pendulum, record, options)
 
 

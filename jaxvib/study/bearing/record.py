@@ -84,13 +84,13 @@ class Record(eqx.Module):
     @validated
     def between(self, start: float, stop: float) -> Record:
         """Return the part of the record from `start` to `stop`, s. **Raises** `InputError` if it has too few samples."""
-        kept = (self.time >= start) & (self.time <= stop)
-        if np.count_nonzero(kept) < _MIN_SAMPLES:
+        is_inside = (self.time >= start) & (self.time <= stop)
+        if np.count_nonzero(is_inside) < _MIN_SAMPLES:
             span = f"{self.time[0]:g} s to {self.time[-1]:g} s"
             raise InputError(
-                self.name, f"has {np.count_nonzero(kept)} samples from {start:g} s to {stop:g} s; it goes from {span}"
+                self.name, f"has {np.count_nonzero(is_inside)} samples from {start:g} s to {stop:g} s; it goes from {span}"
             )
-        return Record(self.time[kept], self.angle[kept], self.name)
+        return Record(self.time[is_inside], self.angle[is_inside], self.name)
 
 
 @validated
@@ -135,29 +135,31 @@ def _columns(table: TextTable, requested: Sequence[str] | None, angle_unit: str 
     path, width, heads = table.path, table.width, table.heads
     if width < 2:
         raise InputError(str(path), "has one column; two are needed, time and angle, separated by commas, semicolons or tabs")
-    given = None if angle_unit is None else _factor(angle_unit, "angle", f"{path}: unit of angle")
+    given_factor = None if angle_unit is None else _factor(angle_unit, "angle", f"{path}: unit of angle")
     if not heads:
         if requested is not None or width > 2:
             raise InputError(str(path), f"has {width} columns but no line of names; add one, for example time (s), angle (deg)")
-        return [0, 1], [1.0, 1.0 if given is None else given]
-    below = table.units or [""] * width
+        return [0, 1], [1.0, 1.0 if given_factor is None else given_factor]
+    unit_row = table.units or [""] * width
     places, factors = [], []
     for k, (what, known) in enumerate(_NAMES.items()):
         parts = [split_head(head, _SI[what]) for head in heads]
         choice = tuple(name.strip().lower() for name in ((requested[k],) if requested is not None else known))
-        found = [i for i, (name, _) in enumerate(parts) if {name.lower(), heads[i].lower()} & set(choice)]
-        if not found and requested is None and width == 2:
-            found = [k]
-        if len(found) != 1:
-            problem = f"has {len(found) or 'no'} column{'s' if found else ''} {(requested[k] if requested else choice[0])!r}"
+        matching = [i for i, (name, _) in enumerate(parts) if {name.lower(), heads[i].lower()} & set(choice)]
+        if not matching and requested is None and width == 2:
+            matching = [k]
+        if len(matching) != 1:
+            problem = (
+                f"has {len(matching) or 'no'} column{'s' if matching else ''} {(requested[k] if requested else choice[0])!r}"
+            )
             names = ", ".join(heads)
             raise InputError(str(path), f"{problem} for the {what}; its columns are {names}: name those of time and angle")
-        place = found[0]
+        place = matching[0]
         name, unit = parts[place]
-        unit = below[place] or unit
+        unit = unit_row[place] or unit
         places.append(place)
-        if what == "angle" and given is not None:
-            factors.append(given)
+        if what == "angle" and given_factor is not None:
+            factors.append(given_factor)
         elif unit:
             factors.append(_factor(unit, what, f"{path}: unit of {what}"))
         elif name.lower() in known:

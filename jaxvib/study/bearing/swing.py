@@ -104,8 +104,10 @@ class BearingPendulum(eqx.Module):
 
 
 class Friction(NamedTuple):
-    """Torques on a pendulum other than that of gravity: coefficients `viscous` mu1, N m s, `dry` mu2, and `air` b, N m s^2, and
-    the constant `torque` M, N m; None for those that are absent."""
+    """Coefficients of the torques on a pendulum other than that of gravity.
+
+    **Attributes**: `viscous` mu1, N m s; `dry` mu2; `air` b, N m s^2; constant `torque` M, N m; None for an absent torque.
+    """
 
     viscous: Array
     dry: Array | None = None
@@ -179,7 +181,7 @@ def swing(
     max_steps: int = 2**17,
     throw: bool = True,
 ) -> Swing:
-    """Return the pendulum's motion at the times `time`, from `angle` and `rate` at the first of them.
+    """Return the motion of a pendulum at the times `time`, from `angle` and `rate` at the first time.
 
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width) - b |f'| f' + M
 
@@ -198,15 +200,17 @@ def swing(
     - `width`, rad/s: range of f' over which the dry friction changes its sign; default: a twentieth of the dead zone's angle
       times the natural frequency. A swing as small as the dead zone then loses 0.1 % too little energy; the error of larger
       swings is smaller. A smaller width needs more steps
-    - `stepsize_controller`: `Tolerance` of a step, whose number is the relative tolerance and also the absolute one, in rad and
-      rad/s; typical: 1e-6 to 1e-9 (the default; in single precision 1e-5). Or a controller of diffrax
-    - `solver`, `adjoint`, `max_steps`: as in diffrax
-    - `throw`: raise if `max_steps` is too small; otherwise, and under a JAX transformation, the status shows it
+    - `stepsize_controller`: a `Tolerance`, whose number is the relative tolerance of a step and also the absolute tolerance, in
+      rad and rad/s, or a controller of diffrax; typical: 1e-6 to 1e-9 (the default; in single precision 1e-5)
+    - `solver`, `adjoint`, `max_steps`: as in diffrax; default: `Tsit5`, `RecursiveCheckpointAdjoint`, 131,072 steps
+    - `throw`: True to raise `ComputationError` if `max_steps` is too small; otherwise, and under a JAX transformation, the
+      status shows it
 
     **Returns** `Swing`. Derivatives in reverse mode, and in forward mode (with `adjoint=diffrax.ForwardMode()`), `jit` and
     `vmap` are supported.
 
-    **Raises** `InputError` for wrong values and for dry friction without the bearing's diameter; `ComputationError`.
+    **Raises** `InputError` for wrong values and for dry friction without the diameter of the bearing; `ComputationError` with
+    the status "max_steps_reached".
 
     >>> import numpy as np, jaxvib as jv
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625, bearing=0.02)
@@ -270,8 +274,8 @@ def swing_states(
     max_steps: int,
 ) -> Swing:
     """Compute a `swing` without validation of its arguments; coefficients may be negative, which happens in a fit to noise."""
-    given = jnp.stack(jnp.broadcast_arrays(pendulum.frequency, angle, rate, *jax.tree.leaves(friction)))
-    exists = jnp.all(jnp.isfinite(given))
+    values = jnp.stack(jnp.broadcast_arrays(pendulum.frequency, angle, rate, *jax.tree.leaves(friction)))
+    exists = jnp.all(jnp.isfinite(values))
     # A swing of a batch that does not exist (a step of a fit left the allowed range) must not disturb the other swings.
     angle, rate, friction = jax.tree.map(lambda value: jnp.where(exists, value, 0.0), (angle, rate, friction))
     pendulum = eqx.tree_at(lambda p: p.g, pendulum, jnp.where(exists, pendulum.g, 1.0))
@@ -304,16 +308,16 @@ def swing_states(
     last = solution.ts[1][0]
     if dry is not None and free is not None:
         last, stopped = jnp.where(free, last, times[0]), stopped | ~free
-        last, rest = _last_part(pendulum, friction, dry, times, last, (end, end_slip))
-        after = stopped & ~jnp.isfinite(f)
-        f, slip = (jnp.where(after, value, before) for value, before in zip(rest, (f, slip), strict=True))
+        last, rest = _motion_to_rest(pendulum, friction, dry, times, last, (end, end_slip))
+        is_after_stop = stopped & ~jnp.isfinite(f)
+        f, slip = (jnp.where(is_after_stop, value, before) for value, before in zip(rest, (f, slip), strict=True))
     finished = stopped | (solution.result == diffrax.RESULTS.successful)
-    good = exists & finished
+    is_usable = exists & finished
     return Swing(
         status=_status(exists, finished, stopped),
         time=times,
-        angle=jnp.where(good, f, jnp.nan),
-        rate=jnp.where(good, slip, jnp.nan),
+        angle=jnp.where(is_usable, f, jnp.nan),
+        rate=jnp.where(is_usable, slip, jnp.nan),
         stopped_at=jax.lax.stop_gradient(jnp.where(stopped, last, jnp.nan)),
         width=jnp.full_like(frequency, jnp.nan) if width is None else width,
         steps=solution.stats["num_steps"],
@@ -338,9 +342,9 @@ _Pair: TypeAlias = tuple[Array, Array]
 
 
 def _margin_to_rest(pendulum: BearingPendulum, friction: Friction, dry: Array, width: Array) -> Callable[..., Array]:
-    """Return a function of the motion that becomes negative when the pendulum is slow within the dead zone.
+    """Return a function of the motion that becomes negative when the pendulum is slow and within the dead zone.
 
-    There the integration ends, because with the smoothed sign of dry friction the pendulum would creep.
+    The integration then ends, because with the smoothed sign of dry friction the pendulum would creep.
     """
 
     def moving(t: RealScalarLike, y: _Pair, args: None, **_: object) -> Array:
@@ -357,7 +361,8 @@ def _margin_to_rest(pendulum: BearingPendulum, friction: Friction, dry: Array, w
 def _rates(
     pendulum: BearingPendulum, friction: Friction, width: Array | None, free: Array | None
 ) -> Callable[[RealScalarLike, _Pair, None], _Pair]:
-    """Return the equations of motion of the pendulum; with dry friction it stays at rest unless it is `free` at the start."""
+    """Return the equations of motion of the pendulum. With dry friction it stays at rest unless `free` is True: friction does
+    not hold it at the start."""
 
     def rates(t: RealScalarLike, y: _Pair, args: None) -> _Pair:
         f, slip = y
@@ -375,21 +380,21 @@ def _rates(
     return rates
 
 
-def _last_part(
+def _motion_to_rest(
     pendulum: BearingPendulum, friction: Friction, dry: Array, times: Array, last: Array, y: _Pair
 ) -> tuple[Array, _Pair]:
-    """Return the time at which a slow pendulum comes to rest, and its angles and rates until then.
+    """Return the time at which a slow pendulum comes to rest, and its angles and rates at `times`.
 
     The motion continues from the state `y` at the time `last`. With the exact sign of dry friction it is a harmonic motion
     about that boundary of the dead zone which lies behind the moving pendulum.
     """
     (end, end_slip), frequency = y, pendulum.frequency
-    way = jnp.where(end_slip < 0.0, -1.0, 1.0)
-    middle = -way * pendulum.dead_zone(dry)
+    direction = jnp.where(end_slip < 0.0, -1.0, 1.0)
+    centre = -direction * pendulum.dead_zone(dry)
     if friction.torque is not None:
         rest = pendulum.rest_angle(friction.torque)
-        middle, frequency = middle + rest, frequency * jnp.sqrt(jnp.cos(rest))
-    reach = jnp.hypot(end - middle, end_slip / frequency)
-    last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - middle)) / frequency
+        centre, frequency = centre + rest, frequency * jnp.sqrt(jnp.cos(rest))
+    radius = jnp.hypot(end - centre, end_slip / frequency)
+    last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - centre)) / frequency
     phase = frequency * jnp.maximum(last - times, 0.0)
-    return last, (middle + way * reach * jnp.cos(phase), way * reach * frequency * jnp.sin(phase))
+    return last, (centre + direction * radius * jnp.cos(phase), direction * radius * frequency * jnp.sin(phase))

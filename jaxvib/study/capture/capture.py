@@ -35,7 +35,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, random_numbers
 
 MAX_CAPTURED_SLIP = 3e-3
-"""Relative difference of speeds below which a load turns with the rotor, as in `regime`."""
+"""Relative difference of the load speed and the rotor speed below which a load counts as turning with the rotor."""
 
 _SCAN_SPEEDS = 32
 """Number of initial speeds of a scan for the threshold."""
@@ -62,15 +62,15 @@ class Capture(Result):
 
     - `status`: a `CaptureStatus`
     - `speed` (S,), ascending: psi'/w, -1 for loads at rest in space, 0 for loads that turn with the rotor
-    - `captured` (S, starts): True if all loads turned with the rotor at the end
+    - `captured` (S, starts): True if all loads turned with the rotor at the end of the run
     - `finite` (S, starts): True if the motion stayed finite
     - `detached` (S, starts): True if a load lost contact with its wall at some time; the equations keep it on the wall
     - `threshold`: midpoint of two neighbouring computed speeds: the lowest one such that every start at this speed and at all
       higher speeds was captured, and the one below it
     - `uncertainty` of the threshold: the largest of half the distance between these two speeds, half the distance from the
       threshold to the highest speed at which half of the starts or more fail, and `last_change`; NaN if there is no threshold
-    - `last_change`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN
-      without a doubling
+    - `last_change`: change of the threshold by the last doubling of the steps, infinite if the threshold appeared or vanished,
+      NaN without a doubling
     - `steps`, and `turns` of the rotor, of each run
 
     Below the threshold outcomes may be chaotic, with single captures among failures; `fraction` gives their share.
@@ -99,7 +99,7 @@ class Capture(Result):
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Standard error (S,) of the fraction, by Agresti and Coull; it is not 0 if all starts, or none, were captured."""
+        """Standard error (S,) of the fraction, by Agresti and Coull; it is not 0 even if all starts, or none, were captured."""
         n = self.captured.shape[1]
         share = (np.sum(self.captured, axis=1) + 2.0) / (n + 4.0)
         return np.sqrt(share * (1.0 - share) / (n + 4.0))
@@ -117,14 +117,14 @@ class Capture(Result):
         head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
-            says = "a ball lost contact with its wall; the equations keep it on the wall"
-            head += f"\n  detached: in {share:.3g} % of the runs {says}"
+            sentence = "a ball lost contact with its wall; the equations keep it on the wall"
+            head += f"\n  detached: in {share:.3g} % of the runs {sentence}"
         if np.isnan(self.threshold):
             return head
         below = self.fraction[self.speed < float(self.threshold)]
-        where = f"threshold {float(self.threshold):.4f} +- {float(self.uncertainty):.1e} of the rotor's speed"
-        lone = f"; below it {100.0 * np.mean(below):.3g} % are also captured" if np.any(below > 0.0) else ""
-        return f"{head}\n  {where}{lone}"
+        threshold_text = f"threshold {float(self.threshold):.4f} +- {float(self.uncertainty):.1e} of the rotor's speed"
+        captures_below = f"; below it {100.0 * np.mean(below):.3g} % are also captured" if np.any(below > 0.0) else ""
+        return f"{head}\n  {threshold_text}{captures_below}"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
@@ -226,37 +226,39 @@ def capture(
     controller, largest_doublings = stepsize_controller, count(doublings, "doublings", low=0)
     first = controller.number if controller is not None else max(16, math.ceil(end * steps_per_second(scene, equations)))
 
-    def outcomes(which: np.ndarray, steps: int) -> list[np.ndarray]:
+    def outcomes(initial_speeds: np.ndarray, steps: int) -> list[np.ndarray]:
         """Return three Boolean arrays (speeds, starts): True for runs that are captured, stay finite, or lose contact with the
         wall."""
-        cases = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
+        cases = (scene, np.repeat(initial_speeds, starts), np.tile(shifts, (initial_speeds.size, 1)))
         shared = eqx.filter_vmap(lambda _: cases[0])(jnp.arange(cases[1].size))
         values = (shared, jnp.asarray(cases[1]), jnp.asarray(cases[2]))
-        make = _rolling_start if rotation == "rolling" else _sliding_start
-        ran = ensemble(make, values, end, stepsize_controller=EqualSteps(steps), estimate=False, equations=equations)
-        slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
-        finite = np.asarray(ran.finite)
-        found = (np.all(slip < MAX_CAPTURED_SLIP, axis=1) & finite, finite, np.any(ran.detached, axis=1))
-        return [each.reshape(which.size, starts) for each in found]
+        start_of = _rolling_start if rotation == "rolling" else _sliding_start
+        runs = ensemble(start_of, values, end, stepsize_controller=EqualSteps(steps), estimate=False, equations=equations)
+        slip = np.abs(np.asarray(runs.load_speed) / float(scene.drive.speed) - 1.0)
+        finite = np.asarray(runs.finite)
+        flags = (np.all(slip < MAX_CAPTURED_SLIP, axis=1) & finite, finite, np.any(runs.detached, axis=1))
+        return [flag.reshape(initial_speeds.size, starts) for flag in flags]
 
     def scan(_: np.ndarray, multiple: int) -> list[Capture]:
         speed, steps = first_speeds, first * multiple
-        parts = outcomes(speed, steps)
+        flags = outcomes(speed, steps)
         while resolution is not None:
-            least = _threshold_index(parts[0])
-            if least in (0, speed.size) or speed[least] - speed[least - 1] <= resolution:
+            index = _threshold_index(flags[0])
+            if index in (0, speed.size) or speed[index] - speed[index - 1] <= resolution:
                 break
-            finer = np.linspace(speed[least - 1], speed[least], max(4, _SCAN_SPEEDS // starts) + 2)[1:-1]
+            finer = np.linspace(speed[index - 1], speed[index], max(4, _SCAN_SPEEDS // starts) + 2)[1:-1]
             order = np.argsort(np.concatenate([speed, finer]))
             speed = np.concatenate([speed, finer])[order]
-            parts = [np.concatenate(pair)[order] for pair in zip(parts, outcomes(finer, steps), strict=True)]
-        captured, finite, detached = parts
+            flags = [np.concatenate(pair)[order] for pair in zip(flags, outcomes(finer, steps), strict=True)]
+        captured, finite, detached = flags
         return [_summarize_captures(speed, captured, finite, detached, turns, steps)]
 
     # A threshold close to one of the speeds may be in the interval below or above it, depending on the steps.
     tolerance = 1.001 * max(np.max(np.diff(first_speeds), initial=0.0) if resolution is None else resolution, 1e-12)
-    found = refine(scan, lambda result: np.array([result.border]), 1, tolerance, largest_doublings if controller is None else 0)
-    (result,), last_change = found.results, float(found.last_change[0, 0])
+    refined = refine(
+        scan, lambda result: np.array([result.border]), 1, tolerance, largest_doublings if controller is None else 0
+    )
+    (result,), last_change = refined.results, float(refined.last_change[0, 0])
     uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
     status = CaptureStatus.not_converged if last_change > tolerance else result.status
     return dataclasses.replace(result, last_change=jnp.asarray(last_change), uncertainty=uncertainty, status=status)
@@ -280,11 +282,11 @@ def _ascending(speeds: Sequence[float] | np.ndarray | None) -> np.ndarray:
     """Return the initial speeds of a scan, relative to the rotor; by default evenly spaced ones."""
     if speeds is None:
         return np.linspace(-1.0, 0.0, _SCAN_SPEEDS + 1)[:-1]
-    given = np.asarray(speeds, dtype=float)
-    is_list = given.ndim == 1 and given.size > 0 and np.all(np.isfinite(given))
-    if not is_list or np.any(np.diff(given) <= 0.0) or given[0] < -1.0 or given[-1] > 0.0:
+    ascending = np.asarray(speeds, dtype=float)
+    is_list = ascending.ndim == 1 and ascending.size > 0 and np.all(np.isfinite(ascending))
+    if not is_list or np.any(np.diff(ascending) <= 0.0) or ascending[0] < -1.0 or ascending[-1] > 0.0:
         raise InputError("speeds", f"is {quoted(speeds)}; ascending numbers from -1 to 0 are needed")
-    return given
+    return ascending
 
 
 def _rolling_start(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
@@ -306,17 +308,17 @@ def _threshold_index(captured: np.ndarray) -> int:
 def _summarize_captures(
     speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, detached: np.ndarray, turns: int, steps: int
 ) -> Capture:
-    least = _threshold_index(captured)
+    index = _threshold_index(captured)
     threshold, uncertainty, status = math.nan, math.nan, CaptureStatus.found
-    if least == 0:
+    if index == 0:
         status = CaptureStatus.all_captured
-    elif least == speed.size:
+    elif index == speed.size:
         status = CaptureStatus.none_captured
     else:
-        threshold = 0.5 * (speed[least - 1] + speed[least])
-        half = np.flatnonzero(np.mean(captured[:least], axis=1) <= 0.5)
+        threshold = 0.5 * (speed[index - 1] + speed[index])
+        half = np.flatnonzero(np.mean(captured[:index], axis=1) <= 0.5)
         below = speed[half[-1]] if half.size else speed[0]
-        uncertainty = max(0.5 * (speed[least] - speed[least - 1]), 0.5 * (threshold - below))
+        uncertainty = max(0.5 * (speed[index] - speed[index - 1]), 0.5 * (threshold - below))
     return Capture(
         speed=speed,
         captured=captured,
@@ -334,12 +336,15 @@ def _summarize_captures(
 def capture_time(run: Run, within: float = 0.05) -> Array:
     """Return the time, s, from which on all load speeds stay within a band around the rotor speed.
 
-    It is the last time in the trajectory of the run at which the speed of a load differs from the rotor speed by more than
+    This is the last time in the trajectory of the run at which the speed of a load differs from the rotor speed by more than
     `within` times the rotor speed, interpolated linearly between the stored states. Forward and reverse derivatives exist. The
     derivatives are valid as long as the same entry of the same load into the band is the last one. If another entry becomes
     the last one, the time jumps, and the derivatives do not show this jump.
 
-    **Returns** a scalar: 0 if all loads are within the band from the beginning, infinite if one of them is outside at the end.
+    **Arguments**: `run` with a trajectory; `within`: half the width of the band, relative to the rotor speed; typical: 0.01 to
+    0.1 (default 0.05).
+
+    **Returns** a scalar: 0 if all loads are within the band from the beginning, infinite if a load is outside at the end.
     **Raises** `InputError` for a run without a trajectory.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -356,16 +361,16 @@ def capture_time(run: Run, within: float = 0.05) -> Array:
     times, speed = run.trajectory.time, run.trajectory.rotor_speed[:, None]
     excess = jnp.abs(run.trajectory.state.azimuth_rate - speed) - within * jnp.abs(speed)
 
-    def last(excess: Array) -> Array:
-        away = excess > 0.0
-        k = jnp.max(jnp.where(away, jnp.arange(times.size), -1))
+    def last_entry(excess: Array) -> Array:
+        is_outside = excess > 0.0
+        k = jnp.max(jnp.where(is_outside, jnp.arange(times.size), -1))
         i = jnp.clip(k, 0, times.size - 2)
         drop = excess[i] - excess[i + 1]
         crossing = times[i] + (times[i + 1] - times[i]) * excess[i] / jnp.where(drop > 0.0, drop, 1.0)
         return jnp.where(k < 0, 0.0, jnp.where(k == times.size - 1, jnp.inf, crossing))
 
-    each = jnp.stack([last(excess[:, j]) for j in range(excess.shape[1])])
-    return jnp.max(each)
+    entry_times = jnp.stack([last_entry(excess[:, j]) for j in range(excess.shape[1])])
+    return jnp.max(entry_times)
 
 
 _STEPS_PER_RADIAN = 1.0
@@ -373,36 +378,36 @@ _STEPS_PER_RADIAN = 1.0
 statistical error of captured fractions."""
 
 _STEPS_PER_ADDED_RADIAN = 2.0
-"""Number of steps per radian of contacts between balls and of slips (`Effect.fastest_rate`), that is, six steps in a
+"""Number of steps per radian of contacts between balls and of sliding (`Effect.fastest_rate`): about six steps in a
 collision."""
 
 _DECAY_PER_STEP = 3.0
 """Largest product of decay rate and step. The method of order 8 is stable up to 5.2; the margin is needed because normal forces
-rise above the force on the equator."""
+can be larger than on the equator of the tube, where the rate is computed."""
 
-Found = TypeVar("Found")
+Scanned = TypeVar("Scanned")
 
 
-class Refined(NamedTuple, Generic[Found]):
+class Refined(NamedTuple, Generic[Scanned]):
     """Results of the finest scans.
 
-    **Attributes**: `results` of P points; `multiple` (P,): the number of steps of each result, in units of the first scan's;
-    `last_change` (P, K): the change of its K borders by the last doubling, infinite if only one of the two scans has the
-    border, NaN without a doubling.
+    **Attributes**: `results` of P points; `multiple` (P,): the number of steps of each result divided by that of the first
+    scan; `last_change` (P, K): the change of the K borders of each result by the last doubling, infinite if only one of the two
+    scans has the border, NaN without a doubling.
     """
 
-    results: list[Found]
+    results: list[Scanned]
     multiple: np.ndarray
     last_change: np.ndarray
 
 
 def refine(
-    scan: Callable[[np.ndarray, int], list[Found]],
-    borders: Callable[[Found], np.ndarray],
+    scan: Callable[[np.ndarray, int], list[Scanned]],
+    borders: Callable[[Scanned], np.ndarray],
     points: int,
     tolerance: float,
     doublings: int = DOUBLINGS,
-) -> Refined[Found]:
+) -> Refined[Scanned]:
     """Double the steps of each point until its borders change by less than the tolerance.
 
     **Arguments**: `scan(indices, multiple)` returns the results of points with `multiple` times the steps; `borders` returns
@@ -413,25 +418,25 @@ def refine(
     >>> found.results, found.multiple.tolist(), found.last_change.tolist()
     ([0.25], [4], [[0.25]])
     """
-    multiple, moving = np.ones(points, dtype=int), np.arange(points)
-    results = scan(moving, 1)
+    multiple, unconverged = np.ones(points, dtype=int), np.arange(points)
+    results = scan(unconverged, 1)
     last_change = np.full((points, *borders(results[0]).shape), np.nan)
     for k in range(1, doublings + 1):
-        if moving.size == 0:
+        if unconverged.size == 0:
             break
-        multiple[moving] = 2**k
-        for i, finer in zip(moving, scan(moving, 2**k), strict=True):
+        multiple[unconverged] = 2**k
+        for i, finer in zip(unconverged, scan(unconverged, 2**k), strict=True):
             last_change[i] = _distance(borders(results[i]), borders(finer))
             results[i] = finer
-        moving = moving[np.any(last_change[moving] > tolerance, axis=1)]
+        unconverged = unconverged[np.any(last_change[unconverged] > tolerance, axis=1)]
     return Refined(results, multiple, last_change)
 
 
-def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the absolute differences: 0 between two NaN, infinite between NaN and a number."""
-    apart = np.abs(one - other)
-    missing = np.isnan(one) != np.isnan(other)
-    return np.where(missing, np.inf, np.where(np.isnan(apart), 0.0, apart))
+    difference = np.abs(first - second)
+    missing = np.isnan(first) != np.isnan(second)
+    return np.where(missing, np.inf, np.where(np.isnan(difference), 0.0, difference))
 
 
 def steps_per_second(scene: Scene, equations: Equations = vector_field) -> float:
@@ -439,14 +444,13 @@ def steps_per_second(scene: Scene, equations: Equations = vector_field) -> float
 
     Rates of oscillation and decay are the eigenvalues of the `equations`, linearized about balls on the equator that turn with
     the rotor. In this state friction overdamps the balls, but it saturates at larger speeds; therefore the natural frequency
-    without friction is resolved too. Contacts and slips do not act in this state; their rates are given by
-    `Effect.fastest_rate`.
+    without friction is resolved too. Contacts and sliding do not act in this state; `Effect.fastest_rate` gives their rates.
     """
     values = np.linalg.eigvals(np.asarray(_jacobian(scene, equations)))
-    own = scene.loads.natural_frequency(scene.drive.speed)
-    oscillation = max(np.max(np.abs(values.imag)), float(scene.drive.speed if own is None else jnp.max(own)))
-    decay, added = np.max(-values.real, initial=0.0), float(effects_rate(scene))
-    return float(max(_STEPS_PER_RADIAN * oscillation, decay / _DECAY_PER_STEP, _STEPS_PER_ADDED_RADIAN * added))
+    natural = scene.loads.natural_frequency(scene.drive.speed)
+    oscillation = max(np.max(np.abs(values.imag)), float(scene.drive.speed if natural is None else jnp.max(natural)))
+    decay, contact_rate = np.max(-values.real, initial=0.0), float(effects_rate(scene))
+    return float(max(_STEPS_PER_RADIAN * oscillation, decay / _DECAY_PER_STEP, _STEPS_PER_ADDED_RADIAN * contact_rate))
 
 
 @cached
@@ -457,7 +461,7 @@ def _jacobian(scene: Scene, equations: Equations) -> Array:
     flat, unravel = ravel_pytree(with_spin(scene, State(still, still, angle, rate)))
     field = field_of(equations, scene)
 
-    def change(flat: Array) -> Array:
+    def rates(flat: Array) -> Array:
         return ravel_pytree(field(jnp.zeros((), flat.dtype), unravel(flat)))[0]
 
-    return jax.jacfwd(change)(flat)
+    return jax.jacfwd(rates)(flat)

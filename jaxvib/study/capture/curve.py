@@ -52,12 +52,12 @@ class ThresholdCurve(Result):
         """Return a line of text for each value."""
         lines = [
             f"captured in {int(self.turns)} turns: threshold of the initial speed, and the lowest captured "
-            "one, relative to the rotor speed"
+            "initial speed, relative to the rotor speed"
         ]
-        for each in zip(self.value, self.threshold, self.uncertainty, self.least, strict=True):
-            value, threshold, uncertainty, least = map(float, each)
-            found = "not every start" if np.isnan(threshold) else f"{threshold:.4f} +- {uncertainty:.1e}"
-            lines.append(f"  {value:10.6g}  {found}" + ("" if np.isnan(least) else f"; lowest {least:.4f}"))
+        for row in zip(self.value, self.threshold, self.uncertainty, self.least, strict=True):
+            value, threshold, uncertainty, least = map(float, row)
+            threshold_text = "not every start" if np.isnan(threshold) else f"{threshold:.4f} +- {uncertainty:.1e}"
+            lines.append(f"  {value:10.6g}  {threshold_text}" + ("" if np.isnan(least) else f"; lowest {least:.4f}"))
         return "\n".join(lines)
 
     @validated
@@ -93,7 +93,7 @@ def threshold_curve(
     - `values` (V,) of the parameter; typical: 5 to 20
     - `speeds`, `turns`, `starts`, `spread`, `seed`, `resolution`, `rotation`, `equations`: as for `capture`
 
-    **Returns** `ThresholdCurve`. **Raises** `InputError` if there are no values, and the errors of `capture`.
+    **Returns** `ThresholdCurve`. **Raises** `InputError` for an empty list of values, and the errors of `capture`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -105,12 +105,12 @@ def threshold_curve(
     >>> curve.threshold.tolist()
     [-0.6]
 
-    Source: as `capture`.
+    Source: see `capture`.
     """
     numbers = np.asarray(values, dtype=float)
     if numbers.ndim != 1 or numbers.size == 0 or not np.all(np.isfinite(numbers)):
         raise InputError("values", f"is {quoted(values)}; it must be a list of at least one finite number")
-    found = [
+    captures = [
         capture(
             make_scene(make, float(value)),
             speeds,
@@ -126,14 +126,14 @@ def threshold_curve(
     ]
     return ThresholdCurve(
         value=numbers,
-        threshold=np.array([each.border for each in found]),
-        uncertainty=np.array([0.0 if each.border == -1.0 else float(each.uncertainty) for each in found]),
-        least=np.array([_least(each) for each in found]),
-        last_change=np.array([float(each.last_change) for each in found]),
+        threshold=np.array([result.border for result in captures]),
+        uncertainty=np.array([0.0 if result.border == -1.0 else float(result.uncertainty) for result in captures]),
+        least=np.array([_lowest_captured_speed(result) for result in captures]),
+        last_change=np.array([float(result.last_change) for result in captures]),
         turns=jnp.asarray(turns),
     )
 
 
-def _least(found: Capture) -> float:
-    captured = np.flatnonzero(np.any(found.captured, axis=1))
-    return float(found.speed[captured[0]]) if captured.size else float("nan")
+def _lowest_captured_speed(result: Capture) -> float:
+    captured = np.flatnonzero(np.any(result.captured, axis=1))
+    return float(result.speed[captured[0]]) if captured.size else float("nan")

@@ -30,8 +30,8 @@ class CriterionMap(Result):
     - `speeds` (S,), rad/s; `mass_factor` (M,) and `drag_factor` (D,): factors on the mass and drag of the scene's loads
     - `predicted` (M, S): True if the criterion predicts stable auto-balancing (it does not depend on the drag)
     - `growth` (D, M, S), 1/s: exact growth rate, stable if negative
-    - `agreement` (D, M): share of the rotor speeds at which both agree
-    - `boundary` (M, B), rad/s: the criterion's boundaries, ascending, NaN for an absent one
+    - `agreement` (D, M): share of the rotor speeds at which criterion and exact stability agree
+    - `boundary` (M, B), rad/s: the boundaries of the criterion, ascending, NaN for an absent boundary
     - `shift` (D, M, B): (exact - predicted)/predicted for each lower or upper end of an interval of the criterion. Each end
       is compared with the same end of the exact interval of stability that overlaps most with this interval; NaN if no exact
       end is in the range of speeds
@@ -49,7 +49,8 @@ class CriterionMap(Result):
     shift: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor", "end"))
 
     def summary(self) -> str:
-        """Return a table as text: the share of speeds at which both agree, and the mean modulus of the shift of boundaries."""
+        """Return a table as text: the share of rotor speeds at which criterion and exact stability agree, and the mean modulus
+        of the shift of the boundaries."""
         lines = ["share of rotor speeds with the right prediction (mean shift of the boundaries)"]
         lines.append("drag x \\ mass x " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
         for d, factor in enumerate(self.drag_factor):
@@ -82,7 +83,7 @@ def criterion_map(
 
     **Arguments**
 
-    - `scene`; its loads are in the first arrangement of `balanced_states`
+    - `scene` with loads on a circle; exact stability is that of the first arrangement of `balanced_states`
     - `speeds`, rad/s, ascending; typical: 50 to 200 from half the lowest to twice the highest resonance
     - `mass` and `drag`: factors greater than 0, times the mass and the drag of the scene's loads; typical: 0.1 to 10
     - `steps`: as for `balanced_stability`; default: the number that the natural frequencies need. The time is proportional to
@@ -111,12 +112,12 @@ def criterion_map(
 
     scene_loads = circular_loads(scene)
 
-    def loaded(m: jax.Array, d: float = 1.0) -> Scene:
+    def scene_with(m: jax.Array, d: float = 1.0) -> Scene:
         factors = scene_loads.mass * m, scene_loads.drag * d
         loads = eqx.tree_at(lambda x: (x.mass, x.drag), scene_loads, factors)
         return eqx.tree_at(lambda s: s.loads, scene, loads)
 
-    results = [criterion(loaded(jnp.asarray(m))) for m in mass_factor]
+    results = [criterion(scene_with(jnp.asarray(m))) for m in mass_factor]
     predicted = np.stack([np.asarray(result.balances(jnp.asarray(grid))) for result in results])
     boundary = np.stack([np.sort([*r.speeds.damped_resonances, *r.speeds.damped_additional]) for r in results])
     growth = np.zeros((drag_factor.size, mass_factor.size, grid.size))
@@ -124,10 +125,10 @@ def criterion_map(
 
     def exact(cell: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         d, m = cell
-        one = loaded(jnp.asarray(mass_factor[m]), drag_factor[d])
-        growth = balanced_growth(one, grid, steps=steps)
+        scene_of_cell = scene_with(jnp.asarray(mass_factor[m]), drag_factor[d])
+        growth = balanced_growth(scene_of_cell, grid, steps=steps)
         stable = growth < 0.0
-        changes = stability_changes(one, grid, stable, close=1e-5, steps=steps)
+        changes = stability_changes(scene_of_cell, grid, stable, close=1e-5, steps=steps)
         ends = [*([np.nan] if stable[0] else []), *changes, *([np.nan] if stable[-1] else [])]
         return growth, _shifts(np.reshape(ends, (-1, 2)), grid, boundary[m])
 
@@ -149,8 +150,8 @@ def _shifts(exact: np.ndarray, grid: np.ndarray, boundary: np.ndarray) -> np.nda
         start, end = boundary[k], boundary[k + 1] if k + 1 < boundary.size else np.inf
         shared = np.minimum(high, np.inf if np.isnan(end) else end) - np.maximum(low, start)
         if shared.size and np.max(shared) > 0.0:
-            found = exact[np.argmax(shared)]
-            shifts[k] = found[0] / start - 1.0
+            interval = exact[np.argmax(shared)]
+            shifts[k] = interval[0] / start - 1.0
             if np.isfinite(end):
-                shifts[k + 1] = found[1] / end - 1.0
+                shifts[k + 1] = interval[1] / end - 1.0
     return shifts

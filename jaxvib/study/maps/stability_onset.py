@@ -74,10 +74,10 @@ def stability_map(
 
     - `make`: a function that returns the scene for a value of x
     - `values` of x, ascending; typical: 5 to 20
-    - `omega`: the range of load speeds, rad/s
+    - `omega`: the lowest and the highest load speed, rad/s; typical: a range about one resonance
     - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
 
-    **Returns** `StabilityMap`. **Raises** `InputError` if there are no values, or if they do not ascend.
+    **Returns** `StabilityMap`. **Raises** `InputError` for an empty list of values, and for values that do not ascend.
 
     >>> import jaxvib as jv
     >>> def machine(eps):
@@ -97,8 +97,8 @@ def stability_map(
     def diagram(k: int) -> ExactBranches:
         return exact_branches(scenes[k], points=points, least=omega[0], most=omega[1])
 
-    found = dict(in_parallel(diagram, range(x.size)))
-    diagrams = [found[k] for k in range(x.size)]
+    diagram_of = dict(in_parallel(diagram, range(x.size)))
+    diagrams = [diagram_of[k] for k in range(x.size)]
     return StabilityMap(
         x,
         np.stack([np.asarray(d.omega) for d in diagrams]),
@@ -126,13 +126,13 @@ def stability_onset(
 
     - `make`: a function that returns the scene for a value of x
     - `kind` of the special point, see `SpecialPoint`
-    - `between`: two positive values of x, the lower without such a point, the upper with one
-    - `omega`: the range of load speeds of the search, rad/s
+    - `between`: two positive values of x; at the lower value the diagram has no such point, at the higher value it has one
+    - `omega`: the lowest and the highest load speed of the search, rad/s
     - `points` of each diagram; typical: 60 to 300 (the default). The time is proportional to it
     - `accuracy` of x, relative; typical: 0.1 to 1e-3 (the default). Each diagram halves the range
 
-    **Returns** x, which is too large by at most `accuracy`. **Raises** `InputError` if both values of `between` have such a
-    point, or neither.
+    **Returns** x, which is too large by at most `accuracy` (relative). **Raises** `InputError` for an unknown kind, and if the
+    diagrams of both values of `between` have such a point, or neither.
 
     >>> import jaxvib as jv
     >>> def machine(eps):
@@ -156,10 +156,10 @@ def stability_onset(
         raise InputError("between", f"is {quoted(between)}; it must be two positive values, the lower one first")
     for x, is_required in ((low, False), (high, True)):
         if has_point(x) != is_required:
-            found, required = ("no", "a") if is_required else ("a", "no")
+            present, required = ("no", "a") if is_required else ("a", "no")
             raise InputError(
                 "between",
-                f"is {quoted(between)}; at {x:g} the diagram has {found} {kind} and must have {required}: "
+                f"is {quoted(between)}; at {x:g} the diagram has {present} {kind} and must have {required}: "
                 f"{'raise' if is_required else 'lower'} this value (stability_map shows the special points)",
             )
     while high / low > 1.0 + accuracy:
