@@ -167,7 +167,7 @@ def killed(folder: pathlib.Path, out: pathlib.Path) -> None:
 
 def watched(told: str):
     """Computation of a chunk by a worker, with a line in a file for each: the process, begin, end, processor time."""
-    real = jaxvib.sweeps.cluster._remote
+    real = jaxvib.sweeps.cluster._compute_remotely
 
     def remote(*given):
         begun, spent = time.time(), time.process_time()
@@ -194,7 +194,7 @@ def cluster(folder: pathlib.Path, out: pathlib.Path) -> None:
     here, there, hurt = folder / "here.zarr", folder / "there.zarr", folder / "hurt.zarr"
     own = jaxvib.sweeps.cluster.versions()  # with what watches the workers, this process would have other sources than they
     jaxvib.sweeps.cluster.versions = lambda: own
-    jaxvib.sweeps.cluster._remote, plain = watched(str(told)), jaxvib.sweeps.cluster._remote
+    jaxvib.sweeps.cluster._compute_remotely, plain = watched(str(told)), jaxvib.sweeps.cluster._compute_remotely
     for turn in range(3):
         for name, store, more in (("in this process", here, {}), ("two workers", there, {"workers": 2})):
             shutil.rmtree(store, ignore_errors=True)
@@ -211,7 +211,7 @@ def cluster(folder: pathlib.Path, out: pathlib.Path) -> None:
             gap, computing = np.mean(mine[1:, 1] - mine[:-1, 2]), np.mean(mine[:, 2] - mine[:, 1])
             share = f"{computing:.3f} s a chunk ({np.mean(mine[:, 3]):.3f} s of the processor), {1e3 * gap:.1f} ms between two"
             print(f"  worker {worker:.0f}: {share}, {100.0 * gap / computing:.1f} %", flush=True)
-    jaxvib.sweeps.cluster._remote = plain
+    jaxvib.sweeps.cluster._compute_remotely = plain
     print("two workers, bit for bit the same:", same(here, there), flush=True)
 
     def kill_one(now) -> None:

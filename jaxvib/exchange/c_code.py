@@ -1,7 +1,7 @@
 """C source of scalar programs.
 
 Statements that depend only on parameters form a separate function, which is called when a parameter changes; the equations read
-its results as constants. Each operation is one statement. An operation without a rule is an error.
+its results as constants. Each operation is one statement. An operation without a rule raises an error.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _BRANCHES = {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 """Comparisons that select one of two expressions, such as contact or no contact."""
 
 
-class Written(NamedTuple):
+class CProgram(NamedTuple):
     """Program in C.
 
     **Attributes**: `prepare`: the statements that depend only on parameters; `body`: the other statements; `constants`: number
@@ -67,7 +67,7 @@ class Written(NamedTuple):
 
 
 def number_text(value: Any) -> str:
-    """Return a number as C text from which a compiler obtains the same bits.
+    """Return a number as C text that a compiler converts to the same bits.
 
     >>> number_text(0.1), number_text(-3.0), number_text(True)
     ('0.1', '-3.0', '1')
@@ -82,16 +82,16 @@ def number_text(value: Any) -> str:
 
 def write_program(
     program: ClosedJaxpr, inputs: Sequence[str], parameters: int, outputs: Sequence[str], *, has_events: bool = False
-) -> Written:
+) -> CProgram:
     """Write a scalar program as C.
 
     **Arguments**: `inputs`: the C expression of each argument; `parameters`: number of leading arguments that change only at
     events; `outputs`: the C expression to which each result is assigned; `has_events`: True to assign the difference of the two
     compared values to an event indicator, for each comparison.
 
-    **Raises** `InputError` with the name of an operation without a rule.
+    **Raises** `InputError` for an operation without a rule; the message names the operation.
     """
-    return _Writer(program, inputs, parameters, has_events).written(outputs)
+    return _Writer(program, inputs, parameters, has_events).translate(outputs)
 
 
 class _Writer:
@@ -108,7 +108,7 @@ class _Writer:
         self.body: list[str] = []
         self.branches = 0
 
-    def written(self, outputs: Sequence[str]) -> Written:
+    def translate(self, outputs: Sequence[str]) -> CProgram:
         jaxpr = self.program.jaxpr
         for equation in jaxpr.eqns:
             early = all(isinstance(atom, Literal) or atom in self.early for atom in equation.invars)
@@ -124,7 +124,7 @@ class _Writer:
         for atom, target in zip(jaxpr.outvars, outputs, strict=True):
             self.body.append(f"{target} = {self._read(atom, early=False)};")
         self.prepare += [f"{place} = {self.names[variable]};" for variable, place in self.constants.items()]
-        return Written(self.prepare, self.body, len(self.constants), self.branches)
+        return CProgram(self.prepare, self.body, len(self.constants), self.branches)
 
     def _read(self, atom: Var | Literal, *, early: bool) -> str:
         """Return the C expression of a value, in `prepare` if `early`, otherwise in `body`."""
@@ -149,11 +149,13 @@ class _Writer:
         if name in ("max", "min", "clamp"):
             real = not early and _is_real(equation)
             if name != "clamp":
-                return [self._larger(values[0], values[1], ">" if name == "max" else "<", real)]
+                return [self._select_larger(values[0], values[1], ">" if name == "max" else "<", real)]
             low, x, high = values
-            above = f"x{len(self.names)}a"
-            (self.prepare if early else self.body).append(f"const double {above} = {self._larger(x, low, '>', real)};")
-            return [self._larger(above, high, "<", real)]
+            lower_bounded = f"x{len(self.names)}a"
+            (self.prepare if early else self.body).append(
+                f"const double {lower_bounded} = {self._select_larger(x, low, '>', real)};"
+            )
+            return [self._select_larger(lower_bounded, high, "<", real)]
         if (rule := _SPECIAL.get(name)) is not None:
             return [rule(values, params, equation)]
         if name not in _RULES or (name == "div" and not _is_real(equation)):
@@ -161,8 +163,8 @@ class _Writer:
             raise InputError("scene", problem)
         return [_RULES[name].format(*values)]
 
-    def _larger(self, x: str, y: str, than: str, real: bool) -> str:
-        """Return the larger or smaller of two numbers; NaN if x is NaN."""
+    def _select_larger(self, x: str, y: str, than: str, real: bool) -> str:
+        """Return the C text of the larger or smaller of two numbers, which is NaN if one of them is NaN."""
         test = f"{x} {than} {y} || {x} != {x}"
         return f"{self._branch(test, x, y) if real else f'({test})'} ? {x} : {y}"
 
@@ -193,10 +195,10 @@ def _power(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> 
 
 
 def _select(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:
-    which, *cases = values
+    index, *cases = values
     if len(cases) == 2:
-        return f"{which} ? {cases[1]} : {cases[0]}"
-    return " : ".join([*(f"{which} == {k} ? {case}" for k, case in enumerate(cases[:-1])), cases[-1]])
+        return f"{index} ? {cases[1]} : {cases[0]}"
+    return " : ".join([*(f"{index} == {k} ? {case}" for k, case in enumerate(cases[:-1])), cases[-1]])
 
 
 def _convert(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:

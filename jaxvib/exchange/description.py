@@ -50,12 +50,12 @@ class Variable(NamedTuple):
 
     @property
     def variability(self) -> str:
-        """Variability of FMI."""
+        """Variability in the sense of FMI: "tunable" or "continuous"."""
         return "tunable" if self.kind == "parameter" else "continuous"
 
     @property
     def is_calculated(self) -> bool:
-        """True if the initial value is also computed from other variables."""
+        """True if the initial value is computed from other variables."""
         return self.kind in ("output", "local") and self.start is None
 
 
@@ -84,74 +84,80 @@ def describe_model(
     **Arguments**: `name` and `identifier` of the model; `token`: text that must be equal in the binary; `variables` in the
     order of their value references; `step` of co-simulation and `stop` time of the default experiment, s.
     """
-    two = fmi == "2.0"
-    listed = [(reference, each) for reference, each in enumerate(variables) if each.listed or not two]
+    is_version_2 = fmi == "2.0"
+    listed = [(reference, variable) for reference, variable in enumerate(variables) if variable.listed or not is_version_2]
     places = {reference: place for place, (reference, _) in enumerate(listed, 1)}
-    indicators = [reference for reference, each in enumerate(variables) if not each.listed]
-    structured = all(_STRUCTURED.fullmatch(each.name) for each in variables)
-    head = {
+    indicators = [reference for reference, variable in enumerate(variables) if not variable.listed]
+    structured = all(_STRUCTURED.fullmatch(variable.name) for variable in variables)
+    attributes = {
         "fmiVersion": fmi,
         "modelName": name,
-        "guid" if two else "instantiationToken": token,
+        "guid" if is_version_2 else "instantiationToken": token,
         "description": about,
         "generationTool": tool,
         "variableNamingConvention": "structured" if structured else "flat",
-        **({"numberOfEventIndicators": str(len(indicators))} if two else {}),
+        **({"numberOfEventIndicators": str(len(indicators))} if is_version_2 else {}),
     }
     states = "canGetAndSetFMUstate", "canSerializeFMUstate"
-    can = states if two else tuple(each.replace("state", "State") for each in states)
+    capabilities = states if is_version_2 else tuple(variable.replace("state", "State") for variable in states)
     common = {
         "modelIdentifier": identifier,
-        **dict.fromkeys(can, "true"),
-        "providesDirectionalDerivative" + "s" * (not two): "true",
+        **dict.fromkeys(capabilities, "true"),
+        "providesDirectionalDerivative" + "s" * (not is_version_2): "true",
     }
     stepping = {"canHandleVariableCommunicationStepSize": "true"}
-    files = [f'<SourceFiles><File name="fmi{fmi[0]}.c"/></SourceFiles>'] if two else []
+    files = [f'<SourceFiles><File name="fmi{fmi[0]}.c"/></SourceFiles>'] if is_version_2 else []
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        _tag("fmiModelDescription", head, closed=False),
+        _tag("fmiModelDescription", attributes, closed=False),
         *_element("ModelExchange", common, files),
         *_element("CoSimulation", {**common, **stepping}, files),
         "<UnitDefinitions>",
         *(
             f"<Unit name={_attribute(unit)}>{_tag('BaseUnit', {k: str(v) for k, v in base_units(unit).items()})}</Unit>"
-            for unit in sorted({each.unit for _, each in listed if each.unit})
+            for unit in sorted({variable.unit for _, variable in listed if variable.unit})
         ),
         "</UnitDefinitions>",
         '<LogCategories><Category name="logStatusError"/></LogCategories>',
         _tag("DefaultExperiment", {"startTime": "0.0", "stopTime": stop, "stepSize": step}),
         "<ModelVariables>",
-        *(_variable(two, reference, each, places) for reference, each in listed),
+        *(_variable_element(is_version_2, reference, variable, places) for reference, variable in listed),
         "</ModelVariables>",
         "<ModelStructure>",
     ]
-    outputs = [reference for reference, each in listed if each.kind == "output"]
-    rates = [reference for reference, each in listed if each.state is not None]
-    initial = [reference for reference, each in listed if each.is_calculated and each.listed]
+    outputs = [reference for reference, variable in listed if variable.kind == "output"]
+    rates = [reference for reference, variable in listed if variable.state is not None]
+    initial = [reference for reference, variable in listed if variable.is_calculated and variable.listed]
     groups = {"Outputs": outputs, "Derivatives": rates, "InitialUnknowns": initial}
-    if two:
+    if is_version_2:
         for group, members in groups.items():
-            lines += [f"<{group}>", *(_tag("Unknown", {"index": str(places[each])}) for each in members), f"</{group}>"]
+            lines += [f"<{group}>", *(_tag("Unknown", {"index": str(places[variable])}) for variable in members), f"</{group}>"]
     else:
         names = "Output", "ContinuousStateDerivative", "InitialUnknown", "EventIndicator"
         for group, members in zip(names, (*groups.values(), indicators), strict=True):
-            lines += [_tag(group, {"valueReference": str(each)}) for each in members]
+            lines += [_tag(group, {"valueReference": str(variable)}) for variable in members]
     return "\n".join([*lines, "</ModelStructure>", "</fmiModelDescription>", ""])
 
 
-def _variable(two: bool, reference: int, each: Variable, places: Mapping[int, int]) -> str:
-    head = {"name": each.name, "valueReference": str(reference)}
-    if each.about:
-        head["description"] = each.about
-    head |= {"causality": each.kind, "variability": each.variability}
-    if each.kind in ("output", "local"):
-        head["initial"] = "calculated" if each.is_calculated else "exact"
-    derivative = None if each.state is None else str(places[each.state] if two else each.state)
-    own = {"unit": each.unit or None, "min": each.low, "max": each.high, "nominal": each.nominal, "derivative": derivative}
-    own = {key: value for key, value in {**own, "start": each.start}.items() if value is not None}
-    if two:
-        return f"{_tag('ScalarVariable', head, closed=False)}{_tag('Real', own)}</ScalarVariable>"
-    return _tag("Float64", {**head, **own})
+def _variable_element(is_version_2: bool, reference: int, variable: Variable, places: Mapping[int, int]) -> str:
+    attributes = {"name": variable.name, "valueReference": str(reference)}
+    if variable.about:
+        attributes["description"] = variable.about
+    attributes |= {"causality": variable.kind, "variability": variable.variability}
+    if variable.kind in ("output", "local"):
+        attributes["initial"] = "calculated" if variable.is_calculated else "exact"
+    derivative = None if variable.state is None else str(places[variable.state] if is_version_2 else variable.state)
+    type_attributes = {
+        "unit": variable.unit or None,
+        "min": variable.low,
+        "max": variable.high,
+        "nominal": variable.nominal,
+        "derivative": derivative,
+    }
+    type_attributes = {key: value for key, value in {**type_attributes, "start": variable.start}.items() if value is not None}
+    if is_version_2:
+        return f"{_tag('ScalarVariable', attributes, closed=False)}{_tag('Real', type_attributes)}</ScalarVariable>"
+    return _tag("Float64", {**attributes, **type_attributes})
 
 
 def _element(name: str, attributes: Mapping[str, str], content: Sequence[str]) -> list[str]:

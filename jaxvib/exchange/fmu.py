@@ -23,7 +23,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, require_one_of, require_writable, written
-from jaxvib.exchange.c_code import Written, number_text, write_program
+from jaxvib.exchange.c_code import CProgram, number_text, write_program
 from jaxvib.exchange.description import Fmi, Variable, describe_model
 from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, named_entries, without_motor_states
 from jaxvib.machine.scene import Scene
@@ -36,7 +36,7 @@ from jaxvib.ode.scalarize import NotScalarizable, scalar_program
 from jaxvib.runtime.compat import HAS_JAXPRS
 
 _STEPS_PER_RADIAN = 16.0
-"""Number of steps of co-simulation per radian of the fastest motion; with it the phase error is 1e-7 per radian."""
+"""Number of steps of co-simulation per radian of the fastest motion; the phase error is then about 1e-7 per radian."""
 
 _COMPILERS = ("cc", "gcc", "clang")
 _COMPILER_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden", "-s")
@@ -81,7 +81,7 @@ def export_fmu(
     """Write a scene as a functional mock-up unit (FMU), for model exchange and co-simulation.
 
     The file contains the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary for this
-    platform. Tools that use it need neither Python nor jaxvib. The same scene gives a file with the same bytes.
+    platform. Tools that use the file need neither Python nor jaxvib. The same scene gives a file with the same bytes.
 
     - Parameters are all parameters of the scene with their names (`machine.stiffness[0]`), units and bounds; they may change
       during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which uses the classical Runge-Kutta
@@ -91,8 +91,8 @@ def export_fmu(
     - Inputs are `force.y1` on each coordinate (N, for angles N m) and, with a motor, `rotor.torque` (N m, anticlockwise), which
       is added to the torque of the motor
     - In a scene with several exciters, the names of their signals begin with the exciter, such as `exciters[1].rotor.torque`
-    - Event indicators are comparisons in nonsmooth forces (stops, contacts, dry friction) and in a drive whose acceleration
-      jumps; a solver ends a step at the time at which an indicator changes its sign
+    - Event indicators belong to comparisons in nonsmooth forces (stops, contacts, dry friction) and in a drive whose
+      acceleration jumps; a solver ends a step at the time at which an indicator changes its sign
     - Directional derivatives of rates and outputs with respect to states, inputs, parameters and time are exact
 
     **Arguments**
@@ -100,7 +100,7 @@ def export_fmu(
     - `scene` to export
     - `path` of the file, ".fmu"
     - `fmi`: version of the standard, "2.0" (the default) or "3.0"
-    - `start`: as in `simulate` except "spin_up", or a `State`
+    - `start`: "rest" (the default) or another name of `simulate` except "spin_up", or a `State`
     - `mode`: number of the jam mode for `start="jam"`; typical: 1, 3, 5
     - `drive`: "scene" (the default), or "input" for inputs in place of the drive: `rotor.speed` and its derivative
       `rotor.acceleration` for an ideal drive (prescribed motion), only `rotor.torque` for a motor
@@ -127,11 +127,11 @@ def export_fmu(
     path = Path(path)
     path = path if path.suffix == ".fmu" else path.with_name(path.name + ".fmu")
     require_writable(path)
-    files, statements, identifier = _sources(scene, state, path.stem, fmi, drive)
+    files, statements, identifier = _source_files(scene, state, path.stem, fmi, drive)
     message = "source only: no binary was requested"
     library = None
     if binary:
-        library, message = _compiled(files, fmi, identifier)
+        library, message = _compile(files, fmi, identifier)
     if library is not None:
         files |= library
     with written(path) as part, part.open("wb") as file:
@@ -139,27 +139,27 @@ def export_fmu(
     return Fmu(path, library is not None, message, statements)
 
 
-def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) -> tuple[dict[str, bytes], int, str]:
-    """Return the files of the unit without a binary, the number of its statements, and the identifier of the model."""
+def _source_files(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) -> tuple[dict[str, bytes], int, str]:
+    """Return the files of the unit without a binary, the number of C statements, and the identifier of the model."""
     equations, names = equations_of(scene, state, drive), named_entries(scene)
     events = has_events(scene)
     programs = _programs(scene, equations, events, len(names))
-    step = _step(scene)
+    step = _max_step(scene)
     variables = _variables(scene, equations, programs.rates.branches, step)
     identifier = re.sub(r"\W", "_", name, flags=re.ASCII)[:60]
     identifier = identifier if re.match("[A-Za-z]", identifier) else f"machine_{identifier}"
-    body = _model(scene, equations, programs, variables)
-    own = Path(__file__).parent / "c"
-    files = {f"sources/{each}": (own / each).read_bytes() for each in ("machine.h", f"fmi{fmi[0]}.c")}
+    body = _model_source(scene, equations, programs, variables)
+    c_folder = Path(__file__).parent / "c"
+    files = {f"sources/{c_file}": (c_folder / c_file).read_bytes() for c_file in ("machine.h", f"fmi{fmi[0]}.c")}
 
-    def described(token: str) -> str:
-        tool, about = f"jaxvib {version('jaxvib')}", _described(scene)
+    def description(token: str) -> str:
+        tool, about = f"jaxvib {version('jaxvib')}", _describe_scene(scene)
         return describe_model(fmi, name, identifier, token, tool, about, variables, _text(step), "10.0")
 
-    content = "".join([described(""), body, *(text.decode() for text in files.values())])
+    content = "".join([description(""), body, *(text.decode() for text in files.values())])
     token = "{" + hashlib.sha256(content.encode()).hexdigest()[:32] + "}"
     files["sources/model.h"] = f'#define TOKEN "{token}"\n{body}'.encode()
-    files["modelDescription.xml"] = described(token).encode()
+    files["modelDescription.xml"] = description(token).encode()
     if fmi == "3.0":
         files["sources/buildDescription.xml"] = (
             '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'
@@ -169,32 +169,34 @@ def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) ->
     return files, len(programs.rates.body), identifier
 
 
-def _described(scene: Scene) -> str:
+def _describe_scene(scene: Scene) -> str:
     """Return a description of the machine and its exciters."""
-    carried = [
+    carried_parts = [
         " and ".join(
-            ([] if each.loads is None else [f"{each.loads.count} {each.loads.kind}"])
-            + ["an unbalance"] * (each.unbalance is not None)
+            ([] if exciter.loads is None else [f"{exciter.loads.count} {exciter.loads.kind}"])
+            + ["an unbalance"] * (exciter.unbalance is not None)
         )
-        for each in scene.exciters
+        for exciter in scene.exciters
     ]
-    return f"{scene.machine.kind} with {', '.join(carried)}"
+    return f"{scene.machine.kind} with {', '.join(carried_parts)}"
 
 
-def _step(scene: Scene) -> float:
+def _max_step(scene: Scene) -> float:
     """Return the longest step of co-simulation, s."""
     fastest, decay = float(frequency_bounds(scene)[0]), float(fastest_decay(scene))
     return float(f"{1.0 / max(_STEPS_PER_RADIAN * fastest, decay):.3g}")
 
 
 class _Programs(NamedTuple):
-    """Programs in C: the rates and outputs (`rates`); their directional derivatives with respect to states and inputs
-    (`tangent`), which implicit solvers need often; and those with respect to parameters, time, states and inputs
-    (`full_tangent`)."""
+    """Programs in C.
 
-    rates: Written
-    tangent: Written
-    full_tangent: Written
+    **Attributes**: `rates`: rates and outputs; `tangent`: their directional derivatives with respect to states and inputs,
+    which implicit solvers need often; `full_tangent`: those with respect to parameters, time, states and inputs.
+    """
+
+    rates: CProgram
+    tangent: CProgram
+    full_tangent: CProgram
 
 
 def _programs(scene: Scene, equations: Equations, events: bool, parameters: int) -> _Programs:
@@ -202,26 +204,26 @@ def _programs(scene: Scene, equations: Equations, events: bool, parameters: int)
     if not HAS_JAXPRS:
         raise InputError("scene", "cannot be written in C, because this version of JAX does not give access to its programs")
     time = jnp.zeros((), scene.top_speed.dtype)
-    given = (scene, time, equations.states, equations.inputs)
+    arguments = (scene, time, equations.states, equations.inputs)
 
     def tangent(scene: Scene, t: Array, states: object, inputs: object, *direction: object) -> object:
-        return jax.jvp(lambda *moving: equations.rates(scene, t, *moving), (states, inputs), direction)[1]
+        return jax.jvp(lambda *changing: equations.rates(scene, t, *changing), (states, inputs), direction)[1]
 
     def full_tangent(*values: Any) -> object:
-        return jax.jvp(equations.rates, values[: len(given)], values[len(given) :])[1]
+        return jax.jvp(equations.rates, values[: len(arguments)], values[len(arguments) :])[1]
 
     try:
-        rates = scalar_program(equations.rates, *given)
-        tangents = scalar_program(tangent, *given, *given[2:]), scalar_program(full_tangent, *given, *given)
+        rates = scalar_program(equations.rates, *arguments)
+        tangents = scalar_program(tangent, *arguments, *arguments[2:]), scalar_program(full_tangent, *arguments, *arguments)
     except NotScalarizable as error:
         problem = f"needs the operation {str(error)!r} of JAX, which is not available for scalars"
         raise InputError("scene", f"{problem}; remove the part that needs it") from error
     numbers, number_seeds = ([f"{name}[{k}]" for k in range(parameters)] for name in ("p", "p_seed"))
     count = {"x": len(equations.state_signals), "u": len(equations.input_signals), "y": len(equations.output_signals)}
-    moving = [f"{name}[{k}]" for name in "xu" for k in range(count[name])]
+    changing = [f"{name}[{k}]" for name in "xu" for k in range(count[name])]
     seeds = [f"{name}_seed[{k}]" for name in "xu" for k in range(count[name])]
     results = [f"{name}[{k}]" for name, size in (("rate", "x"), ("y", "y")) for k in range(count[size])]
-    values = [*numbers, "t", *moving]
+    values = [*numbers, "t", *changing]
     return _Programs(
         write_program(rates, values, parameters, results, has_events=events),
         write_program(tangents[0], [*values, *seeds], parameters, results),
@@ -246,27 +248,27 @@ def _variables(scene: Scene, equations: Equations, branches: int, step: float) -
     scales = _flat(jax.tree.map(lambda size, leaf: np.full(np.shape(leaf), size), error_scale(state, units), state))
     nominals = [*scales, *["1.0"] * (len(signals) - len(scales))]
     states = [
-        Variable(each.name, each.unit, "output", start, nominal=nominal)
-        for each, start, nominal in zip(signals, _flat(equations.states), nominals, strict=True)
+        Variable(item.name, item.unit, "output", start, nominal=nominal)
+        for item, start, nominal in zip(signals, _flat(equations.states), nominals, strict=True)
     ]
     rates = [
-        Variable(f"der({each.name})", f"{each.unit}/s" if "/" not in each.unit else f"{each.unit}^2", "local", state=k)
-        if own is None
-        else Variable(own.name, own.unit, "output", state=k)
-        for k, (each, own) in enumerate(zip(signals, equations.rate_signals, strict=True), 1)
+        Variable(f"der({item.name})", f"{item.unit}/s" if "/" not in item.unit else f"{item.unit}^2", "local", state=k)
+        if rate_signal is None
+        else Variable(rate_signal.name, rate_signal.unit, "output", state=k)
+        for k, (item, rate_signal) in enumerate(zip(signals, equations.rate_signals, strict=True), 1)
     ]
     starts = zip(equations.input_signals, _flat(equations.inputs), strict=True)
     parameters = []
-    for each, value in zip(named_entries(scene), _flat(scene), strict=True):
-        low, high = (_text(x) if np.isfinite(x) else None for x in (each.spec.bounds.low, each.spec.bounds.high))
-        (about,) = each.words(scene)
-        parameters.append(Variable(each.name, each.unit, "parameter", value, about, low, high))
+    for item, value in zip(named_entries(scene), _flat(scene), strict=True):
+        low, high = (_text(x) if np.isfinite(x) else None for x in (item.spec.bounds.low, item.spec.bounds.high))
+        (about,) = item.words(scene)
+        parameters.append(Variable(item.name, item.unit, "parameter", value, about, low, high))
     return [
         Variable("time", "s", "independent"),
         *states,
         *rates,
-        *(Variable(each.name, each.unit, "input", start) for each, start in starts),
-        *(Variable(each.name, each.unit, "output") for each in equations.output_signals),
+        *(Variable(item.name, item.unit, "input", start) for item, start in starts),
+        *(Variable(item.name, item.unit, "output") for item in equations.output_signals),
         *parameters,
         Variable("co_simulation.step", "s", "parameter", _text(step), "longest step of co-simulation", "0.0"),
         *(Variable(f"event_indicator[{k}]", "", "local", listed=False) for k in range(branches)),
@@ -275,7 +277,7 @@ def _variables(scene: Scene, equations: Equations, branches: int, step: float) -
 
 _MODEL = """/* Equations of one scene, written by jaxvib.
 
-   p parameters, t time, x states, u inputs, y outputs; constants are what `prepare` computes from the parameters. */
+   p parameters, t time, x states, u inputs, y outputs; constants: the results of `prepare`, which depend on parameters only. */
 
 #define STATES {states}
 #define INPUTS {inputs}
@@ -314,7 +316,7 @@ static void tangent(const double *p, const double *constants, double t, const do
 {tangent}
 }}
 
-/* The same in the direction (p_seed, t_seed, x_seed, u_seed). */
+/* Derivatives of rates and outputs in the direction (p_seed, t_seed, x_seed, u_seed). */
 static void prepare_full_tangent(const double *p, double *constants) {{
 {prepare_full_tangent}
 }}
@@ -327,27 +329,27 @@ static void full_tangent(const double *p, const double *constants, double t, con
 """
 
 
-def _model(scene: Scene, equations: Equations, programs: _Programs, variables: list[Variable]) -> str:
+def _model_source(scene: Scene, equations: Equations, programs: _Programs, variables: list[Variable]) -> str:
     """Return the C source of the equations."""
-    parameters = [each for each in variables if each.kind == "parameter"]
-    bounds = [each.spec.bounds for each in named_entries(scene)]
-    opened = [*(int(each.open_low) + 2 * int(each.open_high) for each in bounds), 1]
-    states = [each for each in variables if each.nominal is not None]
-    inputs = [each for each in variables if each.kind == "input"]
+    parameters = [item for item in variables if item.kind == "parameter"]
+    bounds = [item.spec.bounds for item in named_entries(scene)]
+    open_bounds = [*(int(item.open_low) + 2 * int(item.open_high) for item in bounds), 1]
+    states = [item for item in variables if item.nominal is not None]
+    inputs = [item for item in variables if item.kind == "input"]
     lists = {
-        "names": ['"' + re.sub(r"[^ -~]|[\"\\%?]", "_", each.name) + '"' for each in variables],
-        "start_states": [str(each.start) for each in states],
-        "start_inputs": [str(each.start) for each in inputs],
-        "start_parameters": [str(each.start) for each in parameters],
-        "nominals": [str(each.nominal) for each in states],
-        "low": [each.low or "-INFINITY" for each in parameters],
-        "high": [each.high or "INFINITY" for each in parameters],
-        "open": [str(each) for each in opened],
+        "names": ['"' + re.sub(r"[^ -~]|[\"\\%?]", "_", item.name) + '"' for item in variables],
+        "start_states": [str(item.start) for item in states],
+        "start_inputs": [str(item.start) for item in inputs],
+        "start_parameters": [str(item.start) for item in parameters],
+        "nominals": [str(item.nominal) for item in states],
+        "low": [item.low or "-INFINITY" for item in parameters],
+        "high": [item.high or "INFINITY" for item in parameters],
+        "open": [str(item) for item in open_bounds],
     }
     blocks = {"prepare": programs.rates.prepare, "body": programs.rates.body}
     for name in ("tangent", "full_tangent"):
-        written = getattr(programs, name)
-        blocks |= {f"prepare_{name}": written.prepare, name: written.body}
+        program = getattr(programs, name)
+        blocks |= {f"prepare_{name}": program.prepare, name: program.body}
     return _MODEL.format(
         states=len(states),
         inputs=len(inputs),
@@ -362,32 +364,32 @@ def _model(scene: Scene, equations: Equations, programs: _Programs, variables: l
     )
 
 
-def _compiled(files: dict[str, bytes], fmi: Fmi, identifier: str) -> tuple[dict[str, bytes] | None, str]:
+def _compile(files: dict[str, bytes], fmi: Fmi, identifier: str) -> tuple[dict[str, bytes] | None, str]:
     """Return the binary for this platform, or None, and a sentence about it."""
-    found = _PLATFORMS.get((platform.system(), platform.machine()))
+    folders = _PLATFORMS.get((platform.system(), platform.machine()))
     compiler = next(filter(None, map(shutil.which, filter(None, (os.environ.get("CC"), *_COMPILERS)))), None)
-    if found is None or compiler is None:
+    if folders is None or compiler is None:
         missing = "a C compiler (CC, cc, gcc or clang)" if compiler is None else "a name of this platform in FMI"
         return None, f"source only: {missing} was not found; the tool that reads the file has to compile it"
-    folder = found[0] if fmi == "2.0" else found[1]
+    folder = folders[0] if fmi == "2.0" else folders[1]
     with tempfile.TemporaryDirectory() as home:
         for name, content in files.items():
             if name.startswith("sources/"):
                 (Path(home) / Path(name).name).write_bytes(content)
-        words = [compiler, *_COMPILER_FLAGS, "-o", "machine", f"fmi{fmi[0]}.c", "-lm"]
+        command = [compiler, *_COMPILER_FLAGS, "-o", "machine", f"fmi{fmi[0]}.c", "-lm"]
         try:
-            subprocess.run(words, cwd=home, capture_output=True, text=True, timeout=_COMPILE_SECONDS, check=True)
+            subprocess.run(command, cwd=home, capture_output=True, text=True, timeout=_COMPILE_SECONDS, check=True)
         except (OSError, subprocess.SubprocessError) as error:
-            said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-            why = f"{Path(compiler).name} failed ({said[0] if said else 'no message'})"
-            return None, f"source only: {why}; the tool that reads the file has to compile it"
+            output = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+            reason = f"{Path(compiler).name} failed ({output[0] if output else 'no message'})"
+            return None, f"source only: {reason}; the tool that reads the file has to compile it"
         return {
-            f"binaries/{folder}/{identifier}{found[2]}": (Path(home) / "machine").read_bytes()
+            f"binaries/{folder}/{identifier}{folders[2]}": (Path(home) / "machine").read_bytes()
         }, f"with a binary for {folder}"
 
 
 def _archive(files: dict[str, bytes]) -> bytes:
-    """Return a ZIP archive whose bytes depend only on the files, not on the time."""
+    """Return a ZIP archive whose bytes depend only on the files, not on the time of writing."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(files):

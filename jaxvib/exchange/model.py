@@ -93,7 +93,7 @@ class _SpeedInput(IdealDrive):
 
 
 class _TorqueInput(MotorWrapper):
-    """Motor with an additional torque on its rotor, or, if `is_alone`, with this torque in place of its own."""
+    """Motor with an additional torque on its rotor; if `is_alone` is True, this torque replaces the torque of the motor."""
 
     motor: Motor
     extra: Array
@@ -140,8 +140,8 @@ class States(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Outputs that are neither states nor rates: `foundation_force`, N, one entry for each direction; `rotors`:
-    for each exciter the angle and the speed of its rotor, None if these are states or inputs."""
+    """Outputs that are neither states nor rates: `foundation_force`, N, with an entry for each direction; `rotors`: for each
+    exciter the angle, rad, and the speed, rad/s, of its rotor, None if these are states or inputs."""
 
     foundation_force: Any
     rotors: tuple[Any, ...]
@@ -167,7 +167,10 @@ class Equations(NamedTuple):
 
 
 def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
-    """Return the equations of a scene, with the initial state `start`."""
+    """Return the equations of a scene.
+
+    **Arguments**: `start`: the initial state; `drive`: "scene", or "input" for inputs in place of the drives.
+    """
     carrier = scene.machine.structure()
     zero = np.zeros((), carrier.mass.dtype)
     by_input = drive == "input"
@@ -191,31 +194,31 @@ def equations_of(scene: Scene, start: State, drive: DriveBy) -> Equations:
             rotors.append(RotorInputs())
             output_signals += [angle, speed]
 
-    def rates(scene: Scene, t: Array, states: States, given: Inputs) -> tuple[States, Outputs]:
+    def rates(scene: Scene, t: Array, states: States, values: Inputs) -> tuple[States, Outputs]:
         state = states.machine
-        cases = zip(scene.exciters, states.rotor_angles, given.rotors, strict=True)
-        driven = [_driven(exciter, angle, inputs, by_input) for exciter, angle, inputs in cases]
-        forced = Scene(scene.machine, exciters=driven, effects=(*scene.effects, _AppliedForce(given.force)))
+        cases = zip(scene.exciters, states.rotor_angles, values.rotors, strict=True)
+        driven_exciters = [_with_input_drive(exciter, angle, inputs, by_input) for exciter, angle, inputs in cases]
+        forced = Scene(scene.machine, exciters=driven_exciters, effects=(*scene.effects, _AppliedForce(values.force)))
         rate = dynamics_of(assemble(forced), solve_definite)(t, state)
         force = assemble(scene).foundation_force(state.displacement, state.velocity)
-        is_known = [exciter.drive.ideal and not by_input for exciter in scene.exciters]
+        are_outputs = [exciter.drive.ideal and not by_input for exciter in scene.exciters]
         turning = [exciter.turning_drive for exciter in scene.exciters]
         known = [
             (each.rotor_angle(t, None), each.rotor_speed(t, None)) if is_output else None
-            for each, is_output in zip(turning, is_known, strict=True)
+            for each, is_output in zip(turning, are_outputs, strict=True)
         ]
-        return States(rate, tuple(inputs.speed for inputs in given.rotors)), Outputs(force, tuple(known))
+        return States(rate, tuple(inputs.speed for inputs in values.rotors)), Outputs(force, tuple(known))
 
     signals = [*state_signals(scene, start), *angle_signals]
     acceleration = iter(coordinate_signals(carrier, "acceleration", 2))
-    own = [next(acceleration) if each.name.startswith("velocity.") else None for each in signals]
+    rate_signals = [next(acceleration) if each.name.startswith("velocity.") else None for each in signals]
     inputs, states = Inputs(np.zeros(carrier.mass.shape[0], zero.dtype), tuple(rotors)), States(start, tuple(angles))
-    return Equations(rates, states, inputs, signals, own, input_signals, output_signals, by_input)
+    return Equations(rates, states, inputs, signals, rate_signals, input_signals, output_signals, by_input)
 
 
 def without_motor_states(state: State) -> State:
-    """Return a state, or its units, without the states of motors beside the angle and the speed of the rotor."""
-    exciters = [replace(own, rotor=None if own.rotor is None else own.rotor[:2]) for own in state.exciters]
+    """Return a state, or its units, without the states of motors other than the angle and the speed of the rotor."""
+    exciters = [replace(exciter, rotor=None if exciter.rotor is None else exciter.rotor[:2]) for exciter in state.exciters]
     return replace(state, exciters=exciters)
 
 
@@ -225,16 +228,16 @@ def _rotor_signals(place: str) -> list[Signal]:
     return [Signal(f"{place}rotor.{name}", unit) for name, unit in named.items()]
 
 
-def _driven(exciter: Exciter, angle: Array | None, given: RotorInputs, by_input: bool) -> Exciter:
+def _with_input_drive(exciter: Exciter, angle: Array | None, inputs: RotorInputs, by_input: bool) -> Exciter:
     """Return the exciter with a drive to which the inputs are applied."""
     drive, sign = exciter.drive, float(exciter.direction)
     if isinstance(drive, Motor):
-        turned = _TorqueInput(drive, sign * given.torque, is_alone=by_input)
+        input_drive = _TorqueInput(drive, sign * inputs.torque, is_alone=by_input)
     elif angle is not None:
-        turned = _SpeedInput(sign * given.speed, sign * angle, sign * given.acceleration)
+        input_drive = _SpeedInput(sign * inputs.speed, sign * angle, sign * inputs.acceleration)
     else:
         return exciter
-    return eqx.tree_at(lambda e: e.drive, exciter, turned)
+    return eqx.tree_at(lambda e: e.drive, exciter, input_drive)
 
 
 def state_signals(scene: Scene, state: State) -> list[Signal]:
@@ -244,30 +247,30 @@ def state_signals(scene: Scene, state: State) -> list[Signal]:
     ends = np.cumsum([np.size(leaf) for leaf in leaves])
     shaped = [np.arange(end - np.size(leaf), end).reshape(np.shape(leaf)) for leaf, end in zip(leaves, ends, strict=True)]
     places = jax.tree.unflatten(structure, shaped)
-    found: dict[int, Signal] = {}
+    signals_by_index: dict[int, Signal] = {}
 
     def put(where: np.ndarray, signals: list[Signal] | tuple[Signal, ...]) -> None:
-        found.update(zip(np.atleast_1d(where).tolist(), signals, strict=True))
+        signals_by_index.update(zip(np.atleast_1d(where).tolist(), signals, strict=True))
 
     def put_loads(name: str, unit: str, coordinates: tuple[np.ndarray, ...]) -> None:
         for k, where in enumerate(coordinates):
-            own = name if len(coordinates) == 1 else f"{name}_{k + 1}"
-            put(where, [Signal(f"{own}.load{j + 1}", unit) for j in range(where.size)])
+            exciter = name if len(coordinates) == 1 else f"{name}_{k + 1}"
+            put(where, [Signal(f"{exciter}.load{j + 1}", unit) for j in range(where.size)])
 
     put(places.displacement, coordinate_signals(carrier, "displacement", 0))
     put(places.velocity, coordinate_signals(carrier, "velocity", 1))
-    for k, own in enumerate(places.exciters):
+    for k, exciter in enumerate(places.exciters):
         place = scene.prefix_of(k)
-        put_loads(f"{place}angle", "rad", own.angle)
-        put_loads(f"{place}rate", "rad/s", own.rate)
-        if own.rotor is not None:
-            states = [Signal(f"{place}motor.state{k + 1}", "") for k in range(len(own.rotor) - 2)]
-            put(np.asarray(own.rotor), [*_rotor_signals(place)[:2], *states])
-        if own.spin is not None and own.spin.drilling is not None:
-            put_loads(f"{place}drilling_spin", "rad/s", (own.spin.drilling,))
-        if own.spin is not None and own.spin.slip is not None:
-            put_loads(f"{place}slip", "m/s", own.spin.slip)
-    return [found[k] for k in range(len(found))]
+        put_loads(f"{place}angle", "rad", exciter.angle)
+        put_loads(f"{place}rate", "rad/s", exciter.rate)
+        if exciter.rotor is not None:
+            states = [Signal(f"{place}motor.state{k + 1}", "") for k in range(len(exciter.rotor) - 2)]
+            put(np.asarray(exciter.rotor), [*_rotor_signals(place)[:2], *states])
+        if exciter.spin is not None and exciter.spin.drilling is not None:
+            put_loads(f"{place}drilling_spin", "rad/s", (exciter.spin.drilling,))
+        if exciter.spin is not None and exciter.spin.slip is not None:
+            put_loads(f"{place}slip", "m/s", exciter.spin.slip)
+    return [signals_by_index[k] for k in range(len(signals_by_index))]
 
 
 def has_events(scene: Scene) -> bool:
@@ -285,12 +288,12 @@ def named_entries(scene: Scene) -> list[NamedNumber]:
     ends = np.cumsum([np.size(leaf) for leaf in leaves])
     shaped = [np.arange(end - np.size(leaf), end).reshape(np.shape(leaf)) for leaf, end in zip(leaves, ends, strict=True)]
     places = jax.tree.unflatten(structure, shaped)
-    found: dict[int, NamedNumber] = {}
-    for each in (single for group in numbers_of(scene).values() for single in group.single(scene)):
-        where = np.asarray(each.leaf(places))
-        found[int(where if each.entry is None else where[each.entry])] = each
-    if len(found) != sum(map(np.size, leaves)):
+    numbers_by_index: dict[int, NamedNumber] = {}
+    for parameter in (single for group in numbers_of(scene).values() for single in group.single(scene)):
+        index = np.asarray(parameter.leaf(places))
+        numbers_by_index[int(index if parameter.entry is None else index[parameter.entry])] = parameter
+    if len(numbers_by_index) != sum(map(np.size, leaves)):
         raise InputError(
             "scene", "has a parameter without a name, which another tool could not set; give a scene of jaxvib's parts"
         )
-    return [found[k] for k in range(len(found))]
+    return [numbers_by_index[k] for k in range(len(numbers_by_index))]

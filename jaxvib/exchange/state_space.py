@@ -56,7 +56,7 @@ class StateSpace(NamedTuple):
 
     - `A` (nx, nx), `B` (nx, nu), `C` (ny, nx), `D` (ny, nu), SI units
     - `states`, `inputs`, `outputs`: a `Signal` (`name`, `unit`) for each entry of x, u and y
-    - `x0`, `u0`, `y0`: the operating point, 0 for a machine at rest; x, u and y are deviations from it
+    - `x0`, `u0`, `y0`: values at the operating point, 0 for a machine at rest; x, u and y are deviations from these values
     - `about`: a sentence about the equations
     """
 
@@ -78,8 +78,12 @@ class StateSpace(NamedTuple):
 
     @validated
     def frequency_response(self, omega: Numbers) -> np.ndarray:
-        """Return C (i w - A)^-1 B + D, the amplitudes of outputs per input at `omega`, rad/s; shape (omega, outputs,
-        inputs)."""
+        """Return the frequency responses C (i w - A)^-1 B + D, complex amplitude of each output per amplitude of each input.
+
+        **Arguments**: `omega`: frequencies w, rad/s or text.
+
+        **Returns** an array (frequencies, ny, nu).
+        """
         frequencies = np.ravel(np.asarray(numbers(omega, "rad/s", "omega", None), float))[:, None, None]
         inner = np.linalg.solve(1j * frequencies * np.eye(len(self.A)) - self.A, self.B.astype(complex))
         return self.C @ inner + self.D
@@ -94,7 +98,7 @@ class StateSpace(NamedTuple):
         **Raises** `InputError` if python-control is not installed (extra `control`).
         """
         names = {
-            name: [re.sub(r"[.\[\]]+", "_", each.name) for each in getattr(self, name)]
+            name: [re.sub(r"[.\[\]]+", "_", signal.name) for signal in getattr(self, name)]
             for name in ("states", "inputs", "outputs")
         }
         return optional_module("control", "control").ss(self.A, self.B, self.C, self.D, **names)
@@ -116,8 +120,8 @@ class StateSpace(NamedTuple):
         content: dict[str, Any] = {name: getattr(self, name) for name in ("A", "B", "C", "D", "x0", "u0", "y0", "about")}
         for kind in ("state", "input", "output"):
             signals = getattr(self, f"{kind}s")
-            content[f"{kind}_names"] = np.asarray([each.name for each in signals], dtype=object)
-            content[f"{kind}_units"] = np.asarray([each.unit for each in signals], dtype=object)
+            content[f"{kind}_names"] = np.asarray([signal.name for signal in signals], dtype=object)
+            content[f"{kind}_units"] = np.asarray([signal.unit for signal in signals], dtype=object)
         io = optional_module("scipy.io", "mat")
         with written(path) as part, part.open("wb") as file:
             io.savemat(file, content, oned_as="column")
@@ -130,14 +134,17 @@ def state_space(
 ) -> StateSpace:
     """Return the state-space model of a scene's machine, at rest or in a jam.
 
-    At rest, M includes the masses of the loads, and K and C include the linear parts of nonlinear supports:
+    At rest, M includes the masses of the loads, and stiffness K and damping B include the linear parts of nonlinear supports:
 
-        M q'' + (C + n G) q' + K q = f + P^T f_e,      x = (q, q'),      y = (q, q', q'', T_K q + T_C q')
+        M q'' + (B + n G) q' + K q = f + P^T f_e,      x = (q, q'),  u = (f, f_e),  y = (q, q', q'', T_K q + T_B q')
+
+    q are the coordinates, G is the gyroscopic matrix, f are forces on the coordinates, f_e forces at the exciters, and the last
+    output is the force on the foundation.
 
     In a jam, the model is the linearization of the averaged equations (`envelope`) about the jam:
 
-    - the states are the complex amplitudes of the carrier (real and imaginary parts), the load speeds, and the phases of the
-      loads relative to the first one
+    - the states are the complex amplitudes of displacements and velocities of the carrier (real and imaginary parts), the load
+      speeds, and the phases of the loads relative to the first load
     - the input is the rotor speed
     - the outputs are the mean load speed and the amplitudes of the coordinates and of the foundation force
     - the largest real part of the poles is the `growth` of `phase_jams`
@@ -165,11 +172,11 @@ def state_space(
     if isinstance(at, (Jam, PhaseJam)):
         if rotor_speed is not None:
             raise InputError("rotor_speed", f"is {quoted(rotor_speed)}, but a jam has its own rotor speed; leave it out")
-        return _in_jam(scene, at)
+        return _model_in_jam(scene, at)
     if at != "rest":
         raise InputError("at", f"is {quoted(at)}; it must be 'rest' or a jam, for example jam_modes(scene).select(3)")
     speed = _mean_speed(scene) if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed", low=0.0)
-    return _at_rest(scene, speed)
+    return _model_at_rest(scene, speed)
 
 
 def _mean_speed(scene: Scene) -> Array:
@@ -178,7 +185,7 @@ def _mean_speed(scene: Scene) -> Array:
     return sum(speeds[1:], speeds[0]) / len(speeds)
 
 
-def _at_rest(scene: Scene, speed: Array) -> StateSpace:
+def _model_at_rest(scene: Scene, speed: Array) -> StateSpace:
     a, b, c, d = map(np.asarray, _rest_matrices(scene, speed))
     carrier = scene.machine.structure()
     states = (*coordinate_signals(carrier, "displacement", 0), *coordinate_signals(carrier, "velocity", 1))
@@ -203,19 +210,21 @@ def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Arr
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         slopes = [slope @ rows for slope in jax.jacfwd(term.force, (0, 1))(rows @ rest, rows @ rest)]
         stiffness, damping = stiffness + rows.T @ slopes[0], damping + rows.T @ slopes[1]
-        foundation = [whole + slope for whole, slope in zip(foundation, slopes, strict=True)]
+        foundation = [matrix + slope for matrix, slope in zip(foundation, slopes, strict=True)]
     forces = jnp.concatenate([jnp.eye(nd, dtype=model.mass.dtype), *(mount.rows[0].T for mount in model.mounts)], axis=1)
     solved = jnp.linalg.solve(model.mass, jnp.concatenate([-stiffness, -damping, forces], axis=1))
-    zero, one = jnp.zeros_like(model.mass), jnp.eye(nd, dtype=model.mass.dtype)
-    still = jnp.zeros_like(forces)
-    a = jnp.block([[zero, one], [solved[:, : 2 * nd]]])
-    b = jnp.concatenate([still, solved[:, 2 * nd :]])
+    zero, identity = jnp.zeros_like(model.mass), jnp.eye(nd, dtype=model.mass.dtype)
+    no_force = jnp.zeros_like(forces)
+    a = jnp.block([[zero, identity], [solved[:, : 2 * nd]]])
+    b = jnp.concatenate([no_force, solved[:, 2 * nd :]])
     c = jnp.concatenate([jnp.eye(2 * nd, dtype=model.mass.dtype), solved[:, : 2 * nd], jnp.concatenate(foundation, axis=1)])
-    d = jnp.concatenate([still, still, solved[:, 2 * nd :], jnp.zeros((len(foundation[0]), forces.shape[1]), forces.dtype)])
+    d = jnp.concatenate(
+        [no_force, no_force, solved[:, 2 * nd :], jnp.zeros((len(foundation[0]), forces.shape[1]), forces.dtype)]
+    )
     return a, b, c, d
 
 
-def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
+def _model_in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
     if not np.ndim(jam.omega) == 0 or not np.isfinite(jam.omega):
         raise InputError("at", f"must be one existing jam ({jam.message}); choose one with select(mode)")
     scene = scene.replace(drive=ConstantSpeed(jam.rotor_speed))
@@ -225,8 +234,8 @@ def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
             "at", "is the jam of a machine with other coordinates or another number of loads; use a jam of this scene"
         )
     averaged_field(scene)  # raises errors for effects outside the averaged equations before anything is compiled
-    found = jax.tree.map(np.asarray, _jam_matrices(scene, jam.omega, phase, jam.displacement))
-    (a, b, c, d), x0, y0, residual = found
+    matrices_and_point = jax.tree.map(np.asarray, _jam_matrices(scene, jam.omega, phase, jam.displacement))
+    (a, b, c, d), x0, y0, residual = matrices_and_point
     if not residual < _MAX_RESIDUAL[residual.dtype.itemsize < 8]:
         problem = f"is not an equilibrium of the averaged equations of this scene (relative residual {float(residual):.1e})"
         raise InputError("at", f"{problem}; use a jam of this scene, or for different loads one from phase_jams(scene)")
@@ -248,7 +257,7 @@ def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
 def _jam_matrices(
     scene: Scene, omega: Array, phase: Array, displacement: Array
 ) -> tuple[tuple[Array, Array, Array, Array], Array, Array, Array]:
-    """Return A, B, C, D; the operating point of states and outputs; the residual of the loads' equations."""
+    """Return A, B, C, D; the operating point of states and outputs; the relative residual of the equations of the loads."""
     nd, count, carrier = displacement.shape[0], phase.shape[0], linear_model(scene).carrier
 
     def amplitudes(x: Array) -> Amplitudes:

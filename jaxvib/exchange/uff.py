@@ -49,7 +49,8 @@ _TAIL = 200
 
 
 class _Node(NamedTuple):
-    """Node of a machine: `number`, `position` (x, y, z) in m, `rows`: the matrix from coordinates to its displacements."""
+    """Node of a machine: `number`; `position` (x, y, z), m; `rows`: the matrix from coordinates to displacements of the
+    node."""
 
     number: int
     position: tuple[float, float, float]
@@ -68,7 +69,7 @@ class UffFunction(NamedTuple):
     - `quantity` such as "acceleration", "" if the file does not state it
     - `response` and `reference`: node and direction of the response and of the force; 1 to 3 are +X to +Z, 4 to 6 rotations
       about +X to +Z, negative numbers the opposite directions
-    - `about`: the first line of the function's description in the file
+    - `about`: the first line of the description of the function in the file
     """
 
     kind: Literal["history", "response", "other"]
@@ -105,11 +106,11 @@ def export_uff(
       directions, at evenly spaced frequencies
     - Natural modes of a `Scene`: undamped (normal modes) for machines that move up and down; damped, at the rotor speed
       (complex modes, the whirl), for machines that move horizontally and vertically
-    - Histories of a `Run`: those of every node and of the force on the foundation (node 0), and the amplitude spectra of its
-      end
+    - Histories of a `Run`: the motion of every node and the force on the foundation (node 0), and the amplitude spectra at the
+      end of the run
 
     Header, units (SI), nodes and lines come first, because programs for modal analysis reject functions without them. Numbers
-    have 12 digits, but those of the abscissa and of mode shapes have 6, as the format prescribes.
+    have 12 digits; those of the abscissa and of mode shapes have 6 digits, as the format prescribes.
 
     **Arguments**
 
@@ -137,8 +138,8 @@ def export_uff(
         scene = validate_scene(source)
         content = [*_modes(scene, rotor_speed), *_responses(scene, quantity, frequencies, rotor_speed)]
     else:
-        given = {"frequencies": frequencies, "rotor_speed": rotor_speed}
-        for name, value in given.items():
+        scene_options = {"frequencies": frequencies, "rotor_speed": rotor_speed}
+        for name, value in scene_options.items():
             if value is not None:
                 raise InputError(name, f"is {quoted(value)}, which is an option for a scene, not for a run; leave it out")
         if quantity == "acceleration":
@@ -153,11 +154,11 @@ def export_uff(
 
 def _nodes(scene: Scene) -> list[_Node]:
     """Return the nodes of a machine; points that always have the same motion form one node."""
-    found: dict[bytes, _Node] = {}
+    nodes: dict[bytes, _Node] = {}
     for place, position in _places(scene):
         rows = np.asarray(scene.machine.rows_at(place))
-        found.setdefault(rows.tobytes(), _Node(len(found) + 1, position, rows))
-    return list(found.values())
+        nodes.setdefault(rows.tobytes(), _Node(len(nodes) + 1, position, rows))
+    return list(nodes.values())
 
 
 def _places(scene: Scene) -> list[tuple[Place, tuple[float, float, float]]]:
@@ -166,19 +167,19 @@ def _places(scene: Scene) -> list[tuple[Place, tuple[float, float, float]]]:
     if machine.places == "platform":
         return [(k + 1, (float(k), 0.0, 0.0)) for k in range(machine.structure().mass.shape[0])]
     if machine.places == "number":
-        return [(k, (float(k), 0.0, 0.0)) for k in sorted({each.at if isinstance(each.at, int) else 1 for each in exciters})]
+        return [(k, (float(k), 0.0, 0.0)) for k in sorted({item.at if isinstance(item.at, int) else 1 for item in exciters})]
     if machine.places == "shaft":
         distances = [position for position, *_ in machine.shaft_supports() or []]
-        for each in exciters:
-            mount = machine.mount(each.place)
-            distances += np.asarray(mount.distances(1 if each.loads is None else each.loads.count)).tolist()
+        for item in exciters:
+            mount = machine.mount(item.place)
+            distances += np.asarray(mount.distances(1 if item.loads is None else item.loads.count)).tolist()
         dtype = machine.structure().mass.dtype
         return [(jnp.asarray(s, dtype), (s, 0.0, 0.0)) for s in sorted({0.0, *distances})]
     if machine.places == "plane":
         points: list[tuple[Any, int]] = [(None, body) for body in range(machine.body_count)]
-        for each in machine.supports:  # pyright: ignore[reportAttributeAccessIssue]
-            points += [(each.at, each.body)] + ([] if each.to is None else [(each.at_other, each.to)])
-        points += [(each.at, each.body) for each in exciters]
+        for item in machine.supports:  # pyright: ignore[reportAttributeAccessIssue]
+            points += [(item.at, item.body)] + ([] if item.to is None else [(item.at_other, item.to)])
+        points += [(item.at, item.body) for item in exciters]
         return [
             (on_body(at, body), (0.0, 0.0, 0.0) if at is None else (0.0, float(at[0]), float(at[1]))) for at, body in points
         ]
@@ -210,9 +211,9 @@ def _modes(scene: Scene, rotor_speed: Number | None) -> list[dict[str, Any]]:
     numbers_ = [node.number for node in nodes]
 
     def at_nodes(shape: np.ndarray) -> dict[str, np.ndarray]:
-        moved = np.array([node.rows @ shape for node in nodes]).T
-        found = {f"r{k}": np.zeros(len(nodes), moved.dtype) for k in (1, 2, 3)}
-        return found | {f"r{direction}": moved[k] for k, direction in enumerate(directions)}
+        displacements = np.array([node.rows @ shape for node in nodes]).T
+        by_direction = {f"r{k}": np.zeros(len(nodes), displacements.dtype) for k in (1, 2, 3)}
+        return by_direction | {f"r{direction}": displacements[k] for k, direction in enumerate(directions)}
 
     common = {"type": 55, "model_type": 1, "data_ch": 2, "spec_data_type": 8, "load_case": 1, "node_nums": numbers_}
     if len(directions) == 1:
@@ -242,16 +243,16 @@ def _responses(scene: Scene, quantity: str, frequencies: Numbers | None, rotor_s
     x = _even_frequencies(scene, frequencies)
     model = state_space(scene, rotor_speed=rotor_speed)
     nd, start = len(model.A) // 2, list(_ORDERS).index(quantity)
-    found = model.frequency_response(2.0 * np.pi * x)[:, start * nd : (start + 1) * nd, nd:]
-    references: dict[tuple[int, int], np.ndarray] = {}  # exciters at one place are one reference
-    columns = iter(np.moveaxis(found, 2, 0))
-    for each in scene.exciters:
-        mounted = np.asarray(scene.machine.mount(each.place).rows[0])
+    responses = model.frequency_response(2.0 * np.pi * x)[:, start * nd : (start + 1) * nd, nd:]
+    references: dict[tuple[int, int], np.ndarray] = {}  # exciters at the same place form one reference
+    columns = iter(np.moveaxis(responses, 2, 0))
+    for exciter in scene.exciters:
+        mounted = np.asarray(scene.machine.mount(exciter.place).rows[0])
         node = next((node.number for node in nodes if np.array_equal(node.rows, mounted)), 0)
         references |= {(node, direction): next(columns) for direction in directions}
     return [
-        _function(x, (node.rows @ moved.T)[k], _RESPONSE, quantity, (node.number, direction), reference, _FREQUENCY)
-        for reference, moved in references.items()
+        _function(x, (node.rows @ displacements.T)[k], _RESPONSE, quantity, (node.number, direction), reference, _FREQUENCY)
+        for reference, displacements in references.items()
         for node in nodes
         for k, direction in enumerate(directions)
     ]
@@ -277,29 +278,31 @@ def _require_even(x: np.ndarray, name: str) -> None:
 
 def _histories(run: Run, quantity: str) -> list[dict[str, Any]]:
     """Return the histories of a run at the nodes, and the amplitude spectra of its end."""
-    kept: Trajectory = run.window if run.trajectory is None else run.trajectory
+    trajectory: Trajectory = run.window if run.trajectory is None else run.trajectory
     nodes, directions = _nodes(run.scene), _directions(run.scene)
-    time, spectrum = np.asarray(kept.time, float), run.spectrum()
+    time, spectrum = np.asarray(trajectory.time, float), run.spectrum()
     _require_even(time, "times of the run")
-    moved = np.asarray(getattr(kept.state, quantity), float)
-    found = [
-        _function(time, moved @ node.rows[k], _HISTORY, quantity, (node.number, direction), (0, 0), _TIME)
+    motion = np.asarray(getattr(trajectory.state, quantity), float)
+    functions = [
+        _function(time, motion @ node.rows[k], _HISTORY, quantity, (node.number, direction), (0, 0), _TIME)
         for node in nodes
         for k, direction in enumerate(directions)
     ]
-    force, frequency = np.asarray(kept.foundation_force, float), np.asarray(spectrum.frequency) / (2.0 * np.pi)
-    found += [
+    force, frequency = np.asarray(trajectory.foundation_force, float), np.asarray(spectrum.frequency) / (2.0 * np.pi)
+    functions += [
         _function(time, force[:, k], _HISTORY, "force", (0, direction), (0, 0), _TIME) for k, direction in enumerate(directions)
     ]
-    found += [
+    functions += [
         _function(frequency, spectrum.force[-1, :, k], _GENERAL, "force", (0, direction), (0, 0), _FREQUENCY)
         for k, direction in enumerate(directions)
     ]
     for name, unit, values in zip(spectrum.coordinates, spectrum.units, spectrum.amplitude[-1].T, strict=True):
         if unit == "m":
             about = f"amplitude spectrum of the coordinate {name}"
-            found.append(_function(frequency, values, _GENERAL, "displacement", (0, 0), (0, 0), _FREQUENCY) | {"id1": about})
-    return found
+            functions.append(
+                _function(frequency, values, _GENERAL, "displacement", (0, 0), (0, 0), _FREQUENCY) | {"id1": about}
+            )
+    return functions
 
 
 def _function(
@@ -371,18 +374,18 @@ def read_uff(path: str | Path) -> UffFile:
     try:
         sets = pyuff.UFF(str(path)).read_sets()
     except Exception as error:  # pyuff raises bare exceptions
-        why = " ".join(str(error).split())
-        raise InputError("path", f"is {quoted(str(path))}, which cannot be read as a UFF file ({why})") from error
+        reason = " ".join(str(error).split())
+        raise InputError("path", f"is {quoted(str(path))}, which cannot be read as a UFF file ({reason})") from error
     sets = sets if isinstance(sets, list) else [sets]
     if sets and tail[-1:] != [b"-1"]:
         raise InputError("path", f"is {quoted(str(path))}, whose last dataset was cut off; export it again")
-    for k, each in enumerate(each for each in sets if each.get("type") == 58):
-        stated, there = int(each["num_pts"]), np.size(each["data"])
-        if stated != there:
-            problem = f"whose function {k + 1} has {there} values where its header states {stated}"
+    for k, dataset in enumerate(dataset for dataset in sets if dataset.get("type") == 58):
+        stated, read_count = int(dataset["num_pts"]), np.size(dataset["data"])
+        if stated != read_count:
+            problem = f"whose function {k + 1} has {read_count} values where its header states {stated}"
             raise InputError("path", f"is {quoted(str(path))}, {problem}; export it again")
-    length, force = next(((each["length"], each["force"]) for each in sets if each.get("type") == 164), (1.0, 1.0))
-    functions = tuple(_read_function(each, length, force) for each in sets if each.get("type") == 58)
+    length, force = next(((dataset["length"], dataset["force"]) for dataset in sets if dataset.get("type") == 164), (1.0, 1.0))
+    functions = tuple(_read_function(dataset, length, force) for dataset in sets if dataset.get("type") == 58)
     if not functions:
         raise InputError(
             "path",
@@ -390,10 +393,10 @@ def read_uff(path: str | Path) -> UffFile:
             "histories or frequency response functions",
         )
     nodes = {}
-    for each in sets:
-        if each.get("type") in (15, 2411):
-            names = each["node_nums"] if each["type"] == 15 else each["grid_global"][:, 0]
-            columns = [each[axis] for axis in "xyz"] if each["type"] == 15 else each["grid_global"][:, 1:].T
+    for dataset in sets:
+        if dataset.get("type") in (15, 2411):
+            names = dataset["node_nums"] if dataset["type"] == 15 else dataset["grid_global"][:, 0]
+            columns = [dataset[axis] for axis in "xyz"] if dataset["type"] == 15 else dataset["grid_global"][:, 1:].T
             nodes |= {int(n): tuple(float(v) / length for v in xyz) for n, *xyz in zip(names, *columns, strict=True)}
     return UffFile(functions, nodes)
 
@@ -417,6 +420,6 @@ def _read_function(dataset: dict[str, Any], length: float, force: float) -> UffF
 def _scale(dataset: dict[str, Any], side: str, length: float, force: float) -> float:
     """Return the factor from the units of the file to SI, for the numerator ("ordinate") or the denominator ("orddenom")."""
     kind = int(dataset[f"{side}_spec_data_type"])
-    own = int(dataset[f"{side}_len_unit_exp"]), int(dataset[f"{side}_force_unit_exp"])
-    lengths, forces = own if kind == 1 else _EXPONENTS.get(kind, (0, 0))
+    stated_exponents = int(dataset[f"{side}_len_unit_exp"]), int(dataset[f"{side}_force_unit_exp"])
+    lengths, forces = stated_exponents if kind == 1 else _EXPONENTS.get(kind, (0, 0))
     return length**-lengths * force**-forces

@@ -35,8 +35,10 @@ AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int 
 
 
 class Target(NamedTuple):
-    """Target of an axis: the parameter `number` of the scene. If this is None: the entry `entry` (None: all entries) of the
-    field `field` of the initial state."""
+    """Target of an axis: the parameter `number` of the scene or, if this is None, an entry of the initial state.
+
+    **Attributes**: `number`; `field` of the initial state and index `entry` in this field, None for all entries.
+    """
 
     number: NamedNumber | None
     field: str
@@ -134,14 +136,14 @@ class Grid(NamedTuple):
 
 
 def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
-    """Return the axis of the parameter with this name, from a list of values or a table.
+    """Return the axis of the parameter with this name; `spec`: a list of values, or a table.
 
     **Raises** `InputError` for a name that does not exist and for values that are not allowed.
     """
-    target, unit = _where(scene, name)
+    target, unit = _target_of(scene, name)
 
-    def value(given: Number, field: str) -> float:
-        return float(number(given, unit, field)) if target.number is None else target.number.value(given, field)
+    def value(stated: Number, field: str) -> float:
+        return float(number(stated, unit, field)) if target.number is None else target.number.value(stated, field)
 
     if isinstance(spec, Mapping):
         for key in spec:
@@ -176,11 +178,11 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
     return axis
 
 
-def _where(scene: Scene, name: str) -> tuple[Target, str]:
-    """Return the parameters with this name, in the scene or in the initial state, and their unit."""
+def _target_of(scene: Scene, name: str) -> tuple[Target, str]:
+    """Return the target with this name, in the scene or in the initial state, and its unit."""
     if not str(name).startswith("start."):
-        found = find_number(scene, name, "axes")
-        return Target(found, "", None), found.unit
+        parameter = find_number(scene, name, "axes")
+        return Target(parameter, "", None), parameter.unit
     match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
     if match is None or match[1] not in _START:
         raise InputError(
@@ -195,21 +197,22 @@ def _where(scene: Scene, name: str) -> tuple[Target, str]:
 
 
 def require_disjoint(scene: Scene, axes: Sequence[Axis]) -> None:
-    """Require that no two axes change the same parameter. **Raises** `InputError` otherwise."""
-    taken: dict[object, str] = {}
+    """**Raises** `InputError` if two axes change the same parameter."""
+    owners: dict[object, str] = {}
     for axis in axes:
-        found, field, entry = axis.target
-        if found is not None:
-            entries: set = found.entries
+        parameter, field, entry = axis.target
+        if parameter is not None:
+            entries: set = parameter.entries
         else:
             size = scene.loads.count if field in ("angle", "rate") else scene.machine.structure().mass.shape[0]
             entries = {(field, k) for k in (range(size) if entry is None else (entry,))}
-        for one in entries:
-            if one in taken:
+        for entry_of_axis in entries:
+            if entry_of_axis in owners:
                 raise InputError(
-                    f"axes.{axis.name}", f"changes a parameter that axes.{taken[one]} also changes; use one of these axes"
+                    f"axes.{axis.name}",
+                    f"changes a parameter that axes.{owners[entry_of_axis]} also changes; use one of these axes",
                 )
-            taken[one] = axis.name
+            owners[entry_of_axis] = axis.name
 
 
 def put(scene: Scene, targets: Sequence[Target], values: Array) -> Scene:
@@ -225,8 +228,8 @@ def put_start(state: State, targets: Sequence[Target], values: Array) -> State:
 
     A common value for all angles sets the mean angle of the loads and keeps their differences.
     """
-    for k, (found, field, entry) in enumerate(targets):
-        if found is None:
+    for k, (parameter, field, entry) in enumerate(targets):
+        if parameter is None:
             old = getattr(state, field)
             leaf = old[0] if isinstance(old, tuple) else old
             if entry is not None:
@@ -247,12 +250,12 @@ def corners(axes: Sequence[Axis]) -> np.ndarray:
     return np.stack([mesh.ravel() for mesh in np.meshgrid(*ends, indexing="ij")], axis=1)
 
 
-def tile_of(shape: Sequence[int], most: int) -> tuple[int, ...]:
-    """Return the number of cases of a chunk along each dimension; a chunk has at most `most` cases.
+def tile_of(shape: Sequence[int], max_cases: int) -> tuple[int, ...]:
+    """Return the number of cases of a chunk along each dimension; a chunk has at most `max_cases` cases.
 
-    Chunks extend along the last dimension first and have nearly equal sizes.
+    Chunks extend along the last dimension first; their sizes are nearly equal.
     """
-    tile, room = [], most
+    tile, room = [], max_cases
     for n in reversed(shape):
         parts = -(-n // max(min(n, room), 1))
         tile.append(-(-n // parts))
@@ -268,7 +271,7 @@ def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.nd
     """Return the samples `first` to `last` - 1 of a sequence in [0, 1)^size, as an array (last - first, size).
 
     "low_discrepancy" is the additive sequence x_k = frac(x_0 + k a) with a_j = g^-j, where g > 1 solves g^(size+1) = g + 1 and
-    x_0 is random with the seed `seed`. The sequence is computed with 64-bit integers, so that even the billionth sample has
+    x_0 is random with the seed `seed`. The sequence is computed with 64-bit integers; therefore even the billionth sample has
     full precision. "random" samples come from a counter-based generator (Philox) with the key `seed`.
 
     >>> samples(0, 4, 1, 0, "low_discrepancy").round(3).ravel().tolist()

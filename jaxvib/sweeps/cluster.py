@@ -27,10 +27,10 @@ _STUDIES: dict[str, Study] = {}
 def on_a_cluster(
     study: Study, todo: Iterable[int], *, workers: int | None, scheduler: str | None, timeout: Number
 ) -> Generator[tuple[int, Chunk], None, None]:
-    """Compute chunks by workers; yield each finished chunk with its number. Only the calling process writes.
+    """Compute chunks by workers, and yield the number and the results of each finished chunk. Only the calling process writes.
 
-    If a worker terminates, other workers compute its chunks. If several workers have terminated while they computed the same
-    chunk, the cases of this chunk are "lost".
+    If a worker terminates, other workers compute its chunks. If several workers terminated while they computed the same chunk,
+    the cases of this chunk have the status "lost".
 
     **Raises** `InputError` if Dask is not installed, the scheduler does not answer, no worker connects, or a worker has other
     versions.
@@ -59,13 +59,13 @@ def on_a_cluster(
             advice = "start one with: dask scheduler; dask worker ADDRESS"
             raise InputError("scheduler", f"{problem} ({_first_line(error)}); {advice}") from error
         # NumPy arrays, because a worker that unpacks JAX arrays before it enables double precision loses half their digits.
-        plain = dataclasses.replace(study, scene=jax.tree.map(np.asarray, study.scene))
+        picklable = dataclasses.replace(study, scene=jax.tree.map(np.asarray, study.scene))
         precise, chunks = jnp.result_type(float) == np.float64, iter(todo)
         running, numbers = as_completed(loop=client.loop), {}
 
         def submit_next() -> None:
             for chunk in chunks:
-                future = client.submit(_remote, plain, chunk, study.key, versions(), precise, pure=False)
+                future = client.submit(_compute_remotely, picklable, chunk, study.key, versions(), precise, pure=False)
                 numbers[future.key] = chunk
                 running.add(future)
                 return
@@ -75,32 +75,35 @@ def on_a_cluster(
         for future in running:
             chunk = numbers.pop(future.key)
             try:
-                found = future.result()
+                result = future.result()
             except KilledWorker:
-                found = _lost(study, chunk)
+                result = _lost_chunk(study, chunk)
             future.release()
-            if isinstance(found, str):
-                raise InputError("worker", f"{found}; install the same versions everywhere")
+            if isinstance(result, str):
+                raise InputError("worker", f"{result}; install the same versions everywhere")
             submit_next()
-            yield chunk, found
+            yield chunk, result
 
 
-def _remote(study: Study, chunk: int, key: str, expected_versions: dict[str, str], precise: bool) -> Chunk | str:
-    """Compute the cases of a chunk on a worker; return a text if versions differ from those in the store."""
+def _compute_remotely(study: Study, chunk: int, key: str, expected_versions: dict[str, str], is_double: bool) -> Chunk | str:
+    """Compute the cases of a chunk on a worker.
+
+    **Returns** a text about the difference if versions differ from those in the store.
+    """
     for name, version in versions().items():
         if expected_versions[name] != version:
             return f"has {name} {version}, but the store was created with {expected_versions[name]}: digits would differ"
-    jax.config.update("jax_enable_x64", precise)
+    jax.config.update("jax_enable_x64", is_double)
     take_a_device()
-    if key not in _STUDIES:  # keep the first received copy, because the program was compiled for its functions
+    if key not in _STUDIES:  # the first received copy is stored, because the program was compiled for its functions
         _STUDIES[key] = dataclasses.replace(study, scene=jax.tree.map(jnp.asarray, study.scene))
     return compute(_STUDIES[key], chunk)
 
 
-def _lost(study: Study, chunk: int) -> Chunk:
+def _lost_chunk(study: Study, chunk: int) -> Chunk:
     cases = int(np.prod([s.stop - s.start for s in study.grid.region(chunk)], dtype=np.int64))
     status = np.full(cases, CASE_STATUSES.index("lost"), np.uint8)
-    return Chunk(dict(zip(study.names, study.nothing(cases), strict=True)), status, {})
+    return Chunk(dict(zip(study.names, study.placeholders(cases), strict=True)), status, {})
 
 
 def _first_line(error: BaseException) -> str:

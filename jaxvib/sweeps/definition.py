@@ -30,8 +30,8 @@ PYTHON = "calls Python"
 
 
 class CaseStatus(eqx.Enumeration):
-    """Outcomes of a case. The value of each member is the message shown to the user. The order is part of the store's
-    format."""
+    """Outcomes of a case. The value of each member is the message shown to the user. The order is part of the format of the
+    store."""
 
     missing = "the case has not been computed yet"
     done = "the case was computed"
@@ -85,7 +85,7 @@ class Study:
 
     @property
     def batch(self) -> int:
-        """Number of cases that are computed together: a whole chunk on an accelerator, unless it is very large."""
+        """Number of cases that are computed together: on an accelerator a whole chunk, if it is not very large."""
         return min(batch_size(), _round_up(self._cases_in_chunk, BATCH_SIZE))
 
     @property
@@ -124,8 +124,8 @@ class Study:
         """String that is unique for the study."""
         return digest(self.record)
 
-    def nothing(self, cases: int) -> list[np.ndarray]:
-        """Return placeholders for the measures of cases without a value: NaN, or -1 for integers."""
+    def placeholders(self, cases: int) -> list[np.ndarray]:
+        """Return arrays for the measures of so many `cases` without a value: NaN, or -1 for integers."""
         return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]
 
 
@@ -139,12 +139,12 @@ def digest(value: Plain) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def difference(one: Plain, other: Plain, name: str = "") -> tuple[str, Plain, Plain] | None:
-    """Return the path of the first difference between two plain values, and both entries there; None for equal values."""
-    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        pairs = [(f"{name}.{key}" if name else key, one[key], other[key]) for key in one]
-    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        pairs = [(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(zip(one, other, strict=True))]
+def difference(first: Plain, second: Plain, name: str = "") -> tuple[str, Plain, Plain] | None:
+    """Return the path of the first difference between two plain values, and the two entries there; None for equal values."""
+    if isinstance(first, dict) and isinstance(second, dict) and first.keys() == second.keys():
+        pairs = [(f"{name}.{key}" if name else key, first[key], second[key]) for key in first]
+    elif isinstance(first, list) and isinstance(second, list) and len(first) == len(second):
+        pairs = [(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(zip(first, second, strict=True))]
     else:  # compared as strings, because 1 == 1.0 == True in Python
-        return None if json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True) else (name, one, other)
+        return None if json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True) else (name, first, second)
     return next((found for key, a, b in pairs if (found := difference(a, b, key))), None)

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Look
 
 _MAX_DOTS = 1500
-"""Maximum number of cases along an axis of a figure; if there are more, only every k-th case is drawn."""
+"""Maximum number of cases along an axis of a figure; of more cases only every k-th one is drawn."""
 
-_ROWS = 9
+_THEORY_ROWS = 9
 """Number of values, along the axis that is not the rotor speed, for which folds and torus bifurcations are computed."""
 
-_BINS = 60
+_HISTOGRAM_BINS = 60
 
 _MAX_PANELS = 4
 """Maximum number of measures in the figure of a study with one axis."""
@@ -62,8 +62,8 @@ def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
 
 
 def _plot_line(store: Store, ax: Axes | None) -> Drawn:
-    """Plot the measures of a study with one axis as points, each in its own panel; onto `ax` only the first one with
-    numbers."""
+    """Plot the measures of a study with one axis as points, with a panel for each. If `ax` is given, only the first measure
+    with numbers is drawn."""
     from jaxvib.draw.style import panels
     from jaxvib.draw.sweeps import points_over
 
@@ -71,7 +71,7 @@ def _plot_line(store: Store, ax: Axes | None) -> Drawn:
     x, step = _thinned(store, axis)
     region = tuple(slice(None, None, step if dim == axis else 1) for dim in store.dims)
     named = [name for name in store.names if not (name == "mode" and "regime" in store.names)][:_MAX_PANELS]
-    named = [_measure(store, None)] if ax is not None else named
+    named = [_measure_name(store, None)] if ax is not None else named
     figure, axes = panels(len(named), size=(7.0, 3.6 if len(named) == 1 else 2.2), share_x=True, ax=ax)
     log = _is_log(store, axis)
     scale = display_unit(store, axis)[1]
@@ -79,11 +79,11 @@ def _plot_line(store: Store, ax: Axes | None) -> Drawn:
         shared = {"log": log, "x_label": axis_label(store, axis) if drawn is axes[-1] else ""}
         if is_label(store, name):
             codes, words = case_labels(store, region)
-            kept = sorted(set(codes[codes >= 0].ravel().tolist()))
-            places = np.array([[kept.index(k) if k >= 0 else np.nan for k in row] for row in codes.reshape(x.size, -1)])
+            present = sorted(set(codes[codes >= 0].ravel().tolist()))
+            places = np.array([[present.index(k) if k >= 0 else np.nan for k in row] for row in codes.reshape(x.size, -1)])
             points_over(scale * x, places, y_label="", ax=drawn, **shared)
-            drawn.set_yticks(range(len(kept)), [words[k].replace("_", " ") for k in kept])
-            drawn.set_ylim(-0.6, len(kept) - 0.4)
+            drawn.set_yticks(range(len(present)), [words[k].replace("_", " ") for k in present])
+            drawn.set_ylim(-0.6, len(present) - 0.4)
             continue
         values = display_unit(store, name)[1] * _values(store, name, region)
         points_over(scale * x, values.reshape(x.size, -1), y_label=measure_label(store, name), ax=drawn, **shared)
@@ -121,9 +121,7 @@ def plot_map(
     theory: bool = True,
     ax: Axes | None = None,
 ) -> Drawn:
-    """Plot a map over two axes.
-
-    It shows values, or labels (regimes, jam modes) with the folds and torus bifurcations of exact jams.
+    """Plot a map over two axes: values, or labels (regimes, jam modes) with the folds and torus bifurcations of exact jams.
 
     **Arguments**
 
@@ -139,9 +137,9 @@ def plot_map(
     opened = Store(Path(store))
     dims = opened.dims
     grid = [d for d in dims if d != SAMPLE]
-    for name, given in (("x", x), ("y", y)):
-        if given is not None and given not in grid:
-            raise InputError(name, f"is {quoted(given)}; {suggest_name(given, grid)}")
+    for name, chosen in (("x", x), ("y", y)):
+        if chosen is not None and chosen not in grid:
+            raise InputError(name, f"is {quoted(chosen)}; {suggest_name(chosen, grid)}")
     rest = [d for d in grid if d not in (x, y)]
     x_name = x or (_SPEED if _SPEED in rest else rest[0] if rest else None)
     rest = [d for d in rest if d != x_name]
@@ -158,11 +156,11 @@ def plot_map(
     (_, scale_x), (_, scale_y) = display_unit(opened, x_name), display_unit(opened, y_name)
     if measure in (None, "regime", "mode") and _has_labels(opened):
         table = case_labels(opened, region)
-        lines = _theory(opened, x_name, y_name, xs, ys) if theory else {}
+        lines = _theory_lines(opened, x_name, y_name, xs, ys) if theory else {}
         codes = np.transpose(table.codes, order).reshape(shape)
         lines = {kind: [(scale_x * a, scale_y * b) for a, b in parts] for kind, parts in lines.items()}
         return label_map(scale_x * xs, scale_y * ys, codes, table.names, lines=lines, **labels, ax=ax)
-    name = _measure(opened, measure)
+    name = _measure_name(opened, measure)
     values = np.transpose(_values(opened, name, region), order).reshape(shape)
     _, factor = display_unit(opened, name)
     return value_map(scale_x * xs, scale_y * ys, factor * values, label=measure_label(opened, name), **labels, ax=ax)
@@ -206,7 +204,7 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
     from jaxvib.draw.sweeps import distribution_chart
 
     opened = Store(Path(store))
-    name = _measure(opened, measure)
+    name = _measure_name(opened, measure)
     low, high = np.inf, -np.inf
     for rows in opened.pieces():
         values = _values(opened, name, rows)
@@ -216,7 +214,7 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
         raise InputError(
             "measure", f"is {quoted(name)}, which has no value in any case; choose another one: {', '.join(opened.names)}"
         )
-    edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _BINS + 1)
+    edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _HISTOGRAM_BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
     _, factor = display_unit(opened, name)
     return distribution_chart(factor * edges, np.asarray(counts), x_label=measure_label(opened, name), ax=ax)
@@ -231,23 +229,23 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
     from jaxvib.draw.sweeps import tornado_chart
 
     opened = Store(Path(store))
-    name, dims = _measure(opened, measure), opened.dims
+    name, dims = _measure_name(opened, measure), opened.dims
     axes = list(opened.record["axes"])
     ends = {axis: _fifths(opened, axis) for axis in axes}
-    sums, found = {axis: np.zeros((2, 2)) for axis in axes}, np.zeros(2)
+    sums, total = {axis: np.zeros((2, 2)) for axis in axes}, np.zeros(2)
     for rows in opened.pieces():
         values = _values(opened, name, rows)
-        there = np.isfinite(values)
-        found += [np.sum(values[there]), np.sum(there)]
+        has_value = np.isfinite(values)
+        total += [np.sum(values[has_value]), np.sum(has_value)]
         for axis in axes:
             dim = axis if axis in dims else SAMPLE
             place = dims.index(dim)
             along = opened.read(axis, rows if place == 0 else slice(None))
             along = along.reshape([-1 if k == place else 1 for k in range(len(dims))])
             for k, inside in enumerate((along <= ends[axis][0], along >= ends[axis][1])):
-                chosen = there & inside
+                chosen = has_value & inside
                 sums[axis][k] += [np.sum(values[chosen]), np.sum(chosen)]
-    if not found[1]:
+    if not total[1]:
         raise InputError(
             "measure", f"is {quoted(name)}, which has no value in any case; choose another one: {', '.join(opened.names)}"
         )
@@ -256,11 +254,11 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
     label = f"mean over all cases: {measure_label(opened, name)}"
     _, factor = display_unit(opened, name)
     words = [_axis_words(opened, axis) for axis in axes]
-    return tornado_chart(words, *(factor * m for m in (*means.T, found[0] / found[1])), x_label=label, ax=ax)
+    return tornado_chart(words, *(factor * m for m in (*means.T, total[0] / total[1])), x_label=label, ax=ax)
 
 
 def _fifths(store: Store, axis: str) -> tuple[float, float]:
-    """Return the upper end of the lowest fifth of the values of an axis, and the lower end of the highest fifth."""
+    """Return the quantiles 0.2 and 0.8 of the values of an axis."""
     values = store.read(axis, slice(0, 1 << 20))
     return float(np.nanquantile(values, 0.2)), float(np.nanquantile(values, 0.8))
 
@@ -278,7 +276,7 @@ def _is_log(store: Store, axis: str) -> bool:
 
 
 _USUAL_SIZES = {"m": 0.01, "N/m": 1e5, "N": 100.0}
-"""Usual values, SI, by which the display unit of a whole figure is chosen."""
+"""Usual values, SI, by unit; the display unit of a figure is chosen for them."""
 
 
 def display_unit(store: Store, name: str) -> tuple[str, float]:
@@ -310,13 +308,13 @@ def _axis_words(store: Store, axis: str) -> str:
     return named[0] if len(named) == 1 else axis
 
 
-def _measure(store: Store, name: str | None) -> str:
+def _measure_name(store: Store, name: str | None) -> str:
     """Return the name of a measure; default: the first one with numbers."""
     plain = [n for n in store.names if not is_label(store, n)]
-    found = name or next(iter(plain or store.names))
-    if found not in store.names:
-        raise InputError("measure", f"is {quoted(found)}; {suggest_name(found, list(store.names))}")
-    return found
+    measure = name or next(iter(plain or store.names))
+    if measure not in store.names:
+        raise InputError("measure", f"is {quoted(measure)}; {suggest_name(measure, list(store.names))}")
+    return measure
 
 
 def measure_label(store: Store, name: str) -> str:
@@ -327,7 +325,8 @@ def measure_label(store: Store, name: str) -> str:
 
 
 def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:
-    """Return the values of a measure in a region, NaN if missing. Of a measure with its own axis the maximum is returned."""
+    """Return the values of a measure in a region, NaN for missing values; for a measure with an additional axis, the maximum
+    along this axis."""
     values = store.read(name, region).astype(float)
     return np.max(values, axis=-1) if values.ndim > len(store.shape) else values
 
@@ -353,26 +352,26 @@ def case_labels(store: Store, region: slice | tuple[slice, ...]) -> _Labels:
     return _Labels(np.where(done, codes, -1), names)
 
 
-def _theory(
+def _theory_lines(
     store: Store, x_name: str, y_name: str, xs: np.ndarray, ys: np.ndarray
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """Return the lines in a map on which exact jams of the stored scene have a fold or lose their stability, by kind.
 
     Lines exist only if one axis is the rotor speed. If the other axis is a parameter of the initial state, which does not
     influence steady motions, the lines are straight. If it is a parameter of the scene, the lines connect points that are
-    computed for `_ROWS` of its values.
+    computed for `_THEORY_ROWS` of its values.
     """
     if _SPEED not in (x_name, y_name):
         return {}
     scene = scene_from_toml(store.record["scene"])
     if not isinstance(scene.drive, ConstantSpeed):
         return {}
-    other, values, speeds = (y_name, ys, xs) if x_name == _SPEED else (x_name, xs, ys)
-    fixed = other.startswith("start.")
-    rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _ROWS))
-    target = axis_of(scene, other, [float(rows[0])]).target
+    other_axis, values, speeds = (y_name, ys, xs) if x_name == _SPEED else (x_name, xs, ys)
+    fixed = other_axis.startswith("start.")
+    rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _THEORY_ROWS))
+    target = axis_of(scene, other_axis, [float(rows[0])]).target
     scene = put(scene, (axis_of(scene, _SPEED, [float(speeds[-1])]).target,), jnp.asarray([float(np.max(speeds))]))
-    found: list[dict[str, list[float]]] = []
+    kinds_of_rows: list[dict[str, list[float]]] = []
     for value in rows[:1] if fixed else rows:
         try:
             special = exact_branches(put(scene, (target,), jnp.asarray([float(value)]))).special
@@ -381,17 +380,17 @@ def _theory(
         kinds: dict[str, list[float]] = {}
         for point in special:
             kinds.setdefault(point.kind.replace("_", " "), []).append(point.rotor_speed)
-        found.append(kinds)
-    found = found * 2 if fixed else found
+        kinds_of_rows.append(kinds)
+    kinds_of_rows = kinds_of_rows * 2 if fixed else kinds_of_rows
     lines: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for kind in sorted({kind for kinds in found for kind in kinds}):
-        counts = {len(kinds.get(kind, [])) for kinds in found}
+    for kind in sorted({kind for kinds in kinds_of_rows for kind in kinds}):
+        counts = {len(kinds.get(kind, [])) for kinds in kinds_of_rows}
         if len(counts) == 1:  # points are connected only if every row has the same number of points
-            parts = [(np.asarray([kinds[kind][k] for kinds in found]), rows) for k in range(counts.pop())]
+            parts = [(np.asarray([kinds[kind][k] for kinds in kinds_of_rows]), rows) for k in range(counts.pop())]
         else:
             parts = [
                 (np.asarray([n]), np.asarray([row]))
-                for kinds, row in zip(found, rows, strict=True)
+                for kinds, row in zip(kinds_of_rows, rows, strict=True)
                 for n in kinds.get(kind, [])
             ]
         lines[kind] = parts if x_name == _SPEED else [(b, a) for a, b in parts]

@@ -21,16 +21,16 @@ from jaxvib.steady.measures import vibration_measures
 from optimize.quantities.quantity import Quantity
 
 _SETTLED_SPEED_SHARE = 0.01
-"""Difference between a mean load speed and the final one, relative to the rotor speed, below which loads are settled."""
+"""Difference between a mean load speed and the final load speed, relative to the rotor speed, below which loads are settled."""
 
 
 @dataclass(frozen=True)
 class RunMeasure:
     """Quantity that is computed from a run, see `BatchRun`.
 
-    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun`, or the name of its attribute, that gives a scalar or
-    an array with an additional dimension of the name `axis` ("coordinate", "load"); `meanings`: for a label, the meanings of
-    its values 0, 1, ...
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that returns a scalar or an array (n,), or the name
+    of an attribute of `BatchRun`; `axis`: name of the dimension of such an array ("coordinate", "load"), "" for a scalar;
+    `meanings`: for a label, the meanings of its values 0, 1, ...
     """
 
     name: str
@@ -53,7 +53,7 @@ Measure: TypeAlias = Quantity | RunMeasure
 """Type of a measure of a study."""
 
 
-def _of_regime(name: str, unit: str, field: str, meanings: tuple[str, ...] = ()) -> RunMeasure:
+def _regime_measure(name: str, unit: str, field: str, meanings: tuple[str, ...] = ()) -> RunMeasure:
     """Return a measure with the name of a `field` of `Regime`."""
 
     def read(run: BatchRun) -> Array:
@@ -68,8 +68,11 @@ def _of_regime(name: str, unit: str, field: str, meanings: tuple[str, ...] = ())
     return RunMeasure(name, unit, read, meanings=meanings)
 
 
-def _settling(run: BatchRun) -> Array:
-    """Return the end, s, of the last part of the run in which the speed of a load or rotor differs from its final speed."""
+def _settling_time(run: BatchRun) -> Array:
+    """Return the end, s, of the last part of the run in which the speed of a load or rotor differs from its final speed.
+
+    If the speed still changes within the window, the end of the run is returned.
+    """
     last = run.measured.load_speed
     if run.regime is None:
         end, half = run.window.time.shape[0] - 1, run.window.time.shape[0] // 2
@@ -79,8 +82,8 @@ def _settling(run: BatchRun) -> Array:
         change = jnp.max(jnp.abs(late - early)) / top
     else:
         top, change = jnp.abs(run.window.rotor_speed[-1]), run.regime.change
-    away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * top, axis=1)
-    at = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
+    is_away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * top, axis=1)
+    at = jnp.max(jnp.where(is_away, jnp.arange(1, is_away.shape[0] + 1), 0)) * run.part_length
     return jnp.where(change < _SETTLED_SPEED_SHARE, at, run.window.time[-1])
 
 
@@ -91,7 +94,7 @@ def _relative_rotation(run: BatchRun) -> Array:
     return jnp.max(turned) - jnp.min(turned)
 
 
-def _of_vibration(name: str, unit: str, field: str, axis: str = "") -> RunMeasure:
+def _vibration_measure(name: str, unit: str, field: str, axis: str = "") -> RunMeasure:
     """Return a measure with the name of a `field` of `VibrationMeasures`."""
 
     def read(run: BatchRun) -> Array:
@@ -108,32 +111,32 @@ def _support_load(run: BatchRun) -> Array:
     return _STATIC.read(run) + _DYNAMIC.read(run)
 
 
-_STATIC = _of_vibration("", "N", "static_load", "support")
-_DYNAMIC = _of_vibration("", "N", "dynamic_load", "support")
+_STATIC = _vibration_measure("", "N", "static_load", "support")
+_DYNAMIC = _vibration_measure("", "N", "dynamic_load", "support")
 
 
 RUN_MEASURES = {
     measure.name: measure
     for measure in (
-        _of_regime("run.regime", "", "name", REGIMES),
-        _of_regime("run.mode", "", "mode"),
+        _regime_measure("run.regime", "", "name", REGIMES),
+        _regime_measure("run.mode", "", "mode"),
         RunMeasure("run.load_speed", "rad/s", "measured.omega"),
         RunMeasure("run.amplitude", "m or rad", "measured.amplitude", axis="coordinate"),
         RunMeasure("run.foundation_force", "N", "measured.foundation_force"),
-        _of_regime("run.ripple", "rad/s", "ripple"),
-        _of_regime("run.rotor_speed", "rad/s", "rotor_speed"),
+        _regime_measure("run.ripple", "rad/s", "ripple"),
+        _regime_measure("run.rotor_speed", "rad/s", "rotor_speed"),
         RunMeasure("run.relative_rotation", "rad", _relative_rotation),
         RunMeasure("run.drift", "", "measured.drift"),
-        RunMeasure("run.settling_time", "s", _settling),
-        _of_vibration("run.stroke", "m", "stroke", "translation"),
-        _of_vibration("run.acceleration", "", "acceleration", "translation"),
-        _of_vibration("run.velocity", "m/s", "velocity", "translation"),
-        _of_vibration("run.transmissibility", "", "transmissibility"),
-        _of_vibration("run.shaft_torque", "N m", "torque", "exciter"),
-        _of_vibration("run.shaft_power", "W", "power", "exciter"),
+        RunMeasure("run.settling_time", "s", _settling_time),
+        _vibration_measure("run.stroke", "m", "stroke", "translation"),
+        _vibration_measure("run.acceleration", "", "acceleration", "translation"),
+        _vibration_measure("run.velocity", "m/s", "velocity", "translation"),
+        _vibration_measure("run.transmissibility", "", "transmissibility"),
+        _vibration_measure("run.shaft_torque", "N m", "torque", "exciter"),
+        _vibration_measure("run.shaft_power", "W", "power", "exciter"),
         RunMeasure("run.support_load", "N", _support_load, "support"),
-        _of_vibration("run.throw_number", "", "throw_number"),
-        _of_vibration("run.conveying_speed", "m/s", "conveying_speed"),
+        _vibration_measure("run.throw_number", "", "throw_number"),
+        _vibration_measure("run.conveying_speed", "m/s", "conveying_speed"),
     )
 }
 """Measures of a run by name: regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
@@ -147,7 +150,7 @@ load."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:
-    """Return a measure, looked up by name if it is a string. **Raises** `InputError` for other values."""
+    """Return a measure; a string is the name of a measure of `RUN_MEASURES`. **Raises** `InputError` for other values."""
     if isinstance(given, (Quantity, RunMeasure)):
         return given
     if isinstance(given, str) and given in RUN_MEASURES:

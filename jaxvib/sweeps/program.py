@@ -24,11 +24,11 @@ from jaxvib.sweeps.definition import CASE_STATUSES, PYTHON, Study, digest
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from optimize.quantities.evaluation import Evaluation
 
-_SAMPLES = 1024
+_STATES_IN_WINDOW = 1024
 """Number of states in the measuring window of a run."""
 
-_PER_TURN = 8
-"""Smallest number of states in a turn of the rotor; jammed loads turn more slowly, and have more states in a turn."""
+_STATES_PER_TURN = 8
+"""Smallest number of states per turn of the rotor. Jammed loads turn more slowly; there are more states per turn of a load."""
 
 _SLOW_PERIODS = 20
 """Length of the window in periods of the lowest natural frequency, as in `simulate`."""
@@ -42,16 +42,16 @@ _CODE = {name: k for k, name in enumerate(CASE_STATUSES)}
 class Chunk(NamedTuple):
     """Results of the cases of a chunk.
 
-    **Attributes**: `found`: values (cases, ...) of each measure, by name; `status` (cases,): indices of `CASE_STATUSES`;
+    **Attributes**: `values` (cases, ...) of each measure, by name; `status` (cases,): indices of `CASE_STATUSES`;
     `errors`: the message of each failed case, by its index.
     """
 
-    found: dict[str, np.ndarray]
+    values: dict[str, np.ndarray]
     status: np.ndarray
     errors: dict[int, str]
 
 
-def _each(
+def _measure_cases(
     scene: Scene,
     values: Array,
     batch: int,
@@ -61,18 +61,20 @@ def _each(
     start: Start,
     mode: int | None,
 ) -> tuple[tuple[Array, ...], Array]:
-    """Compute the measures of each case (cases, axes), `batch` cases at a time, and True for each case whose motion stayed
-    finite."""
+    """Compute the measures of the cases with the `values` (cases, axes) of the axes, `batch` cases at a time.
 
-    def one(value: Array) -> tuple[tuple[Array, ...], Array]:
-        this = put(scene, targets, value)
-        evaluation, run = Evaluation(this), None
+    **Returns** the measures (cases, ...), and True (cases,) for cases whose motion stayed finite.
+    """
+
+    def measure_case(value: Array) -> tuple[tuple[Array, ...], Array]:
+        varied = put(scene, targets, value)
+        evaluation, run = Evaluation(varied), None
         if plan is not None:
             separation = (
                 START_SEPARATION if start == "jam" else None
             )  # loads that start at one angle stay together, even in an unstable jam
-            state = put_start(initial_state(this, start, mode=mode, separation=separation, throw=False), targets, value)
-            run = run_in_batch(this, state, plan)
+            state = put_start(initial_state(varied, start, mode=mode, separation=separation, throw=False), targets, value)
+            run = run_in_batch(varied, state, plan)
 
         def read(measure: Measure) -> Array:
             if not isinstance(measure, RunMeasure):
@@ -82,46 +84,48 @@ def _each(
 
         return tuple(jnp.asarray(read(measure)) for measure in measures), jnp.asarray(True) if run is None else run.finite
 
-    return jax.lax.map(one, values, batch_size=batch)
+    return jax.lax.map(measure_case, values, batch_size=batch)
 
 
 @cached
-def _cases(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tuple[Array, ...], Array]:
-    """Compute cases by a compiled program; each digest `program` has its own.
+def _measure_cases_compiled(scene: Scene, values: Array, program: str, *choices: Any) -> tuple[tuple[Array, ...], Array]:
+    """Compute cases by a compiled program; there is one program for each digest `program`.
 
-    The digest is an argument because a function is equal to itself after a change of its global variables, so that the program
-    before the change would be used again.
+    The digest is an argument for the following reason: a user's function is equal to itself after a change of its global
+    variables. Without the digest, the program from before the change would be used again.
     """
-    return _each(scene, values, *choices)
+    return _measure_cases(scene, values, *choices)
 
 
 @cached
 def _speeds(scene: Scene, values: Array, targets: tuple[Target, ...]) -> tuple[Array, Array, Array, Array]:
-    def one(value: Array) -> tuple[Array, Array, Array, Array]:
-        this = put(scene, targets, value)
-        return (*frequency_bounds(this), fastest_decay(this), this.top_speed)
+    def bounds_of_case(value: Array) -> tuple[Array, Array, Array, Array]:
+        varied = put(scene, targets, value)
+        return (*frequency_bounds(varied), fastest_decay(varied), varied.top_speed)
 
-    return jax.vmap(one)(values)
+    return jax.vmap(bounds_of_case)(values)
 
 
-def planned(scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], until: float, steps: int | None) -> BatchPlan:
+def plan_runs_of_cases(
+    scene: Scene, corners: np.ndarray, targets: tuple[Target, ...], until: float, steps: int | None
+) -> BatchPlan:
     """Return the plan of steps and window for all cases, from the fastest and the slowest of the `corners` (n, axes) of a
     study.
 
     Frequencies increase with each stiffness and decrease with each mass; therefore the extreme frequencies are in the corners.
     """
     fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), targets))
-    most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
-    window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), most, until / 2.0)
-    given = None if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
-    step, implicit = equal_step_length(float(np.max(fastest)), float(np.max(decay)), 1.0, given)
+    max_window = 2.0 * np.pi * _STATES_IN_WINDOW / (_STATES_PER_TURN * float(np.max(rotor)))
+    window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), max_window, until / 2.0)
+    step_given = None if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
+    step, implicit = equal_step_length(float(np.max(fastest)), float(np.max(decay)), 1.0, step_given)
     if until / step > _MAX_STEPS:
         name = "until" if steps is None else "steps"
         raise InputError(name, f"needs {until / step:.3g} steps for every run; give a shorter run or fewer steps")
-    each, between = (until - window) / (PARTS_OF_RUN * step), window / ((_SAMPLES - 1) * step)
+    steps_per_part, steps_between = (until - window) / (PARTS_OF_RUN * step), window / ((_STATES_IN_WINDOW - 1) * step)
     # 1e-9: a number that is whole up to rounding errors is not rounded up
-    counts = (int(np.ceil(x - 1e-9)) or 1 for x in (each, between))
-    return BatchPlan(until, window, _SAMPLES, *counts, implicit=implicit)
+    counts = (int(np.ceil(x - 1e-9)) or 1 for x in (steps_per_part, steps_between))
+    return BatchPlan(until, window, _STATES_IN_WINDOW, *counts, implicit=implicit)
 
 
 def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
@@ -134,12 +138,12 @@ def traced_program(study: Study) -> tuple[list[jax.ShapeDtypeStruct], str]:
     values = jnp.zeros((1, len(study.targets)))
 
     def cases(values: Array) -> tuple[tuple[Array, ...], Array]:
-        return _each(study.scene, values, *study.choices)
+        return _measure_cases(study.scene, values, *study.choices)
 
-    program, (found, _) = jax.make_jaxpr(cases, return_shape=True)(values)
+    program, (leaves, _) = jax.make_jaxpr(cases, return_shape=True)(values)
     text: list[Plain] = [*program_text(program)]
     identity = f"{PYTHON} {uuid.uuid4().hex}" if calls_python(program) else digest(text)
-    return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in found], identity
+    return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], identity
 
 
 def compute(study: Study, chunk: int) -> Chunk:
@@ -151,31 +155,36 @@ def compute(study: Study, chunk: int) -> Chunk:
     errors: dict[int, str] = {}
     parts = _compute_cases(study, values, np.arange(len(values)), errors)
     leaves, finite = parts
-    whole = np.all([np.all(np.isfinite(leaf.reshape(len(values), -1)), axis=1) for leaf in leaves], axis=0)
-    status = np.where(finite, np.where(whole, _CODE["done"], _CODE["absent"]), _CODE["not_finite"]).astype(np.uint8)
+    is_complete = np.all([np.all(np.isfinite(leaf.reshape(len(values), -1)), axis=1) for leaf in leaves], axis=0)
+    status = np.where(finite, np.where(is_complete, _CODE["done"], _CODE["absent"]), _CODE["not_finite"]).astype(np.uint8)
     status[list(errors)] = _CODE["failed"]
     return Chunk(dict(zip(study.names, leaves, strict=True)), status, errors)
 
 
 def _compute_cases(
-    study: Study, values: np.ndarray, which: np.ndarray, errors: dict[int, str]
+    study: Study, values: np.ndarray, cases: np.ndarray, errors: dict[int, str]
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the results of the cases `which` of a chunk; NaN (labels: -1) for other cases and cases that raise an error."""
-    filled = np.repeat(values[which[:1]], study.size, axis=0)
-    filled[which] = values[which]
+    """Return the results of a chunk, of which only the `cases` (indices) are computed.
+
+    Other cases, and cases that raise an error, have NaN (labels: -1). Messages are added to `errors`.
+    """
+    filled = np.repeat(values[cases[:1]], study.size, axis=0)
+    filled[cases] = values[cases]
     try:
-        found, finite = _cases(study.scene, jnp.asarray(filled), study.program, *study.choices)
-        return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
+        leaves, finite = _measure_cases_compiled(study.scene, jnp.asarray(filled), study.program, *study.choices)
+        return [np.asarray(leaf)[: len(values)] for leaf in leaves], np.asarray(finite)[: len(values)]
     except RuntimeError as error:  # raised by a running program; an error of its compilation would concern all cases
         if "RESOURCE_EXHAUSTED" in str(error):
             raise
-        if len(which) == 1:
-            errors[int(which[0])] = _sentence(error)
-            return study.nothing(len(values)), np.ones(len(values), bool)
-        halves = [_compute_cases(study, values, half, errors) for half in np.array_split(which, 2)]
-    late = np.isin(np.arange(len(values)), np.array_split(which, 2)[1])
-    chosen = [np.where(late.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(*(h[0] for h in halves), strict=True)]
-    return chosen, np.where(late, halves[1][1], halves[0][1])
+        if len(cases) == 1:
+            errors[int(cases[0])] = _sentence(error)
+            return study.placeholders(len(values)), np.ones(len(values), bool)
+        halves = [_compute_cases(study, values, half, errors) for half in np.array_split(cases, 2)]
+    is_second_half = np.isin(np.arange(len(values)), np.array_split(cases, 2)[1])
+    chosen = [
+        np.where(is_second_half.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(*(h[0] for h in halves), strict=True)
+    ]
+    return chosen, np.where(is_second_half, halves[1][1], halves[0][1])
 
 
 def _sentence(error: Exception) -> str:

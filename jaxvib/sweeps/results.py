@@ -11,20 +11,20 @@ from jaxvib.sweeps.figures import axis_label, case_labels, display_unit, is_labe
 from jaxvib.sweeps.store import Store
 
 _MAX_CASES = 40
-"""Number of cases up to which each one has its own row."""
+"""Largest number of cases for which the table has a row for each case."""
 
 _MAX_ENTRIES = 4
-"""Number of entries of a measure up to which all are shown; of a longer one the range is shown."""
+"""Largest number of entries of a measure that are all shown; of more entries the range is shown."""
 
 _MAX_READ = 1_000_000
-"""Number of cases up to which a store is read as a whole."""
+"""Largest number of cases of a store that is read as a whole."""
 
 
 def results_table(store: str | Path) -> tuple[str, list[str], list[list[str]]]:
     """Return the results of a study as title, heads and rows of a table, in display units.
 
-    Up to 40 cases have a row each. Of more cases the table has the range and the median of each measure, or the shares of its
-    labels, such as regimes; it has no rows for more than a million cases.
+    A study with at most 40 cases has a row for each case. For more cases the table has a row for each measure: least value,
+    median and largest value, or the shares of labels, such as regimes. The table of more than a million cases is empty.
     """
     opened = Store(Path(store))
     if np.prod(opened.shape, dtype=np.int64) > _MAX_READ:
@@ -55,19 +55,19 @@ def _case_texts(store: Store, name: str) -> list[str]:
         codes, names = case_labels(store, slice(None))
         return [names[k].replace("_", " ") if k >= 0 else "" for k in codes.ravel()]
     values = display_unit(store, name)[1] * store.read(name).astype(float)
-    each = values.reshape(int(np.prod(store.shape)), -1)
-    if each.shape[1] > _MAX_ENTRIES:
-        return [f"{np.min(row):.4g} to {np.max(row):.4g}" for row in each]
-    return [" ".join(f"{x:.4g}" for x in row) for row in each]
+    entries = values.reshape(int(np.prod(store.shape)), -1)
+    if entries.shape[1] > _MAX_ENTRIES:
+        return [f"{np.min(row):.4g} to {np.max(row):.4g}" for row in entries]
+    return [" ".join(f"{x:.4g}" for x in row) for row in entries]
 
 
 def _summary(store: Store, name: str, done: np.ndarray) -> list[str]:
-    """Return least value, median and largest value of a measure over the finished cases; of labels their shares."""
+    """Return least value, median and largest value of a measure over the finished cases, or the shares of labels, as text."""
     if is_label(store, name):
         codes, names = case_labels(store, slice(None))
         count = np.bincount(codes[done].ravel(), minlength=len(names))
-        found = [k for k in np.argsort(-count, kind="stable") if count[k]]
-        return ["", ", ".join(f"{names[k].replace('_', ' ')} {100.0 * count[k] / np.sum(done):.3g} %" for k in found), ""]
+        present = [k for k in np.argsort(-count, kind="stable") if count[k]]
+        return ["", ", ".join(f"{names[k].replace('_', ' ')} {100.0 * count[k] / np.sum(done):.3g} %" for k in present), ""]
     values = display_unit(store, name)[1] * store.read(name).astype(float)[done]
     values = values[np.isfinite(values)]
     return [f"{x:.4g}" for x in np.quantile(values, [0.0, 0.5, 1.0])] if values.size else ["", "no value", ""]

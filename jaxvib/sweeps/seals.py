@@ -33,8 +33,8 @@ def seal_of(store: Path, chunk: int) -> Path:
 
 
 def _digest(files: Mapping[str, Path]) -> str:
-    """Return a digest of names and contents; a missing file also changes it."""
-    found = hashlib.sha256()
+    """Return a digest of the names and contents of files; for a missing file the digest differs too."""
+    total = hashlib.sha256()
     for name, path in files.items():
         try:
             with open_regular(path) as file:
@@ -43,17 +43,17 @@ def _digest(files: Mapping[str, Path]) -> str:
             content = "absent"
         except OSError as error:
             content = f"unreadable: {error}"
-        found.update(f"{name} {content}\n".encode())
-    return found.hexdigest()
+        total.update(f"{name} {content}\n".encode())
+    return total.hexdigest()
 
 
 def _stamps(files: Mapping[str, Path]) -> tuple[object, ...]:
-    """Return stamps of files, which change if a file is rewritten or replaced."""
+    """Return stamps of files (time of change, size, inode number), which differ if a file was rewritten or replaced."""
 
     def stamp(path: Path) -> object:
         try:
-            seen = path.stat()
-            return seen.st_mtime_ns, seen.st_size, seen.st_ino
+            status = path.stat()
+            return status.st_mtime_ns, status.st_size, status.st_ino
         except OSError:
             return None
 
@@ -112,7 +112,8 @@ def changed_layout(store: Path) -> str | None:
 
 
 def _lock(file: int, *, exclusive: bool) -> bool:
-    """Lock an open file; return False if another process has the lock. The system releases the lock when the process ends."""
+    """Lock an open file, and return False if another process has the lock. The system releases the lock when the process
+    ends."""
     try:
         import fcntl
     except ImportError:  # Windows

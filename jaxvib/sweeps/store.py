@@ -79,7 +79,7 @@ class Store:
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
                 raise InputError("store", f"is {quoted(str(path))}, which is not the store of a sweep; name another one")
             self.record: Tables = self.attributes["study"]
-            # A chunk without values is also written, because a missing file counts as damage.
+            # Chunks of placeholders are written too, because a missing file counts as damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self.arrays = {name: self.group[name] for name in self.group.array_keys()}
             self.shape = tuple(self.group["status"].shape)
@@ -99,8 +99,8 @@ class Store:
 
     @classmethod
     def create(cls, path: Path, study: Study) -> None:
-        """Create the empty store of a study atomically. If another process has created it in the meantime, that store is
-        kept."""
+        """Create the empty store of a study atomically. If another process has created the store in the meantime, nothing is
+        changed."""
         zarr = optional_module("zarr", "sweep")
         part = path.with_name(f".{uuid.uuid4().hex}.partial")
         try:
@@ -123,16 +123,16 @@ class Store:
 
     def require_same(self, study: Study) -> None:
         """**Raises** `InputError` if the store belongs to another study or to other versions of the packages."""
-        if (found := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
-            name, mine, its = found
+        if (change := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
+            name, mine, its = change
             part = re.split(r"[.\[]", name)[0]
             problem = f"is {str(self.path)!r}, which contains another study: its {part} differs"
-            where = "" if part == name else f" ({name} is {_short(its)} in the store and {_short(mine)} here)"
+            detail = "" if part == name else f" ({name} is {_short(its)} in the store and {_short(mine)} here)"
             if study.program.startswith(PYTHON):
-                where = " (a measure calls Python from its program, whose results cannot be compared)"
+                detail = " (a measure calls Python from its program, whose results cannot be compared)"
             elif name == "program":
-                where = " (a parameter of the scene, the function of a measure, or a value to which it refers)"
-            raise InputError("store", f"{problem}{where}; name another store, or run the study of this store")
+                detail = " (a parameter of the scene, the function of a measure, or a value to which it refers)"
+            raise InputError("store", f"{problem}{detail}; name another store, or run the study of this store")
         for name, version in versions().items():
             if self.attributes["versions"].get(name) != version:
                 begun = f"was created with {name} {self.attributes['versions'].get(name)}, and this is {version}"
@@ -164,12 +164,12 @@ class Store:
     def _files(self, chunk: int) -> dict[str, Path]:
         """Return the files of a chunk by array name: sampled numbers, measures, errors, statuses."""
         place = tuple(int(k) for k in np.unravel_index(chunk, self.tiles))
-        found: dict[str, Path] = {}
+        files: dict[str, Path] = {}
         for name in (*self.sampled, *self.names, "error", "status"):
-            at = place[-1:] if name in self.sampled else place
+            indices = place[-1:] if name in self.sampled else place
             extra = len(self.arrays[name].shape) - len(self.shape) if name in self.names else 0
-            found[name] = self.path / name / "c" / "/".join(str(k) for k in (*at, *([0] * extra)))
-        return found
+            files[name] = self.path / name / "c" / "/".join(str(k) for k in (*indices, *([0] * extra)))
+        return files
 
     @property
     def sampled(self) -> tuple[str, ...]:
@@ -194,7 +194,7 @@ class Store:
         return ChunkState.damaged
 
     def _is_readable(self, chunk: int, files: dict[str, Path]) -> bool:
-        """Return True if the files of a chunk that an interrupted process left behind can be read."""
+        """Return True if the files that an interrupted process has written for a chunk can be read, or if there are none."""
         if not any(file.exists() for file in files.values()):
             return True
         region = self.region(chunk)
@@ -206,7 +206,8 @@ class Store:
         return True
 
     def clear(self, chunk: int) -> None:
-        """Remove the files of a damaged chunk, first its seal: after an interruption the chunk then counts as missing."""
+        """Remove the files of a damaged chunk. The seal is removed first; after an interruption the chunk then counts as
+        missing."""
         try:
             for file in (seals.seal_of(self.path, chunk), *reversed(self._files(chunk).values())):
                 shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink(missing_ok=True)
@@ -230,7 +231,7 @@ class Store:
                 drawn = study.grid.sampled_values(region[-1])
                 for k, name in enumerate(self.sampled):
                     self.arrays[name][region[-1]] = drawn[:, k]
-            for name, leaf in cases.found.items():
+            for name, leaf in cases.values.items():
                 self.arrays[name][region] = leaf.reshape(*shape, *leaf.shape[1:])
             if cases.errors:
                 sentences = np.full(int(np.prod(shape)), "", dtype=object)
@@ -250,11 +251,11 @@ class Store:
         total = np.zeros(len(CASE_STATUSES), np.int64)
         finished = (states == ChunkState.finished).reshape(self.tiles)
         for rows in self.pieces():
-            among = finished[rows.start // self.tile[0] : -(-rows.stop // self.tile[0])]
-            if np.all(among):
+            is_finished = finished[rows.start // self.tile[0] : -(-rows.stop // self.tile[0])]
+            if np.all(is_finished):
                 total += self._count_statuses(rows)
                 continue
-            for place in np.argwhere(among):
+            for place in np.argwhere(is_finished):
                 place[0] += rows.start // self.tile[0]
                 total += self._count_statuses(self.region(int(np.ravel_multi_index(tuple(place), self.tiles))))
         total[0] += int(np.prod(self.shape, dtype=np.int64)) - np.sum(total)
@@ -292,9 +293,9 @@ def _short(value: Plain) -> str:
 
 def cannot_write(path: Path, error: OSError) -> InputError:
     """Return the error for a store that cannot be written. Its finished chunks are not affected."""
-    why = error.strerror or str(error)
+    reason = error.strerror or str(error)
     advice = "make room or name another store; finished chunks are kept, run the same command again to continue"
-    return InputError("store", f"is {quoted(str(path))}, which cannot be written ({why}); {advice}")
+    return InputError("store", f"is {quoted(str(path))}, which cannot be written ({reason}); {advice}")
 
 
 def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
@@ -315,16 +316,21 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
     group = zarr.create_group(path, zarr_format=3, attributes=attributes)
 
     def add(
-        name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...], kind: object, **more: Plain
+        name: str,
+        dims: tuple[str, ...],
+        shape: tuple[int, ...],
+        chunks: tuple[int, ...],
+        kind: object,
+        **attributes_of_measure: Plain,
     ) -> Any:
-        array_attributes = {key: value for key, value in more.items() if key != "fill" and value}
+        array_attributes = {key: value for key, value in attributes_of_measure.items() if key != "fill" and value}
         return group.create_array(
             name,
             shape=shape,
             chunks=chunks,
             dtype=kind,
             dimension_names=dims,
-            fill_value=more["fill"],
+            fill_value=attributes_of_measure["fill"],
             attributes=array_attributes,
             compressors=ZstdCodec(level=1, checksum=True),
         )
@@ -339,11 +345,22 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
     for name, measure, form in zip(study.names, study.measures, study.forms, strict=True):
         extra = (measure.axis,) if isinstance(measure, RunMeasure) and measure.axis else ()
         real = np.issubdtype(form.dtype, np.inexact)
-        more: dict[str, Plain] = {"units": measure.unit, "long_name": measure.words}
+        attributes_of_measure: dict[str, Plain] = {"units": measure.unit, "long_name": measure.words}
         if isinstance(measure, RunMeasure) and measure.meanings:
-            more |= {"flag_values": list(range(len(measure.meanings))), "flag_meanings": " ".join(measure.meanings)}
+            attributes_of_measure |= {
+                "flag_values": list(range(len(measure.meanings))),
+                "flag_meanings": " ".join(measure.meanings),
+            }
         kind, fill = (form.dtype, np.nan) if real else (np.dtype("i2"), -1)
-        add(name, (*grid.dims, *extra), (*grid.shape, *form.shape), (*grid.tile, *form.shape), kind, fill=fill, **more)
+        add(
+            name,
+            (*grid.dims, *extra),
+            (*grid.shape, *form.shape),
+            (*grid.tile, *form.shape),
+            kind,
+            fill=fill,
+            **attributes_of_measure,
+        )
         for dim, size in zip(extra, form.shape, strict=True):
             if dim not in group and len(extra_names.get(dim, ())) == size:
                 add(dim, (dim,), (size,), (size,), str, fill="")[:] = np.asarray(extra_names[dim], dtype=object)

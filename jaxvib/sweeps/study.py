@@ -19,7 +19,7 @@ from jaxvib.results.fields import Plain
 from jaxvib.sweeps.axes import SAMPLINGS, Axis, AxisSpec, Grid, axis_of, corners, require_disjoint, tile_of
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
-from jaxvib.sweeps.program import planned, traced_program
+from jaxvib.sweeps.program import plan_runs_of_cases, traced_program
 from jaxvib.units import Number, count, number
 from optimize.files import quantity_from_table
 from optimize.quantities.quantity import TIERS, Quantity, Tier
@@ -27,13 +27,13 @@ from optimize.quantities.quantity import TIERS, Quantity, Tier
 Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
 """Type of measures: a list, or a mapping from names to measures."""
 
-_CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
+_CASES_PER_CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
 """Default number of cases of a chunk by tier: about one second of computation, much more than the time to write the chunk."""
 
 _RESERVED = ("status", "error")
 
 _MAX_CASES = 10**9
-"""Maximum number of cases of a study; the list of all chunks is kept in memory."""
+"""Maximum number of cases of a study, because the list of all chunks is in memory."""
 
 
 def study(
@@ -61,8 +61,8 @@ def study(
     require_one_of(chosen, TIERS, "tier")
     measures = tuple(m.at_tier(tier) if tier and isinstance(m, Quantity) else m for m in measures)
     plan = _run_plan(scene, grid.axes, measures, until, start, mode, steps)
-    most = count(_CHUNK["time" if has_runs else chosen] if chunk is None else chunk, "chunk")
-    grid = grid._replace(tile=tile_of(grid.shape, most))
+    max_cases = count(_CASES_PER_CHUNK["time" if has_runs else chosen] if chunk is None else chunk, "chunk")
+    grid = grid._replace(tile=tile_of(grid.shape, max_cases))
     specs = {name: _plain(spec) for name, spec in axes.items()}
     return _traced(Study(scene, grid, names, measures, plan, start, mode, chosen, specs))
 
@@ -71,18 +71,18 @@ def _grid(scene: Scene, axes: Mapping[str, AxisSpec], samples: int, sampling: st
     """Return the cases of a study, without the size of its chunks."""
     if not isinstance(axes, Mapping) or not axes:
         raise InputError("axes", "is empty; name at least one parameter that varies, such as drive.speed")
-    found = tuple(axis_of(scene, name, spec) for name, spec in axes.items())
-    require_disjoint(scene, found)
-    drawn = [axis.name for axis in found if axis.values is None]
+    read_axes = tuple(axis_of(scene, name, spec) for name, spec in axes.items())
+    require_disjoint(scene, read_axes)
+    sampled = [axis.name for axis in read_axes if axis.values is None]
     count(samples, "samples", low=0)
     require_one_of(sampling, SAMPLINGS, "sampling")
     if count(seed, "seed", low=0) >= 2**64:
         raise InputError("seed", "has more than 64 bits; give a smaller whole number")
-    if drawn and not samples:
-        raise InputError(f"axes.{drawn[0]}", "is a range without a count; give samples, or a count")
-    if samples and not drawn:
+    if sampled and not samples:
+        raise InputError(f"axes.{sampled[0]}", "is a range without a count; give samples, or a count")
+    if samples and not sampled:
         raise InputError("samples", f"is {samples}, but no axis is sampled; leave out samples, or the count of an axis")
-    grid = Grid(found, samples, seed, sampling, ())
+    grid = Grid(read_axes, samples, seed, sampling, ())
     if math.prod(grid.shape) > _MAX_CASES:
         problem = f"make {math.prod(grid.shape):.3g} cases; a study has {_MAX_CASES:.0e} at most"
         raise InputError("axes", f"{problem}: give fewer values, or give ranges without a count and draw samples")
@@ -112,15 +112,15 @@ def _run_plan(
     runs, targets = [m for m in measures if isinstance(m, RunMeasure)], tuple(axis.target for axis in axes)
     if not runs:
         if until is not None or any(target.number is None for target in targets):
-            what = "until" if until is not None else next(f"axes.{a.name}" for a in axes if a.target.number is None)
+            field = "until" if until is not None else next(f"axes.{a.name}" for a in axes if a.target.number is None)
             problem = "applies to runs, but no quantity is measured in a run; measure for example run.regime"
-            raise InputError(what, problem)
+            raise InputError(field, problem)
         return None
     if until is None:
         raise InputError("until", f"is missing; {runs[0].name} is measured in a run; give the duration of the run")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
     initial_state(scene, start, mode=mode, throw=False)  # raises an error for a start that the scene cannot have
-    return planned(scene, corners(axes), targets, end, None if steps is None else count(steps, "steps"))
+    return plan_runs_of_cases(scene, corners(axes), targets, end, None if steps is None else count(steps, "steps"))
 
 
 def _traced(study: Study) -> Study:
@@ -158,9 +158,9 @@ def _name_measures(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, .
     The mode is appended to the names of quantities that differ only in it.
     """
     if isinstance(measure, Mapping):
-        found = {str(name): measure_of(m, f"measure.{name}") for name, m in measure.items()}
-        if found:
-            return tuple(found), tuple(found.values())
+        named = {str(name): measure_of(m, f"measure.{name}") for name, m in measure.items()}
+        if named:
+            return tuple(named), tuple(named.values())
         measure = ()
     if isinstance(measure, (str, Quantity, RunMeasure)) or not isinstance(measure, Sequence) or not measure:
         raise InputError("measure", f"is {quoted(measure)}; give a list of quantities, such as ['run.regime']")
@@ -183,7 +183,7 @@ _FIELDS = ["scene", "tier", "samples", "sampling", "seed", "chunk", "axes", "run
 def load_study(path: str | Path) -> Study:
     """Read a study file: TOML with the path of a `scene` relative to the file, `[axes]`, `[[measure]]` and, for runs, `[run]`.
 
-    **Returns** `Study`. **Raises** `InputError` for a file that cannot be read and for every error in it, with the name of the
+    **Returns** `Study`. **Raises** `InputError` for a file that cannot be read, and for an error in it; the message names the
     field.
 
     >>> import pathlib, tempfile
@@ -213,13 +213,13 @@ def load_study(path: str | Path) -> Study:
     for name in run:
         if name not in ("until", "start", "mode", "steps"):
             raise InputError(f"run.{name}", f"is not a field here; {suggest_name(name, ['until', 'start', 'mode', 'steps'])}")
-    given = [_measure(table, f"measure[{k}]", Path(path)) for k, table in enumerate(tables["measure"])]
-    measure: Measures = [m for _, m in given]
-    if any(name for name, _ in given):
-        names = [name or (m if isinstance(m, str) else m.name).removeprefix("run.") for name, m in given]
+    named_measures = [_measure(table, f"measure[{k}]", Path(path)) for k, table in enumerate(tables["measure"])]
+    measure: Measures = [m for _, m in named_measures]
+    if any(name for name, _ in named_measures):
+        names = [name or (m if isinstance(m, str) else m.name).removeprefix("run.") for name, m in named_measures]
         doubled = [name for name in names if names.count(name) > 1]
         if doubled:
-            raise InputError("measure", f"has several {doubled[0]}; give each a name of its own")
+            raise InputError("measure", f"has several {doubled[0]}; give each one a different name")
         measure = dict(zip(names, measure, strict=True))
     options = {name: tables[name] for name in ("tier", "samples", "sampling", "seed", "chunk") if name in tables}
     scene = load_scene(Path(path).parent / tables["scene"])
@@ -251,12 +251,12 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
             raise InputError(f"{field}.{key}", f"is not a field here; {suggest_name(key, ['function', 'unit', 'name'])}")
     module, _, function = str(table["function"]).partition(":")
     try:
-        found = getattr(importlib.import_module(module), function)
+        user_function = getattr(importlib.import_module(module), function)
     except Exception as error:  # any error of the user's module
         reason = f"{error}" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: {error}"
         problem = f"is {quoted(table['function'])}, which cannot be imported ({reason}); write 'module:function'"
         raise InputError(f"{field}.function", problem) from error
-    return Quantity(name or function, str(table.get("unit", "")), found)
+    return Quantity(name or function, str(table.get("unit", "")), user_function)
 
 
 TEMPLATE = Path(__file__).with_name("study.toml").read_text(encoding="utf-8")

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import xarray
 
 _MAX_WORKERS = 16
-"""Maximum number of worker processes on a machine with few cores; with more than four cores, four for each core."""
+"""Maximum number of worker processes on a machine with at most four cores; otherwise it is four for each core."""
 
 
 class Progress(NamedTuple):
@@ -114,8 +114,10 @@ class Sweep(Result):
             again = "they were computed again" if self.computed else "run the study again, which computes them again"
             lines.append(f"  {self.damaged} cases were in damaged or incomplete files: {again}")
         if self.computed:
-            each = 1e3 * self.seconds / self.computed
-            lines.append(f"  {self.computed} cases were computed in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
+            milliseconds = 1e3 * self.seconds / self.computed
+            lines.append(
+                f"  {self.computed} cases were computed in this call, in {self.seconds:.3g} s ({milliseconds:.3g} ms a case)"
+            )
         return "\n".join(lines)
 
     @validated
@@ -150,8 +152,8 @@ def sweep(
     """Compute all cases of a study and store the results on disk. If the store of the same study exists, it is continued.
 
     - Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask
-    - A finished chunk is written at once, so that it is not lost if the process is terminated; a chunk with damaged files is
-      computed again
+    - A finished chunk is written at once and is not lost if the process is terminated; a chunk with damaged files is computed
+      again
     - The results of a case do not depend on other cases, on their order, on the number of workers, or on restarts
 
     **Arguments**
@@ -165,7 +167,7 @@ def sweep(
     - `tier` of quantities of a jam: "leading", "exact" or "time"; default: that of each quantity
     - `start`, `mode`: initial state of runs, "rest" (the default), or "jam" for a start near the jam mode `mode`; axes may
       change its values
-    - `until`: end of runs, s
+    - `until`: end of runs, s or text; typical: 5 to 60
     - `steps`: number of equal steps of a run, the same in all cases; default: one for each radian of the fastest motion
     - `samples`: number of samples; typical: 1000 to 100,000; `sampling`: "low_discrepancy" or "random"; `seed` of the samples
     - `chunk`: number of cases that are computed and written together; a store is continued only with the same number.
@@ -235,7 +237,7 @@ def run_study(
     timeout: Number = "30 s",
     report: Report | None = None,
 ) -> Sweep:
-    """Compute the missing cases in the store of a study; for the arguments see `sweep`."""
+    """Compute the missing cases in the store of a study, see `sweep`."""
     begun = time.perf_counter()
     path = Path(store)
     if workers is not None:
@@ -244,13 +246,13 @@ def run_study(
             raise InputError("workers", f"is {workers}, too many processes for this machine; give at most {most}")
     if not path.exists():
         Store.create(path, new_study)
-    kept = Store(path, writable=True)
-    with kept.locked():
-        return _compute_missing(kept, new_study, begun, workers, scheduler, timeout, report)
+    opened = Store(path, writable=True)
+    with opened.locked():
+        return _compute_missing(opened, new_study, begun, workers, scheduler, timeout, report)
 
 
 def _compute_missing(
-    kept: Store,
+    opened: Store,
     new_study: Study,
     begun: float,
     workers: int | None,
@@ -258,18 +260,18 @@ def _compute_missing(
     timeout: Number,
     report: Report | None,
 ) -> Sweep:
-    """Compute the missing chunks of a store that this process has locked, and recompute the damaged ones."""
+    """Compute the missing and the damaged chunks of a store that this process has locked."""
     has_functions = any(measure not in RUN_MEASURES.values() for measure in new_study.measures)
     if has_functions and not new_study.program.startswith(PYTHON) and traced_program(new_study)[1] != new_study.program:
         problem = "have a function that has changed since the study was created, or that gives another program in each call"
         raise InputError("measures", f"{problem} (a clock, random numbers, a file); pass such numbers as constants")
-    kept.require_same(new_study)
-    states = kept.states(writing=True)
+    opened.require_same(new_study)
+    states = opened.states(writing=True)
     damaged = np.flatnonzero(states == ChunkState.damaged)
     for chunk in damaged:
-        kept.clear(int(chunk))
+        opened.clear(int(chunk))
     finished = states == ChunkState.finished
-    sizes = np.asarray([_cases(new_study, chunk) for chunk in range(finished.size)])
+    sizes = np.asarray([_cases_of_chunk(new_study, chunk) for chunk in range(finished.size)])
     add = _reporter(new_study.grid.cases, int(np.sum(sizes[finished])), report)
     todo = np.flatnonzero(~finished).tolist()
     if todo:
@@ -281,27 +283,29 @@ def _compute_missing(
             source = on_a_cluster(new_study, todo, workers=workers, scheduler=scheduler, timeout=timeout)
         with contextlib.closing(source):
             for chunk, cases in source:
-                kept.write(new_study, chunk, cases)
+                opened.write(new_study, chunk, cases)
                 add(int(sizes[chunk]))
     states[:] = ChunkState.finished
-    return _sweep_result(kept, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged])))
+    return _sweep_result(
+        opened, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged]))
+    )
 
 
 def _reporter(cases: int, done: int, report: Report | None) -> Callable[[int], None]:
     """Return a function that takes the number of cases of each finished chunk and reports the progress."""
-    begun, before, now = time.perf_counter(), done, done
+    begun, finished_before, finished_now = time.perf_counter(), done, done
 
-    def add(more: int) -> None:
-        nonlocal now
-        now += more
+    def add(cases_of_chunk: int) -> None:
+        nonlocal finished_now
+        finished_now += cases_of_chunk
         if report is not None:
-            rate = (now - before) / max(time.perf_counter() - begun, 1e-9)
-            report(Progress(now, cases, rate, (cases - now) / rate))
+            rate = (finished_now - finished_before) / max(time.perf_counter() - begun, 1e-9)
+            report(Progress(finished_now, cases, rate, (cases - finished_now) / rate))
 
     return add
 
 
-def _cases(new_study: Study, chunk: int) -> int:
+def _cases_of_chunk(new_study: Study, chunk: int) -> int:
     return math.prod(s.stop - s.start for s in new_study.grid.region(chunk))
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.exchange.recordings import formats
-from jaxvib.exchange.recordings.formats import _flat, _flat_hdf, _floating, _stated_rate, _with_own_names, read_channels
+from jaxvib.exchange.recordings.formats import _flat, _flat_hdf, _floating, _stated_rate, _with_unique_names, read_channels
 from jaxvib.identification.records.recorded import Recorded
 
 T = np.arange(0.0, 1.0, 0.01)
@@ -104,7 +104,7 @@ def test_arrays_of_version_73():
 
 
 def test_names_that_occur_twice_are_numbered():
-    found = _with_own_names([Recorded(name, "", None, T) for name in ("a", "b", "a")])
+    found = _with_unique_names([Recorded(name, "", None, T) for name in ("a", "b", "a")])
     assert [each.name for each in found] == ["a 1", "b", "a 2"]
     assert _floating(np.arange(3, dtype=np.int16)).dtype == np.float64 and _floating(T.astype(np.float32)).dtype == np.float32
     assert _floating(np.arange(2, dtype=np.longdouble)).dtype == np.float64

@@ -244,7 +244,7 @@ def test_runs_do_not_depend_on_those_beside_them(runs):
     asked = study(runs.scene, axes, measure, until=400.0, chunk=12)
     values = np.asarray([[n, w] for w in axes["start.rate"][::-1] for n in axes["drive.speed"]])
     beside = np.random.default_rng(0).uniform(0.4, 2.0, (asked.size - len(values), 2))
-    found, _ = program._cases(asked.scene, jnp.concatenate([beside, values]), asked.program, *asked.choices)
+    found, _ = program._measure_cases_compiled(asked.scene, jnp.concatenate([beside, values]), asked.program, *asked.choices)
     for name, leaf in zip(asked.names, found, strict=True):
         for value, one in zip(values, leaf[len(beside) :], strict=True):
             kept = given[name].sel({"drive.speed": value[0], "start.rate": value[1]}).values

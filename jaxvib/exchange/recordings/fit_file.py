@@ -26,8 +26,11 @@ _CANDIDATE_FIELDS = ["name", "drive", "duration", "rate", "at", "noise", "change
 
 
 class FitInput(NamedTuple):
-    """Arguments of `identify`: `scene`, `runs`, names of `unknown` numbers, `known` numbers with their errors; those of
-    `plan_runs`: `candidates` and `limits`; and the path of the `scene_file`."""
+    """Contents of an identification file.
+
+    **Attributes**: path of the `scene_file`; arguments of `identify`: `scene`, `runs`, names of `unknown` numbers, and `known`
+    numbers with their errors; arguments of `plan_runs`: `candidates` and `limits` (None without limits).
+    """
 
     scene_file: Path
     scene: Scene
@@ -56,10 +59,10 @@ def fit_from_tables(tables: Tables, folder: Path) -> FitInput:
         raise InputError("machine", 'is not the name of a scene file; write [machine] and below it file = "machine.toml"')
     options = build_part(_options, _table(tables.get("identify", {}), "identify"), "identify")
     entries = _entries(tables, "channel")
-    channels = [build_part(Channel, each, f"channel[{k}]") for k, each in enumerate(entries)]
-    runs = [_run(each, k, channels, folder) for k, each in enumerate(_entries(tables, "run"))]
+    channels = [build_part(Channel, table, f"channel[{k}]") for k, table in enumerate(entries)]
+    runs = [_run(table, k, channels, folder) for k, table in enumerate(_entries(tables, "run"))]
     planned = _entries(tables, "candidate") if "candidate" in tables else []
-    candidates = [_candidate(each, k, entries, runs[0]) for k, each in enumerate(planned)]
+    candidates = [_candidate(table, k, entries, runs[0]) for k, table in enumerate(planned)]
     limits = dict(_table(tables["limits"], "limits")) if "limits" in tables else None
     scene_file = folder / machine["file"]
     scene = load_scene(scene_file)
@@ -74,7 +77,7 @@ def _table(value: object, name: str) -> Mapping[str, object]:
 
 def _entries(tables: Mapping[str, object], name: str) -> list[Mapping[str, object]]:
     entries = tables.get(name)
-    if not isinstance(entries, list) or not entries or not all(isinstance(each, Mapping) for each in entries):
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, Mapping) for entry in entries):
         raise InputError(name, f"is {'missing' if entries is None else quoted(entries)}; write [[{name}]] for each {name}")
     return entries  # pyright: ignore[reportReturnType]
 
@@ -95,33 +98,35 @@ def _run(table: Mapping[str, object], k: int, channels: list[Channel], folder: P
 
 
 def _candidate(table: Mapping[str, object], k: int, channels: list[Mapping[str, object]], first: MeasuredRun) -> PlannedRun:
-    """Return a planned run with the channels of the file at their own places or at others, and new ones."""
-    where = f"candidate[{k}]"
+    """Return a planned run. It has the channels of the file, some of them at other places, and new channels."""
+    field = f"candidate[{k}]"
     for name in table:
         if name not in _CANDIDATE_FIELDS:
-            raise InputError(f"{where}.{name}", f"is not a field here; {suggest_name(name, _CANDIDATE_FIELDS)}")
+            raise InputError(f"{field}.{name}", f"is not a field here; {suggest_name(name, _CANDIDATE_FIELDS)}")
     for name in ("name", "drive", "duration"):
         if name not in table:
-            raise InputError(f"{where}.{name}", "is missing; a candidate needs a name, a drive and a duration")
-    places, names = _table(table.get("at", {}), f"{where}.at"), [str(each["name"]) for each in channels]
+            raise InputError(f"{field}.{name}", "is missing; a candidate needs a name, a drive and a duration")
+    places, names = _table(table.get("at", {}), f"{field}.at"), [str(each["name"]) for each in channels]
     for name in places:
         if name not in names:
-            raise InputError(f"{where}.at.{name}", f"is not a channel; the channels are: {', '.join(names)}")
-    moved = [{**each, "at": places[name]} if name in places else each for name, each in zip(names, channels, strict=True)]
+            raise InputError(f"{field}.at.{name}", f"is not a channel; the channels are: {', '.join(names)}")
+    moved_channels = [
+        {**each, "at": places[name]} if name in places else each for name, each in zip(names, channels, strict=True)
+    ]
     new = _entries(table, "channel") if "channel" in table else []
     measured = [channel.name for channel in first.of_kind(*MOTIONS)]
     if "rate" not in table and not measured:
-        raise InputError(f"{where}.rate", "is missing; write for example rate = '500 Hz'")
+        raise InputError(f"{field}.rate", "is missing; write for example rate = '500 Hz'")
     values: dict[str, object] = {
         "name": table["name"],
-        "drive": build_drive(table["drive"], f"{where}.drive"),
+        "drive": build_drive(table["drive"], f"{field}.drive"),
         "duration": table["duration"],
-        "channels": [build_part(Channel, each, f"{where}.channel") for each in (*moved, *new)],
+        "channels": [build_part(Channel, each, f"{field}.channel") for each in (*moved_channels, *new)],
         "rate": table["rate"] if "rate" in table else first.rate(measured[0]),
         "noise": table.get("noise"),
         "change": table.get("change"),
     }
-    with within(f"{where}."):
+    with within(f"{field}."):
         return build_part(PlannedRun, values, "")
 
 

@@ -23,7 +23,7 @@ from jaxvib.units.columns import split_head, unit_factor
 
 _MAX_BYTES = 2**32
 _UNKNOWN_SIZE = 2**32 - 1
-"""Size in the header of a WAV file that was written without knowing it."""
+"""Size in the header of a WAV file whose length was unknown when the header was written."""
 
 _TIME_NAMES = ("time", "t", "times", "timestamp", "x_value", "zeit", "время")
 """Names of a channel of times, in lower case."""
@@ -37,7 +37,7 @@ _SI = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "force":
 
 
 def read_channels(path: Path, rate: float | None) -> list[Recorded]:
-    """Return the channels of a file; its name ends in the name of its format.
+    """Return the channels of a file, whose format follows from the end of its name.
 
     **Arguments**: `rate`, Hz, replaces the times of the file.
 
@@ -57,31 +57,33 @@ def read_channels(path: Path, rate: float | None) -> list[Recorded]:
         raise
     except Exception as error:  # libraries raise any class of error for a damaged file
         kind = _NAMES.get(reader, "recording")
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(str(path), f"cannot be read as a {kind} file ({why}); export it again") from error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(str(path), f"cannot be read as a {kind} file ({reason}); export it again") from error
     if not channels:
         raise InputError(str(path), "contains no channel of numbers; export the channels that were recorded")
-    channels = [each._replace(values=_floating(each.values)) for each in _with_own_names(channels)]
+    channels = [channel._replace(values=_floating(channel.values)) for channel in _with_unique_names(channels)]
     if rate is None:
         return channels
-    times = {size: np.arange(size) / rate for size in {each.values.size for each in channels}}
-    return [each._replace(time=times[each.values.size]) for each in channels]
+    times = {size: np.arange(size) / rate for size in {channel.values.size for channel in channels}}
+    return [channel._replace(time=times[channel.values.size]) for channel in channels]
 
 
 def _floating(values: np.ndarray) -> np.ndarray:
-    """Return readings as floating-point numbers; those in single precision remain so, for the memory of long recordings."""
+    """Return readings as floating-point numbers. Single precision is kept, because long recordings need much memory."""
     values = np.asarray(values)
     return values if values.dtype in (np.float32, np.float64) else values.astype(float)
 
 
-def _with_own_names(channels: list[Recorded]) -> list[Recorded]:
-    """Return channels of which each has its own name: a number follows a name that occurs more than once."""
-    counts, seen = Counter(each.name for each in channels), Counter()
-    found = []
-    for each in channels:
-        seen[each.name] += 1
-        found.append(each._replace(name=f"{each.name} {seen[each.name]}") if counts[each.name] > 1 else each)
-    return found
+def _with_unique_names(channels: list[Recorded]) -> list[Recorded]:
+    """Return the channels with different names: a number is appended to a name that occurs more than once."""
+    counts, occurrences = Counter(channel.name for channel in channels), Counter()
+    unique = []
+    for channel in channels:
+        occurrences[channel.name] += 1
+        unique.append(
+            channel._replace(name=f"{channel.name} {occurrences[channel.name]}") if counts[channel.name] > 1 else channel
+        )
+    return unique
 
 
 def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
@@ -122,13 +124,13 @@ def _read_text(path: Path, rate: float | None) -> Iterator[Recorded]:
 def _stated_rate(remarks: list[str]) -> float | None:
     """Return the sampling rate, Hz, that a line above the table states."""
     for line in remarks:
-        found = _RATE.match(line)
-        if found is not None and float(found[2]) > 0.0:
-            return float(found[2]) * (1e3 if (found[3] or "").lower() == "khz" else 1.0)
+        match = _RATE.match(line)
+        if match is not None and float(match[2]) > 0.0:
+            return float(match[2]) * (1e3 if (match[3] or "").lower() == "khz" else 1.0)
     return None
 
 
-def _cut_off(path: Path, difference: str) -> InputError:
+def _cut_off_error(path: Path, difference: str) -> InputError:
     """Return the error of a file whose header and data have different lengths."""
     return InputError(str(path), f"{difference}: the recording was cut off; export it again")
 
@@ -137,27 +139,34 @@ def _read_tdms(path: Path, rate: float | None) -> Iterator[Recorded]:
     tdms = optional_module("nptdms", "tdms").TdmsFile.read(str(path))
     for name, status in (tdms.file_status.channel_statuses or {}).items():
         if status.read_length != status.expected_length:
-            header, found = status.expected_length, status.read_length
-            raise _cut_off(path, f"has {found} readings of {name} where its header states {header}")
+            header, read_count = status.expected_length, status.read_length
+            raise _cut_off_error(path, f"has {read_count} readings of {name} where its header states {header}")
     for group in tdms.groups():
-        channels = [each for each in group.channels() if np.issubdtype(each.dtype, np.number)]
-        clock = next((each for each in channels if each.name.lower() in _TIME_NAMES), None)
-        for each in channels:
-            if each is clock:
+        channels = [channel for channel in group.channels() if np.issubdtype(channel.dtype, np.number)]
+        clock = next((channel for channel in channels if channel.name.lower() in _TIME_NAMES), None)
+        for channel in channels:
+            if channel is clock:
                 continue
             time = None
-            if each.properties.get("wf_increment"):
-                time = each.properties.get("wf_start_offset", 0.0) + each.properties["wf_increment"] * np.arange(len(each))
+            if channel.properties.get("wf_increment"):
+                time = channel.properties.get("wf_start_offset", 0.0) + channel.properties["wf_increment"] * np.arange(
+                    len(channel)
+                )
             elif clock is not None:
                 time = np.asarray(clock[:], float)
-            unit = each.properties.get("unit_string") or each.properties.get("NI_UnitDescription") or ""
-            yield Recorded(each.name, str(unit), time, each[:])
+            unit = channel.properties.get("unit_string") or channel.properties.get("NI_UnitDescription") or ""
+            yield Recorded(channel.name, str(unit), time, channel[:])
 
 
 def _read_uff(path: Path, rate: float | None) -> Iterator[Recorded]:
-    for each in read_uff(path).functions:
-        if each.kind == "history":
-            yield Recorded(each.about or f"node {each.response[0]}", _SI.get(each.quantity, ""), each.x, np.real(each.values))
+    for function in read_uff(path).functions:
+        if function.kind == "history":
+            yield Recorded(
+                function.about or f"node {function.response[0]}",
+                _SI.get(function.quantity, ""),
+                function.x,
+                np.real(function.values),
+            )
 
 
 def _read_wav(path: Path, rate: float | None) -> Iterator[Recorded]:
@@ -166,15 +175,15 @@ def _read_wav(path: Path, rate: float | None) -> Iterator[Recorded]:
         head, size = file.read(8), file.seek(0, os.SEEK_END)
     stated = int.from_bytes(head[4:], "little") + 8
     if head[:4] == b"RIFF" and size < stated < _UNKNOWN_SIZE:
-        raise _cut_off(path, f"has {size} bytes where its header states {stated}")
-    with warnings.catch_warnings():  # of chunks with notes
+        raise _cut_off_error(path, f"has {size} bytes where its header states {stated}")
+    with warnings.catch_warnings():  # SciPy warns of chunks that contain notes
         warnings.simplefilter("ignore", wavfile.WavFileWarning)
-        own, data = wavfile.read(path)
+        file_rate, data = wavfile.read(path)
     if np.issubdtype(data.dtype, np.integer):
         half = 2.0 ** (8 * data.dtype.itemsize - 1)
         precise = np.float32 if data.dtype.itemsize < 3 else np.float64
         data = (data.astype(precise) - (half if data.dtype == np.uint8 else 0.0)) / precise(half)
-    time = np.arange(len(data)) / own
+    time = np.arange(len(data)) / file_rate
     for k, values in enumerate(data.reshape(len(data), -1).T, 1):
         yield Recorded(f"channel {k}", "", time, values)
 
@@ -193,28 +202,28 @@ def _read_mat(path: Path, rate: float | None) -> Iterator[Recorded]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = scipy_io.loadmat(path, squeeze_me=True)
-        plain = dict(_flat({k: v for k, v in content.items() if not k.startswith("__")}, "", objects))
+        arrays = dict(_flat({k: v for k, v in content.items() if not k.startswith("__")}, "", objects))
     except NotImplementedError:  # version 7.3
         with optional_module("h5py", "mat").File(path) as file:
-            plain = dict(_flat_hdf(file, "", objects))
+            arrays = dict(_flat_hdf(file, "", objects))
     clocks = {
-        name: value for name, value in plain.items() if name.rpartition(".")[2].lower() in _TIME_NAMES and value.ndim == 1
+        name: value for name, value in arrays.items() if name.rpartition(".")[2].lower() in _TIME_NAMES and value.ndim == 1
     }
-    scalars = {name.lower(): float(value) for name, value in plain.items() if value.size == 1}
+    scalars = {name.lower(): float(value) for name, value in arrays.items() if value.size == 1}
     stated = next((scalars[name] for name in _RATE_NAMES if scalars.get(name, 0.0) > 0.0), None)
-    found = False
-    for name, value in plain.items():
+    has_channel = False
+    for name, value in arrays.items():
         if name in clocks or value.size < 2:
             continue
         columns = [value] if value.ndim == 1 else list(value if value.shape[0] < value.shape[1] else value.T)
         folder = name.rpartition(".")[0]
-        near = [clock for each, clock in clocks.items() if each.rpartition(".")[0] == folder] or list(clocks.values())
+        candidates = [clock for each, clock in clocks.items() if each.rpartition(".")[0] == folder] or list(clocks.values())
         for k, column in enumerate(columns):
-            fits = next((clock for clock in near if clock.size == column.size), near[0] if near else None)
-            time = np.asarray(fits, float) if fits is not None else np.arange(column.size) / stated if stated else None
-            found = True
+            matching = next((clock for clock in candidates if clock.size == column.size), candidates[0] if candidates else None)
+            time = np.asarray(matching, float) if matching is not None else np.arange(column.size) / stated if stated else None
+            has_channel = True
             yield Recorded(name if len(columns) == 1 else f"{name}[{k}]", "", time, column)
-    if objects and not found:
+    if objects and not has_channel:
         raise InputError(
             str(path),
             f"holds objects of MATLAB ({', '.join(objects[:5])}), such as timetables or Simulink data, which only MATLAB can "
@@ -223,7 +232,7 @@ def _read_mat(path: Path, rate: float | None) -> Iterator[Recorded]:
 
 
 def _flat(value: Any, name: str, objects: list[str]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the arrays of numbers in variables and structures by dotted names; names of objects are added to `objects`."""
+    """Yield dotted names and arrays of numbers of variables and structures; names of objects are appended to `objects`."""
     if type(value).__name__ in ("MatlabOpaque", "MatlabFunction", "MatlabObject"):
         objects.append(name if name not in ("", "None") else "a variable without a name")
         return
@@ -238,19 +247,19 @@ def _flat(value: Any, name: str, objects: list[str]) -> Iterator[tuple[str, np.n
 
 
 def _flat_hdf(group: Any, name: str, objects: list[str]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the arrays of numbers of a file of version 7.3, as `_flat` does."""
-    for key, each in group.items():
+    """Yield dotted names and arrays of numbers of a file of version 7.3; names of objects are appended to `objects`."""
+    for key, item in group.items():
         if key.startswith("#"):  # storage of references and of objects
             continue
-        own = f"{name}.{key}" if name else key
-        kind = each.attrs.get("MATLAB_class", b"")
+        item_name = f"{name}.{key}" if name else key
+        kind = item.attrs.get("MATLAB_class", b"")
         kind = kind.decode() if isinstance(kind, bytes) else str(kind)
-        if "MATLAB_object_decode" in each.attrs or kind in ("timetable", "table", "timeseries", "string"):
-            objects.append(own)
-        elif hasattr(each, "items"):
-            yield from _flat_hdf(each, own, objects)
-        elif each.dtype.kind in "iuf" and kind not in ("char", "cell") and each.ndim <= 2:
-            yield own, np.squeeze(each[()])
+        if "MATLAB_object_decode" in item.attrs or kind in ("timetable", "table", "timeseries", "string"):
+            objects.append(item_name)
+        elif hasattr(item, "items"):
+            yield from _flat_hdf(item, item_name, objects)
+        elif item.dtype.kind in "iuf" and kind not in ("char", "cell") and item.ndim <= 2:
+            yield item_name, np.squeeze(item[()])
 
 
 _READERS = {

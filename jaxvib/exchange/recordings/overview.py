@@ -15,7 +15,7 @@ from jaxvib.identification.run import MeasuredRun
 from jaxvib.units.columns import unit_factor
 
 _TWO_LEVELS = 0.9
-"""Share of readings at either end of the range above which a channel has two levels."""
+"""Share of readings at the two ends of the range above which a channel counts as a signal with two levels."""
 
 
 class ChannelOverview(NamedTuple):
@@ -23,8 +23,8 @@ class ChannelOverview(NamedTuple):
 
     **Attributes**
 
-    - `name`, `unit`, and `kinds` of channel that have such a unit
-    - `rate`, Hz, NaN without times; `samples`; `start` and `end`, s
+    - `name`, `unit`; `kinds`: the kinds of channels (see `Channel`) that can have this unit
+    - `rate`: sampling rate, Hz, NaN without times; `samples`: number of readings; `start` and `end`: first and last time, s
     - `low` and `high`: smallest and largest reading
     - `missing` and `clipped`: numbers of readings
     - `notes`: sentences about gaps, repairs and problems
@@ -45,35 +45,35 @@ class ChannelOverview(NamedTuple):
 
 
 def overview_of(recorded: Recorded) -> ChannelOverview:
-    """Return the overview of a channel; problems that would stop a fit are in its notes.
+    """Return the overview of a channel; its notes contain problems for which a fit would refuse the channel.
 
     >>> t = np.arange(0.0, 2.0, 0.01)
     >>> found = overview_of(Recorded("frame", "g", t, np.clip(np.sin(9.0 * t), -1.0, 0.8)))
     >>> round(found.rate), found.kinds, found.clipped > 30
     (100, ('acceleration',), True)
     """
-    where = f"channel {quoted(recorded.name)}"
+    field = f"channel {quoted(recorded.name)}"
     kinds = tuple(kind for kind, si in UNITS.items() if recorded.unit and unit_factor(recorded.unit, si) is not None)
-    known = recorded.values[np.isfinite(recorded.values)]
-    low, high = (float(np.min(known)), float(np.max(known))) if known.size else (np.nan, np.nan)
+    finite = recorded.values[np.isfinite(recorded.values)]
+    low, high = (float(np.min(finite)), float(np.max(finite))) if finite.size else (np.nan, np.nan)
     count, nan = recorded.values.size, float("nan")
-    missing, clipped = count - known.size, 0
+    missing, clipped = count - finite.size, 0
     notes: list[str] = []
     rate, start, end = nan, nan, nan
     if recorded.time is not None and recorded.time.size:
         start, end = float(recorded.time[0]), float(recorded.time[-1])
         try:
             if recorded.time.size != count:
-                raise InputError(where, f"has {recorded.time.size} times but {count} values")
-            time, value, notes = even_samples(recorded.time, recorded.values, where)
+                raise InputError(field, f"has {recorded.time.size} times but {count} values")
+            time, value, notes = even_samples(recorded.time, recorded.values, field)
             rate, missing = 1.0 / float(time[1] - time[0]), int(np.count_nonzero(np.isnan(value)))
             bottom, top = clipped_at(value)
             clipped = int(np.count_nonzero((value <= bottom) | (value >= top)))
             if clipped > _TWO_LEVELS * count:
-                notes.append(f"{where} has two levels, like the pulses of a tachometer")
+                notes.append(f"{field} has two levels, like the pulses of a tachometer")
                 clipped = 0
             elif clipped:
-                notes.append(f"{where} is clipped at {' and '.join(f'{x:.4g}' for x in (bottom, top) if np.isfinite(x))}")
+                notes.append(f"{field} is clipped at {' and '.join(f'{x:.4g}' for x in (bottom, top) if np.isfinite(x))}")
         except InputError as error:
             notes = [str(error)]
     return ChannelOverview(
@@ -82,26 +82,34 @@ def overview_of(recorded: Recorded) -> ChannelOverview:
 
 
 def speed_of(recorded: Sequence[Recorded], pulses: str | None, speed: str | None, per_turn: int) -> MeasuredRun | None:
-    """Return the run of a tachometer or of a channel of speed; None if neither is named and no channel has a unit of speed.
+    """Return the run with the pulses of a tachometer, or with a channel of speed.
 
-    **Raises** `InputError` for an unknown name, and for pulses that cannot be used.
+    **Arguments**: `pulses` or `speed`: name of the channel, None for the first channel in rpm or rad/s; `per_turn`: pulses per
+    revolution.
+
+    **Returns** None if no channel is named and no channel has such a unit. **Raises** `InputError` for an unknown name, and for
+    pulses that cannot be used.
     """
     name = pulses or speed or next((each.name for each in recorded if each.unit.lower() in ("rpm", "1/min", "rad/s")), None)
     if name is None:
         return None
-    found = next((each for each in recorded if each.name.lower() == name.lower()), None)
-    if found is None:
+    channel_found = next((each for each in recorded if each.name.lower() == name.lower()), None)
+    if channel_found is None:
         raise InputError("pulses" if pulses else "speed", f"is {quoted(name)}; the channels are {_names(recorded)}")
-    if pulses is None and unit_factor(found.unit or "rad/s", "rad/s") is None:
-        raise InputError("speed", f"is {quoted(name)}, which is in {quoted(found.unit)}; give a channel in rpm, rad/s or Hz")
-    kind, unit = ("pulses", None) if pulses else ("speed", found.unit or None)
-    channel = Channel(found.name, kind, unit=unit, per_turn=per_turn)
-    if found.time is None:
+    if pulses is None and unit_factor(channel_found.unit or "rad/s", "rad/s") is None:
+        raise InputError(
+            "speed", f"is {quoted(name)}, which is in {quoted(channel_found.unit)}; give a channel in rpm, rad/s or Hz"
+        )
+    kind, unit = ("pulses", None) if pulses else ("speed", channel_found.unit or None)
+    channel = Channel(channel_found.name, kind, unit=unit, per_turn=per_turn)
+    if channel_found.time is None:
         raise InputError(
             "pulses" if pulses else "speed",
             f"is {quoted(name)}, which has no times in the file; give the sampling rate, `rate`",
         )
-    return MeasuredRun.from_arrays([channel], {found.name: found.time}, {found.name: found.values}, source="recording")
+    return MeasuredRun.from_arrays(
+        [channel], {channel_found.name: channel_found.time}, {channel_found.name: channel_found.values}, source="recording"
+    )
 
 
 def _names(recorded: Sequence[Recorded]) -> str:

@@ -31,19 +31,20 @@ def read_run(
     - TDMS (`pip install '.[tdms]'`), universal files with dataset 58 (`'.[uff]'`), MATLAB's MAT files of all versions
       (`'.[mat]'`), WAV (`'.[mat]'`), MF4 (`'.[mf4]'`)
 
-    Readings are converted from the unit of the channel, or else of the file, to SI units, checked and repaired; sentences about
-    repairs are in `notes` of the result. Values of WAV files are relative to the full scale; a unit such as "50 g" states it.
+    Readings are converted to SI units from the unit of the channel or, if it has none, from the unit in the file. They are
+    checked and repaired; sentences about repairs are in `notes` of the result. Values of WAV files are fractions of the full
+    scale; a unit such as "50 g" states the full scale.
 
     **Arguments**
 
     - `path` of the file; the end of its name states the format
-    - `channels` that are read, with names as in the file, with or without their units
-    - `start` and `until`, s: part of the record; default: all of it
+    - `channels` that are read, with names as in the file, with or without their units; typical: 1 to 10
+    - `start` and `until`, s: beginning and end of the part that is read; default: the whole record
     - `change`: numbers of the scene that were different in this run, as for `MeasuredRun.from_arrays`
-    - `rate`, Hz, in place of the times in the file; typical: 500 to 10,000
+    - `rate`: sampling rate, Hz, in place of the times in the file; typical: 500 to 10,000
 
-    **Returns** `MeasuredRun`. **Raises** `InputError` for a file that cannot be read, a channel that it does not have, and
-    samples that cannot be used.
+    **Returns** `MeasuredRun`. **Raises** `InputError` for a file that cannot be read, a channel that the file does not have,
+    and samples that cannot be used.
 
     >>> import pathlib, tempfile, numpy as np, jaxvib as jv
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "run_up.csv"
@@ -68,7 +69,8 @@ def read_run(
 def read_recording(path: str | Path, rate: Number | None = None) -> tuple[Recorded, ...]:
     """Read all channels of a file, in the units of the file.
 
-    **Arguments**: `path` of a file as for `read_run`; `rate`, Hz, in place of the times in the file; typical: 500 to 10,000.
+    **Arguments**: `path` of a file as for `read_run`; `rate`: sampling rate, Hz, in place of the times in the file; typical:
+    500 to 10,000.
 
     **Returns** a tuple of channels, each with `name`, `unit` ("" if the file does not state it), `time` (n,) s or None, and
     `values` (n,). **Raises** `InputError` for a file that cannot be read.
