@@ -27,7 +27,7 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
     GROUP is machines, loads, drives, effects or tables ([[exciters]], [[machine.supports]], [[machine.bodies]]); NAME is a
     part, such as three_mass or exciter, whose whole documentation is printed."""
     from jaxvib.machine.files import suggest_name
-    from jaxvib.report.arguments import GROUPS, arguments_of, described
+    from jaxvib.report.arguments import GROUPS, arguments_of, builder_of
 
     if group is None:
         known = {word: list(kinds) for word, kinds in GROUPS.items()}
@@ -39,7 +39,7 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
             every = [*GROUPS, *(kind for kinds in GROUPS.values() for kind in kinds)]
             raise InputError("name", f"is {quoted(group)}; {suggest_name(group, every)}")
         group, name = home, group
-    kinds = GROUPS.get(group, {}) if name is None else {name: described(group, name)}
+    kinds = GROUPS.get(group, {}) if name is None else {name: builder_of(group, name)}
     found = [
         {
             "kind": kind,

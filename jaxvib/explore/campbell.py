@@ -12,7 +12,7 @@ from jaxvib.draw.whirl import critical_groups, whirl_lines
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
 from jaxvib.steady.whirl import Whirl
 
-_SENSES = {
+_SENSE_STYLES = {
     "forward": {"color": COLORS[0], "lw": 1.5},
     "backward": {"color": COLORS[1], "lw": 1.5, "ls": "--"},
     "straight": {"color": COLORS[2], "lw": 1.5, "ls": "-."},
@@ -21,12 +21,12 @@ _SENSES = {
 
 _CRITICAL = {"fc": "white", "ec": "black", "lw": 1.2, "zorder": 4.0}
 _DROP_LINE = {"color": GUIDE, "lw": 0.7, "zorder": 1.2}
-_LETTER = 0.11
-"""Upper bound of the width of a letter, in units of the drawing."""
+_LETTER_WIDTH = 0.11
+"""Upper bound of the mean width of a letter, in units of the drawing."""
 
 _LEGEND = {
-    "forward whirl": _SENSES["forward"],
-    "backward whirl": _SENSES["backward"],
+    "forward whirl": _SENSE_STYLES["forward"],
+    "backward whirl": _SENSE_STYLES["backward"],
     "whirl speed = rotor speed": ROTOR,
     "operating speed": OPERATING,
     "critical speeds (no damping), rpm": _CRITICAL,
@@ -34,10 +34,10 @@ _LEGEND = {
 """Styles of lines and dots by kind."""
 
 
-def campbell(found: Whirl, at: float) -> str:
-    """Draw the whirl speeds against the rotor speed, with the critical speeds, in rpm, like `Whirl.plot`.
+def campbell(result: Whirl, at: float) -> str:
+    """Draw the whirl speeds over the rotor speed, with the critical speeds, in rpm, like `Whirl.plot`.
 
-    **Arguments**: `found`, whirl speeds of one scene at several rotor speeds; `at`, the operating speed, rad/s.
+    **Arguments**: `result`: whirl speeds of one scene at several rotor speeds; `at`: the operating speed, rad/s.
 
     **Returns** the text of an SVG file.
 
@@ -49,29 +49,29 @@ def campbell(found: Whirl, at: float) -> str:
     >>> "whirl speed, rpm" in campbell(jv.whirl(scene, np.linspace(0.0, 600.0, 31)), at=460.0)
     True
     """
-    scale, rotor_speed = speed_unit("rpm")[1], np.asarray(found.rotor_speed)
-    speed, sense = np.asarray(found.speed), found.sense
-    critical, critical_sense = scale * np.asarray(found.critical.speed), found.critical.sense
+    scale, rotor_speed = speed_unit("rpm")[1], np.asarray(result.rotor_speed)
+    speed, sense = np.asarray(result.speed), result.sense
+    critical, critical_sense = scale * np.asarray(result.critical.speed), result.critical.sense
     right = scale * max(float(np.max(rotor_speed)), 1.05 * at)
     groups = critical_groups(critical, critical_sense, right)
     shown = [k for group, _ in groups for k in group]
     top = 1.12 * max(scale * float(np.nanmax(speed)), *critical[shown].tolist(), 1e-300)
     panel = Panel(FIRST, "whirl speed, rpm", (0.0, right), (0.0, top), wide=2.0 * WIDE + APART)
     parts, texts = panel.frame(), panel.texts()
-    for word, look in _SENSES.items():
+    for word, look in _SENSE_STYLES.items():
         parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, sense == word)]
     end = min(top, right)
     parts += [panel.line([0.0, end], [0.0, end], ROTOR), panel.line([scale * at] * 2, panel.y, OPERATING)]
     for k in shown:
         w = float(critical[k])
-        look = {**_CRITICAL, "ec": _SENSES[str(critical_sense[k])]["color"]}
+        look = {**_CRITICAL, "ec": _SENSE_STYLES[str(critical_sense[k])]["color"]}
         square = critical_sense[k] != "forward"
         parts += [panel.line([w, w], [0.0, w], _DROP_LINE), dot(*panel.at(w, w), look, square=square)]
     ends: list[float] = []  # right end of the texts in each row, from the lowest row upward
     for group, word in groups:
         x, _ = panel.at(float(critical[group[-1]]), 0.0)
         row = next((k for k, end in enumerate(ends) if end < x), len(ends))
-        ends[row:] = [x + _LETTER * len(word), *ends[row + 1 :]]
+        ends[row:] = [x + _LETTER_WIDTH * len(word), *ends[row + 1 :]]
         texts.append(Text(x + 0.08, 0.2 + 0.27 * row, word, {"fontsize": "small", "bbox": {"fc": "white"}}))
     keys, names = legend(_LEGEND)
     return svg((0.0, FIRST + panel.wide + LAST, -0.6, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)

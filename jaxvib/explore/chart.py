@@ -28,10 +28,10 @@ _LEGEND = {
 """Styles of lines by kind."""
 
 
-def chart(found: Branches, most: float) -> str:
+def chart(result: Branches, max_speed: float) -> str:
     """Draw the load speed, rpm, and the foundation force (zero to peak) over the rotor speed, rpm, like `Branches.plot`.
 
-    **Arguments**: `found`, the branches of one scene; `most`, the highest rotor speed in the diagram, rad/s.
+    **Arguments**: `result`: the branches of one scene; `max_speed`: the highest rotor speed in the diagram, rad/s.
 
     **Returns** the text of an SVG file.
 
@@ -39,13 +39,13 @@ def chart(found: Branches, most: float) -> str:
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
     >>> scene = jv.scene_from_toml(TEMPLATES["one_mass"])
-    >>> "foundation force, N, zero to peak" in chart(jv.branches(scene), most=200.0)
+    >>> "foundation force, N, zero to peak" in chart(jv.branches(scene), max_speed=200.0)
     True
     """
-    scale, at = speed_unit("rpm")[1], float(found.scene.drive.speed)
-    omega, stable, force = np.asarray(found.omega), np.asarray(found.stable), np.asarray(found.foundation_force)
-    rotor_speed, resonances = np.asarray(found.rotor_speed), np.asarray(found.resonances)
-    rotor_speed = np.where(rotor_speed <= most, rotor_speed, np.nan)
+    scale, at = speed_unit("rpm")[1], float(result.scene.drive.speed)
+    omega, stable, force = np.asarray(result.omega), np.asarray(result.stable), np.asarray(result.foundation_force)
+    rotor_speed, resonances = np.asarray(result.rotor_speed), np.asarray(result.resonances)
+    rotor_speed = np.where(rotor_speed <= max_speed, rotor_speed, np.nan)
     high = scale * float(np.nanmax(rotor_speed))
     speeds = Panel(FIRST, "speed of loads, rpm", (0.0, high), (0.0, 1.06 * high))
     limits = log_limits([force], rotor_speed, omega, resonances)
@@ -53,7 +53,7 @@ def chart(found: Branches, most: float) -> str:
     parts, texts = [*speeds.frame(), *forces.frame()], [*speeds.texts(), *forces.texts()]
     parts += [speeds.line([0.0, high], [scale * w, scale * w], _RESONANCE) for w in resonances.tolist()]
     parts.append(speeds.line([0.0, high], [0.0, high], ROTOR))
-    crossed = crossings(rotor_speed, stable, np.asarray(found.mode), at)
+    crossed = crossings(rotor_speed, stable, np.asarray(result.mode), at)
     for panel, values in ((speeds, scale * omega), (forces, force)):
         parts += [
             panel.line(scale * rotor_speed[along], values[along], _STABLE if solid else _UNSTABLE)
@@ -71,8 +71,10 @@ def chart(found: Branches, most: float) -> str:
         texts += [Text(x + 0.1, TALL * share, name, look) for share, name in join_names(sorted(jams))]
     folds = [
         (scale * n, scale * w)
-        for n, w, there in zip(*map(np.ravel, (found.folds.rotor_speed, found.folds.omega, found.folds.exists)), strict=True)
-        if there and n <= most
+        for n, w, exists in zip(
+            *map(np.ravel, (result.folds.rotor_speed, result.folds.omega, result.folds.exists)), strict=True
+        )
+        if exists and n <= max_speed
     ]
     parts += [dot(*speeds.at(n, w), _FOLD) for n, w in folds]
     width = FIRST + 2.0 * WIDE + APART + LAST

@@ -37,8 +37,8 @@ _GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
 class Panel:
     """Chart over the rotor speed.
 
-    **Attributes**: `left`, position of its left end; `title` above it; `x` and `y`, the limits of its axes; `log`: True for a
-    logarithmic vertical axis; `wide`, its width.
+    **Attributes**: `left`: position of its left end, in units of the drawing; `title` above it; `x` and `y`: limits of its
+    axes; `log`: True for a logarithmic vertical axis; `wide`: its width, in units of the drawing.
     """
 
     left: float
@@ -61,10 +61,10 @@ class Panel:
         return float(across), float(up)
 
     def line(self, x: ArrayLike, y: ArrayLike, look: Look) -> Part:
-        """Return a line through points, without those below or above the chart."""
+        """Return a line through points, without the points below or above the chart."""
         points = np.stack(self.place(x, y), axis=1)
         inside = (points[:, 1] >= 0.0) & (points[:, 1] <= TALL)
-        return Part(_thinned(np.where(inside[:, None], points, np.nan)), look)
+        return Part(_thin_out(np.where(inside[:, None], points, np.nan)), look)
 
     def frame(self) -> list[Part]:
         """Return the axes and the grid lines at their ticks."""
@@ -95,14 +95,15 @@ def _ticks(places: ArrayLike, limits: tuple[float, float]) -> list[tuple[float, 
     return [(x, f"{x:g}") for x in np.asarray(places, float).tolist() if limits[0] <= x <= limits[1]]
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
-    """Return a line (n, 2) without points that are too close to others; its ends and the points beside a gap (NaN) stay."""
+def _thin_out(points: np.ndarray) -> np.ndarray:
+    """Return a line (n, 2) without points that are too close to other points. Its ends and the points beside a gap (NaN) are
+    kept."""
     steps = np.hypot(*np.diff(points, axis=0).T)
-    gone = np.floor(np.concatenate([[0.0], np.nancumsum(steps)]) / _MIN_POINT_DISTANCE)
+    distance_count = np.floor(np.concatenate([[0.0], np.nancumsum(steps)]) / _MIN_POINT_DISTANCE)
     gap = np.isnan(np.concatenate([[np.nan], steps, [np.nan]]))
-    keep = gap[1:] | gap[:-1]
-    keep[1:] |= gone[1:] != gone[:-1]
-    return points[keep]
+    is_needed = gap[1:] | gap[:-1]
+    is_needed[1:] |= distance_count[1:] != distance_count[:-1]
+    return points[is_needed]
 
 
 def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
@@ -114,7 +115,7 @@ def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
 def legend(looks: Mapping[str, Look]) -> tuple[list[Part], list[Text]]:
     """Return the legend above the charts, with two entries in a column: samples of lines and dots with their names.
 
-    A style with a fill colour ("fc") is that of a dot.
+    A style with a fill colour ("fc") is drawn as a dot, other styles as a line.
     """
     parts, texts = [], []
     for k, (name, look) in enumerate(looks.items()):

@@ -31,11 +31,11 @@ Amplitudes and forces are zero to peak. The page shows the theory of light loads
 `jaxvib simulate` or `jaxvib modes --exact`."""
 """Text below the sliders, as Markdown."""
 
-_SPEEDS = 81
+_CAMPBELL_SPEEDS = 81
 """Number of rotor speeds of a Campbell diagram."""
 
 _PREPARED_COUNTS = 7
-"""Number of counts of loads, other than the present one, for which programs are compiled while the page is open."""
+"""Number of further numbers of loads for which programs are compiled while the page is open."""
 
 
 class SceneOrProblem(NamedTuple):
@@ -46,7 +46,7 @@ class SceneOrProblem(NamedTuple):
 
 
 def scene_or_problem(build: Callable[[], Scene]) -> SceneOrProblem:
-    """Return the scene from `build`, or the message of its error: some values of the sliders do not give a valid machine."""
+    """Return the scene from `build`, or the message of its error, because some values of the sliders give no valid machine."""
     try:
         return SceneOrProblem(build(), "")
     except (InputError, ComputationError) as error:
@@ -56,23 +56,23 @@ def scene_or_problem(build: Callable[[], Scene]) -> SceneOrProblem:
 def image(draw: Callable[[], str], scene: SceneOrProblem) -> str:
     """Return an SVG picture as an HTML image with embedded data, or the message of the error."""
 
-    def made() -> str:
+    def embed() -> str:
         data = base64.b64encode(draw().encode()).decode()
         return f'<img style="max-width:100%" src="data:image/svg+xml;base64,{data}">'
 
-    return _shown(made, scene)
+    return _html_or_problem(embed, scene)
 
 
 def text(read: Callable[[], str], scene: SceneOrProblem) -> str:
     """Return preformatted text as HTML, or the message of the error."""
-    return _shown(lambda: f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>', scene)
+    return _html_or_problem(lambda: f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>', scene)
 
 
-def _shown(make: Callable[[], str], scene: SceneOrProblem) -> str:
+def _html_or_problem(render: Callable[[], str], scene: SceneOrProblem) -> str:
     problem = scene.problem
     if not problem:
         try:
-            return make()
+            return render()
         except (InputError, ComputationError) as error:
             problem = str(error)
     return f"<p><b>No figure:</b> {html.escape(problem)}</p>"
@@ -86,9 +86,9 @@ def toml(scene: SceneOrProblem, source: Path | None = None) -> str:
 
 
 def prepare(scene: Scene) -> None:
-    """Compile and draw the contents of the page, so that the first move of a slider is as fast as the next ones."""
+    """Compile and draw the contents of the page. The first move of a slider is then as fast as later ones."""
     for slider in sliders_of(scene):
-        if slider.number is not None:  # another number of loads would need another program
+        if slider.number is not None:  # for another number of loads another program is needed
             moved = {slider.name: slider.steps[slider.steps.index(slider.start) - 1]}
             scene_or_problem(functools.partial(scene_at, scene, moved))
     for _ in range(2):
@@ -112,11 +112,11 @@ def prepare_counts(scene: Scene) -> None:
 
 
 def _draw_all(scene: Scene) -> None:
-    most = 4.0 / 3.0 * float(scene.drive.speed)
-    given = SceneOrProblem(scene, "")
-    image(lambda: diagram(scene, most), given)
-    text(lambda: readings(scene), given)
-    image(lambda: machine(scene, next(iter(modes_of(scene)), None)), given)
+    max_speed = 4.0 / 3.0 * float(scene.drive.speed)
+    drawn = SceneOrProblem(scene, "")
+    image(lambda: diagram(scene, max_speed), drawn)
+    text(lambda: readings(scene), drawn)
+    image(lambda: machine(scene, next(iter(modes_of(scene)), None)), drawn)
 
 
 def has_branches(scene: Scene) -> bool:
@@ -140,48 +140,50 @@ def heading(scene: Scene) -> str:
     )
 
 
-def diagram(scene: Scene, most: float) -> str:
+def diagram(scene: Scene, max_speed: float) -> str:
     """Draw the branch diagram with the force chart for a machine that moves up and down, or the Campbell diagram of a rotor.
 
-    **Arguments**: `most`, the highest rotor speed in the diagram, rad/s; it is at least 1.15 times the scene's rotor speed.
+    **Arguments**: `max_speed`: the highest rotor speed in the diagram, rad/s; a value below 1.15 times the rotor speed of the
+    scene is replaced by that value.
 
     **Returns** the text of an SVG file. **Raises** `InputError` for a scene without such a diagram; the message names the part
     of the scene that prevents it.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
-    >>> "whirl speed, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0)
+    >>> "whirl speed, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), max_speed=600.0)
     True
     """
     from jaxvib.explore.campbell import campbell  # slow import
     from jaxvib.explore.chart import chart
 
     speed = float(scene.drive.speed)
-    most = max(most, 1.15 * speed)
+    max_speed = max(max_speed, 1.15 * speed)
     if has_branches(scene):
-        return chart(jax.device_get(branches(scene, most=most)), most)
-    return campbell(jax.device_get(whirl(scene, np.linspace(0.0, most, _SPEEDS))), speed)
+        return chart(jax.device_get(branches(scene, most=max_speed)), max_speed)
+    return campbell(jax.device_get(whirl(scene, np.linspace(0.0, max_speed, _CAMPBELL_SPEEDS))), speed)
 
 
 def readings(scene: Scene) -> str:
-    """Return the jams at the rotor speed, or a rotor's critical speeds, as text. **Raises** `InputError` like `diagram`."""
+    """Return the jams at the rotor speed, or the critical speeds of a rotor, as text. **Raises** `InputError` like
+    `diagram`."""
     return jax.device_get(jam_modes(scene) if has_branches(scene) else critical_speeds(scene)).summary()
 
 
 def modes_of(scene: Scene) -> list[int]:
     """Return the jam modes in which `machine` can show the machine moving: those that are stable by slope.
 
-    Modes that exist at the scene's rotor speed come first. Among modes that exist, and among the others, the one at the highest
-    resonance is first and the one beyond all resonances last. The list is empty for a machine that moves in two directions.
+    Modes that exist at the rotor speed of the scene come first. Within both groups the mode at the highest resonance is first,
+    and the mode beyond all resonances is last. The list is empty for a machine that moves in two directions.
     """
     if not has_branches(scene):
         return []
     modes = range(1, 2 * len(scene.machine.structure().coordinates) + 2, 2)
     try:
-        there = jax.device_get(jam_modes(scene)).mode_numbers()
+        existing = jax.device_get(jam_modes(scene)).mode_numbers()
     except (InputError, ComputationError):
-        there = []
-    return sorted(modes, key=lambda mode: (mode not in there, mode == modes[-1], -mode))
+        existing = []
+    return sorted(modes, key=lambda mode: (mode not in existing, mode == modes[-1], -mode))
 
 
 def machine(scene: Scene, mode: int | None) -> str:

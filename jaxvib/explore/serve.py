@@ -26,7 +26,7 @@ _Receive: TypeAlias = "Callable[[], Awaitable[_Message]]"
 _Page: TypeAlias = "Callable[[_Message, _Receive, _Send], Awaitable[None]]"
 """Type of an ASGI application."""
 
-_VARIABLE = "JAXVIB_EXPLORE"
+_PATH_VARIABLE = "JAXVIB_EXPLORE"
 """Environment variable with the path of the scene file."""
 
 _HOST = "127.0.0.1"
@@ -35,14 +35,14 @@ _HOST = "127.0.0.1"
 
 def served_path() -> Path:
     """Return the path of the scene file of the page. **Raises** `InputError` if no page is being served."""
-    path = os.environ.get(_VARIABLE)
+    path = os.environ.get(_PATH_VARIABLE)
     if not path:
-        raise InputError(_VARIABLE, "is not set; start the page with: jaxvib explore machine.toml")
+        raise InputError(_PATH_VARIABLE, "is not set; start the page with: jaxvib explore machine.toml")
     return Path(path)
 
 
 def require_marimo() -> None:
-    """Require marimo, which shows the page. **Raises** `InputError` if it is not installed."""
+    """**Raises** `InputError` if marimo, which shows the page, is not installed."""
     if importlib.util.find_spec("marimo") is None:
         raise InputError(
             "explore", "needs marimo; install it with: pip install '.[explore]' (in the folder of jaxvib's sources)"
@@ -50,7 +50,7 @@ def require_marimo() -> None:
 
 
 def require_free(port: int) -> None:
-    """Require a usable port. **Raises** `InputError` if another program listens at it, or if it may not be used."""
+    """**Raises** `InputError` if another program listens at the `port`, or if this process may not use it."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
         # The server sets this option too. With it, a port that another page has just released counts as free.
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(os.name == "posix"))
@@ -65,19 +65,19 @@ def require_free(port: int) -> None:
 def guarded(page: _Page, token: str, port: int) -> _Page:
     """Return an ASGI application that forwards only requests of the page at `/token/` to `page`; others receive an empty 404.
 
-    The header Host must be this computer with `port`; this rejects sites whose name was made to point here (DNS rebinding). The
-    header Origin, which browsers add to requests of other sites and to all websockets, must agree with Host if it is present.
+    The header Host must be this computer with `port`; this rejects sites whose name points to this computer (DNS rebinding). If
+    the header Origin is present, which browsers add to requests of other sites and to all websockets, it must agree with Host.
     """
     hosts = [f"{name}:{port}".encode() for name in (_HOST, "localhost")]
 
     def is_own(scope: _Message) -> bool:
-        found = [value for name, value in scope["headers"] if name.lower() == b"host"]
+        host_headers = [value for name, value in scope["headers"] if name.lower() == b"host"]
         origins = [value for name, value in scope["headers"] if name.lower() == b"origin"]
         first = scope["path"].encode().split(b"/")[1:2]
         return (
-            len(found) == 1
-            and found[0] in hosts
-            and all(origin == b"http://" + found[0] for origin in origins)
+            len(host_headers) == 1
+            and host_headers[0] in hosts
+            and all(origin == b"http://" + host_headers[0] for origin in origins)
             and len(first) == 1
             and hmac.compare_digest(first[0], token.encode())
         )
@@ -97,8 +97,8 @@ def guarded(page: _Page, token: str, port: int) -> _Page:
 def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]) -> None:
     """Serve the page of a scene file until it is interrupted, and end the process.
 
-    **Arguments**: `scene` file; `port` of this computer; `browser`: True to open the page; `announce`, a function that is
-    called with its address.
+    **Arguments**: `scene`: path of the scene file; `port` of this computer; `browser`: True to open the page; `announce`: a
+    function that is called with the address of the page.
 
     **Raises** `InputError` if marimo is not installed or the port is taken.
     """
@@ -107,7 +107,7 @@ def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]
     import marimo  # optional and slow import
     import uvicorn  # marimo's own server
 
-    os.environ[_VARIABLE] = str(scene.resolve())
+    os.environ[_PATH_VARIABLE] = str(scene.resolve())
     token = secrets.token_urlsafe(32)
     page = marimo.create_asgi_app(quiet=True)
     page = page.with_app(path=f"/{token}", root=str(Path(__file__).with_name("page.py"))).build()

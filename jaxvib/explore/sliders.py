@@ -38,7 +38,7 @@ class Slider(NamedTuple):
     **Attributes**
 
     - `name` in the scene; `label`, the name shown to the user; `unit` on the slider
-    - `steps`: ascending values of the slider; `start`: the value in the scene, which is one of them
+    - `steps`: ascending values of the slider; `start`: the value in the scene, which is one of the `steps`
     - `number`: the parameter; None for the number of loads
     """
 
@@ -56,7 +56,7 @@ class Slider(NamedTuple):
 
 
 def sliders_of(scene: Scene) -> list[Slider]:
-    """Return the sliders of a scene, those of the drive and the loads first.
+    """Return the sliders of a scene; the sliders of the drive and the loads come first.
 
     - springs and dampers, masses and drags of the loads: a tenth to ten times the scene's values
     - rotor speed: a hundredth to three times the scene's value
@@ -72,15 +72,15 @@ def sliders_of(scene: Scene) -> list[Slider]:
     >>> sliders_of(scene)[-2].title, sliders_of(scene)[-2].start
     ('stiffness of the support, N/mm', 40.0)
     """
-    found = [_slider(scene, find_number(scene, "drive.speed", "slider"), _SPEED_FACTORS)]
+    sliders = [_slider(scene, find_number(scene, "drive.speed", "slider"), _SPEED_FACTORS)]
     if _has_equal_loads(scene):
         counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
-        found.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
+        sliders.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
     numbers = [find_number(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _is_adjustable(scene, name)]
     arrays = [find_number(scene, name, "slider") for name in _MACHINE_NUMBERS if _is_adjustable(scene, name)]
-    single = [one for array in arrays for one in array.single(scene) if np.any(one.read(scene))]
+    single = [entry for array in arrays for entry in array.single(scene) if np.any(entry.read(scene))]
     numbers += single if len(single) <= _MAX_SINGLE_SLIDERS else arrays
-    return found + [_slider(scene, number, _VALUE_FACTORS) for number in numbers]
+    return sliders + [_slider(scene, number, _VALUE_FACTORS) for number in numbers]
 
 
 def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
@@ -114,8 +114,8 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
 
 
 def _is_adjustable(scene: Scene, name: str) -> bool:
-    """Return True if the scene has this parameter, if it is not 0, and if no other parameter, such as `stiffness_terms` of a
-    rotor, replaces it."""
+    """Return True if the scene has this parameter with a value other than 0, and no other parameter, such as `stiffness_terms`
+    of a rotor, replaces it."""
     part, _, field = name.partition(".")
     owner = getattr(scene, part)
     value = getattr(owner, field, None)
@@ -140,6 +140,6 @@ def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Sl
 
 @functools.lru_cache(maxsize=256)
 def _steps(start: float, factors: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the values around `start`, with four digits. They are cached because each move of a slider needs the values of
-    all sliders."""
+    """Return `start` times each factor, with four digits, and `start` itself, ascending. The values are cached because each
+    move of a slider needs the values of all sliders."""
     return tuple(sorted({start, *(float(f"{f * start:.4g}") for f in factors if f != 1.0)}))

@@ -28,7 +28,7 @@ class Argument(NamedTuple):
     """Argument of a part.
 
     **Attributes**: `name`; `unit`, "" for none; `needed`: True if the argument has no default; `default` as text, or None;
-    `allowed`: the allowed texts of an argument that is a choice; `bounds` of a number in words; `meaning` from the docstring.
+    `allowed`: the allowed texts, () if other values are possible; `bounds` of a number in words; `meaning` from the docstring.
     """
 
     name: str
@@ -49,31 +49,31 @@ def arguments_of(build: Callable[..., object]) -> list[Argument]:
     >>> [(a.name, a.unit, a.needed, a.default, a.bounds) for a in arguments_of(jv.Stop)][1:3]
     [('gap', 'm', True, None, 'at least 0'), ('damping', 'N s/m', False, '0.0', 'at least 0')]
     """
-    found, specs, meanings = [], number_specs(part_of(build)), _meanings(inspect.getdoc(build) or "")
+    arguments, specs, meanings = [], number_specs(part_of(build)), _meanings(inspect.getdoc(build) or "")
     for name, parameter in inspect.signature(build).parameters.items():
-        default = None if parameter.default in (parameter.empty, None) else _shown(parameter.default)
+        default = None if parameter.default in (parameter.empty, None) else _default_text(parameter.default)
         spec = specs.get(name, PLAIN)
         needed = parameter.default is parameter.empty
         meaning = meanings.get(name, spec.words)
-        found.append(Argument(name, spec.unit, needed, default, _choices(build, parameter), spec.bounds.words, meaning))
-    return found
+        arguments.append(Argument(name, spec.unit, needed, default, _choices(build, parameter), spec.bounds.words, meaning))
+    return arguments
 
 
 def _meanings(text: str) -> dict[str, str]:
-    """Return the text of each argument in the list of arguments of a docstring, by name, without the names.
+    """Return the descriptions in the list of arguments of a docstring, by the name of the argument.
 
     >>> _meanings("**Arguments**\\n\\n- `mass` M, kg; typical: 5\\n- `low` and `high`: the ends\\n  of a range\\n\\nEnd.")
     {'mass': 'M, kg; typical: 5', 'low': 'the ends of a range', 'high': 'the ends of a range'}
     """
     _, _, listed = text.partition("**Arguments**")
-    found = {}
+    meanings = {}
     for entry in re.findall(r"^- (`.*(?:\n  .*)*)", listed.partition("**Returns**")[0], re.MULTILINE):
         line = " ".join(entry.split())
         head = re.match(r"`\w+`(?:(?:, | and | or )`\w+`)*", line)
         if head is not None:
             meaning = line[head.end() :].lstrip(":, ").replace("`", "")
-            found |= dict.fromkeys(re.findall(r"\w+", head[0].replace(" and ", " ").replace(" or ", " ")), meaning)
-    return found
+            meanings |= dict.fromkeys(re.findall(r"\w+", head[0].replace(" and ", " ").replace(" or ", " ")), meaning)
+    return meanings
 
 
 def part_of(build: Callable[..., object]) -> type:
@@ -85,20 +85,20 @@ def part_of(build: Callable[..., object]) -> type:
 
 
 def _choices(build: Callable[..., object], parameter: inspect.Parameter) -> tuple[str, ...]:
-    """Return the texts of an argument whose type is a Literal or the name of one; an empty tuple for other types."""
+    """Return the allowed texts of an argument whose type is a Literal, or an alias of a Literal; () for other types."""
     annotation = str(parameter.annotation)
-    home = inspect.getmodule(build)
-    named = getattr(home, annotation, None) if annotation.isidentifier() else None
-    texts = re.findall(r"['\"]([^'\"]+)['\"]", str(named) if named is not None else annotation)
-    return tuple(texts) if "Literal" in (annotation + str(named)) else ()
+    module = inspect.getmodule(build)
+    alias = getattr(module, annotation, None) if annotation.isidentifier() else None
+    texts = re.findall(r"['\"]([^'\"]+)['\"]", str(alias) if alias is not None else annotation)
+    return tuple(texts) if "Literal" in (annotation + str(alias)) else ()
 
 
-def _shown(value: object) -> str:
+def _default_text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def described(group: str, name: str) -> Callable[..., object]:
-    """Return the class or function that builds the part with that name. **Raises** `InputError` for unknown names."""
+def builder_of(group: str, name: str) -> Callable[..., object]:
+    """Return the class or function that builds the part with this group and name. **Raises** `InputError` for unknown names."""
     if group not in GROUPS:
         raise InputError("group", f"is {quoted(group)}; {suggest_name(group, list(GROUPS))}")
     if name not in GROUPS[group]:

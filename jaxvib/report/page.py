@@ -29,8 +29,9 @@ _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "nu
 class Report:
     """Contents of a page.
 
-    **Arguments**: `title`; `document`, plain values as in JSON; `units` of its numbers by name; `command` that computed the
-    result; `text` of the result on the terminal; `scene` of the result and a `sketch` of it; `figures` by name; `author`.
+    **Arguments**: `title`; `document`: the result as plain values, as in JSON; `units` of its numbers by name; `command` that
+    computed the result; `text` of the result on the terminal; `scene` of the result and a `sketch` of the scene; `figures`:
+    pairs of a name and a figure; `author`.
     """
 
     title: str
@@ -44,13 +45,14 @@ class Report:
     author: str = ""
 
     def html(self) -> str:
-        """Return the page as HTML with embedded style and figures; it loads nothing from a network. All text is escaped."""
+        """Return the page as HTML with embedded style and figures. The page loads nothing from a network; all text is
+        escaped."""
         parts = [f"<h1>{escaped(self.title)}</h1>"]
         if self.author:
             parts.append(f"<p>{escaped(self.author)}</p>")
         if self.command:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
-        units = self.units if self.scene is None else _of_coordinates(self.units, self.scene)
+        units = self.units if self.scene is None else _with_coordinate_units(self.units, self.scene)
         document, units = in_display_units(self.document, units)
         numbers = [_section("Accuracy", accuracy_table(document, units)), _section("Numbers", result_tables(document, units))]
         if self.text:
@@ -85,7 +87,7 @@ def html_report(
 
     - `result` of any kind
     - `path` of the file, which is overwritten
-    - `title`; default: the name of the result's class
+    - `title` of the page; default: the name of the class of the result
     - `author` of the report; default: none
     - `scene` whose parameters are listed; default: the scene of the result if it has one
     - `figures`: pairs of a name and a matplotlib figure; default: the figure of the result's method `plot`
@@ -100,11 +102,11 @@ def html_report(
     True
     """
     kind, path = type(result).__name__, Path(path)
-    own = getattr(result, "scene", None)
-    if scene is None and isinstance(own, Scene):
-        scene = own
-    drawn = [(kind, result.plot())] if figures is None else figures
-    page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn, author=author)
+    own_scene = getattr(result, "scene", None)
+    if scene is None and isinstance(own_scene, Scene):
+        scene = own_scene
+    named_figures = [(kind, result.plot())] if figures is None else figures
+    page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, named_figures, author=author)
     with written(path) as part:
         part.write_text(page.html(), encoding="utf-8", errors="replace")
     return path
@@ -112,21 +114,21 @@ def html_report(
 
 def units_of(result: eqx.Module) -> dict[str, str]:
     """Return the units of the numbers of a result and of its parts, by the names of their fields."""
-    found: dict[str, str] = {}
-    for each in dataclasses.fields(result):
-        value = getattr(result, each.name)
-        if each.metadata.get("unit"):
-            found.setdefault(each.name, each.metadata["unit"])
-        elif "part" in each.metadata and isinstance(value, eqx.Module):
+    units: dict[str, str] = {}
+    for field_of_result in dataclasses.fields(result):
+        value = getattr(result, field_of_result.name)
+        if field_of_result.metadata.get("unit"):
+            units.setdefault(field_of_result.name, field_of_result.metadata["unit"])
+        elif "part" in field_of_result.metadata and isinstance(value, eqx.Module):
             for name, unit in units_of(value).items():
-                found.setdefault(name, unit)
-    return found
+                units.setdefault(name, unit)
+    return units
 
 
-def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
+def _with_coordinate_units(units: Units, scene: Scene) -> dict[str, str]:
     """Replace a unit such as "m or rad" by the unit of the machine's coordinates if all coordinates have the same unit."""
-    alike = set(scene.machine.structure().units)
-    choice = 0 if alike == {"m"} else 1 if alike == {"rad"} else None
+    coordinate_units = set(scene.machine.structure().units)
+    choice = 0 if coordinate_units == {"m"} else 1 if coordinate_units == {"rad"} else None
     return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}
 
 
@@ -149,9 +151,9 @@ def _versions() -> str:
             versions.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
-    when = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    where = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
-    return f"<p>{escaped(', '.join([*versions, where]))}</p><p>{escaped(when)}</p>"
+    time_text = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    platform_text = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    return f"<p>{escaped(', '.join([*versions, platform_text]))}</p><p>{escaped(time_text)}</p>"
 
 
 _PAGE = """<!doctype html>

@@ -36,14 +36,15 @@ _MAX_ROWS = 200
 
 
 def escaped(text: object) -> str:
-    """Return a text in which the special characters of HTML are escaped."""
+    """Return a text with escaped special characters of HTML."""
     return html.escape(str(text), quote=True)
 
 
 def in_display_units(document: Mapping[str, Plain], units: Units) -> tuple[Mapping[str, Plain], Units]:
     """Return a document whose numbers are in display units, and these units.
 
-    Each name has one unit, which is chosen by the largest value of this name in the document, in lists and in rows of tables.
+    Each name has one unit. It is chosen for the largest value with this name in the document, including lists and rows of
+    tables.
 
     >>> in_display_units({"omega": 10.0, "jams": [{"amplitude": [0.002]}]}, {"omega": "rad/s", "amplitude": "m"})
     ({'omega': 95.49296585513721, 'jams': [{'amplitude': [2.0]}]}, {'omega': 'rpm', 'amplitude': 'mm'})
@@ -54,30 +55,30 @@ def in_display_units(document: Mapping[str, Plain], units: Units) -> tuple[Mappi
         sizes[name] = max(sizes.get(name, 0.0), abs(x))
         return x
 
-    _scaled(document, "", note_size)
+    _map_numbers(document, "", note_size)
     shown = {name: shown_unit(unit, sizes[name]) for name, unit in units.items()}
-    scaled = _scaled(document, "", lambda name, x: shown[name][1] * x if name in shown else x)
+    scaled = _map_numbers(document, "", lambda name, x: shown[name][1] * x if name in shown else x)
     return cast("Mapping[str, Plain]", scaled), {name: unit for name, (unit, _) in shown.items()}
 
 
-def _scaled(value: Plain | Mapping[str, Plain], name: str, scale: Callable[[str, float], float]) -> Plain:
-    """Apply a function of (name, number) to all numbers of a plain value that are not Booleans."""
+def _map_numbers(value: Plain | Mapping[str, Plain], name: str, scale: Callable[[str, float], float]) -> Plain:
+    """Apply `scale`, a function of name and number, to all numbers of a plain value except Booleans."""
     if isinstance(value, Mapping):
-        return {key: _scaled(each, key, scale) for key, each in value.items()}
+        return {key: _map_numbers(entry, key, scale) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_scaled(each, name, scale) for each in value]
+        return [_map_numbers(entry, name, scale) for entry in value]
     return scale(name, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
 
 
 def accuracy_table(document: Mapping[str, Plain], units: Units) -> str:
     """Return a table of the fields of a document about accuracy and cost: status, error, steps, seconds."""
-    return _pairs(
+    return _pair_table(
         [(name, document[name]) for name in ACCURACY_FIELDS if name in document and _fits_in_cell(document[name])], units
     )
 
 
 def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = False) -> str:
-    """Return a document as tables: one for all single values, and one below its own heading for each list or mapping."""
+    """Return a document as tables: one table for all single values, and a table with a heading for each list or mapping."""
     single, below = [], []
     for name, value in document.items():
         if name in _HIDDEN_FIELDS or (not inner and name in ACCURACY_FIELDS and _fits_in_cell(value)):
@@ -87,11 +88,11 @@ def result_tables(document: Mapping[str, Plain], units: Units, inner: bool = Fal
         elif isinstance(value, Mapping):
             below.append((name, result_tables(value, units, inner=True)))
         elif _entries(value):
-            below.append((name, _rows(value, units)))
+            below.append((name, _row_table(value, units)))
         elif isinstance(value, list) and value:
-            below.append((name, _grid(value)))
+            below.append((name, _grid_table(value)))
     heads = "".join(f"<h3>{escaped(_words(name))}{_unit_of(name, units)}</h3>{body}" for name, body in below if body)
-    return _pairs(single, units) + heads
+    return _pair_table(single, units) + heads
 
 
 def parameter_tables(scene: Scene) -> str:
@@ -103,21 +104,21 @@ def parameter_tables(scene: Scene) -> str:
         owners = [(f"exciter {k}, ", t, e) for k, (t, e) in enumerate(zip(tables["exciters"], scene.exciters, strict=True))]
     kind = str(tables["machine"].pop("kind"))
     parts.append((f"machine: {_words(kind)}", tables["machine"], _units(type(scene.machine))))
-    for which, table, exciter in owners:
-        own = {name: table[name] for name in ("at", "direction", "unbalance") if name in table}
+    for prefix, table, exciter in owners:
+        own_fields = {name: table[name] for name in ("at", "direction", "unbalance") if name in table}
         units = dict(_units(Exciter))
-        if not isinstance(own.get("at"), int):  # a point or a distance, not the number of a platform
+        if not isinstance(own_fields.get("at"), int):  # a point or a distance, not the number of a platform
             units["at"] = units["position"]
-        parts += [(which.removesuffix(", "), own, units)] if own else []
+        parts += [(prefix.removesuffix(", "), own_fields, units)] if own_fields else []
         for section in [name for name in ("loads", "drive") if name in table]:
             kind = str(table[section].pop("kind"))
-            parts.append((f"{which}{section}: {_words(kind)}", table[section], _units(type(getattr(exciter, section)))))
-    for which, table in [("", tables), *((which, table) for which, table, _ in owners if which)]:
+            parts.append((f"{prefix}{section}: {_words(kind)}", table[section], _units(type(getattr(exciter, section)))))
+    for prefix, table in [("", tables), *((prefix, table) for prefix, table, _ in owners if prefix)]:
         for name, value in table.get("effects", {}).items():
-            for each in value if isinstance(value, list) else [value]:
-                parts.append((f"{which}effect: {_words(name)}", each, _units(EFFECTS[name])))
+            for effect_table in value if isinstance(value, list) else [value]:
+                parts.append((f"{prefix}effect: {_words(name)}", effect_table, _units(EFFECTS[name])))
     shown = [(title, *in_display_units(table, units)) for title, table, units in parts]
-    return "".join(f"<h3>{escaped(title)}</h3>{_pairs(list(table.items()), units)}" for title, table, units in shown)
+    return "".join(f"<h3>{escaped(title)}</h3>{_pair_table(list(table.items()), units)}" for title, table, units in shown)
 
 
 def _units(part: type) -> Units:
@@ -143,7 +144,7 @@ def _unit_of(name: str, units: Units) -> str:
     return f", {escaped(units[name])}" if units.get(name) else ""
 
 
-def _pairs(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
+def _pair_table(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
     if not pairs:
         return ""
     rows = "".join(
@@ -153,36 +154,36 @@ def _pairs(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
     return f"<div class='wide'><table>{rows}</table></div>"
 
 
-def _rows(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
-    """Return a table with a row for each entry; long texts are below their row, over the whole width."""
-    every = list(dict.fromkeys(name for row in rows for name in row))
-    long = [
-        name for name in every if any(isinstance(x := row.get(name), str) and len(x) > _MAX_CELL_CHARACTERS for row in rows)
+def _row_table(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
+    """Return a table with a row for each entry. A long text is below its row, over the whole width."""
+    all_names = list(dict.fromkeys(name for row in rows for name in row))
+    long_names = [
+        name for name in all_names if any(isinstance(x := row.get(name), str) and len(x) > _MAX_CELL_CHARACTERS for row in rows)
     ]
-    names = [name for name in every if name not in long]
+    names = [name for name in all_names if name not in long_names]
     heads = "".join(f"<th{_column_class(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
     body = ""
     for row in rows[:_MAX_ROWS]:
         body += "<tr>" + "".join(f"<td{_column_class(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
-        for name in long:
+        for name in long_names:
             if row.get(name):
                 body += f"<tr><td class='below' colspan='{len(names)}'>{escaped(_words(name))}: {_cell(row[name])}</td></tr>"
-    return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more(len(rows))}"
+    return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more_rows_note(len(rows))}"
 
 
 def _column_class(rows: Sequence[Mapping[str, Plain]], name: str) -> str:
-    """Return the HTML class of a column: numbers are aligned to the right."""
+    """Return the HTML class of a column, by which numbers are aligned to the right."""
     values = [row.get(name) for row in rows]
     numeric = all(v is None or (isinstance(v, (int, float)) and not isinstance(v, bool)) for v in values)
     return " class='n'" if numeric else ""
 
 
-def _grid(values: Sequence[Plain]) -> str:
-    """Return a list of lists as a table, or the number of entries and the range of a long list."""
+def _grid_table(values: Sequence[Plain]) -> str:
+    """Return a list of lists as a table; for other lists a sentence with the number of entries and their range."""
     rows = [x for x in values if isinstance(x, list) and _fits_in_cell(x)]
     if len(rows) == len(values):
         body = "".join("<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>" for row in rows[:_MAX_ROWS])
-        return f"<div class='wide'><table>{body}</table></div>{_more(len(values))}"
+        return f"<div class='wide'><table>{body}</table></div>{_more_rows_note(len(values))}"
     numbers = [x for x in values if isinstance(x, (int, float)) and not isinstance(x, bool)]
     if not numbers:
         return f"<p>{len(values)} values; see the output of --json or --out</p>"
@@ -191,7 +192,7 @@ def _grid(values: Sequence[Plain]) -> str:
     )
 
 
-def _more(count: int) -> str:
+def _more_rows_note(count: int) -> str:
     return f"<p>{count - _MAX_ROWS} more rows; see the output of --json or --out</p>" if count > _MAX_ROWS else ""
 
 
@@ -203,7 +204,7 @@ def _cell(value: Plain) -> str:
     if isinstance(value, float):
         return escaped(f"{value:.6g}")
     if _entries(value):
-        return _rows(value, {})
+        return _row_table(value, {})
     if isinstance(value, list):
         return ", ".join(_cell(x) for x in value) or "none"
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Films of a moving machine (platforms, springs, rotor, loads, forces on the foundation), and the motion that they show."""
+"""Films of a moving machine: platforms, springs, rotor, loads, forces on the foundation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.run import Run
-from jaxvib.show.sketch import checked_scene, fit
+from jaxvib.show.sketch import drawable_scene, fit
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose
 from jaxvib.steady.orbits.describe import Orbit
@@ -37,7 +37,7 @@ _TURNS_PER_PICTURE = 0.09
 _MAX_PICTURES = 600
 """Maximum number of pictures of a film."""
 
-_NARROWEST, _WIDEST = 1.0, 50.0
+_MIN_WIDTH, _MAX_WIDTH = 1.0, 50.0
 """Range of the width of a picture, inches."""
 
 _MAX_DRAWN_HEIGHTS = 100.0
@@ -69,8 +69,8 @@ def animate(
     - `begin`, `end`: the part that is shown, s or text; default: the last four periods of a run, or four periods of an orbit
     - `seconds`: duration of the film; typical: 5 to 10; default: the rotor turns by about a tenth of a turn between pictures
     - `fps`: pictures per second; typical: 20 (the default)
-    - `magnify`: magnification of displacements relative to the loads' circle, stated in the picture; typical: 1 to 50; default:
-      a factor at which the largest displacement is clearly visible
+    - `magnify`: magnification of displacements relative to the circle of the loads, which the picture states; typical: 1 to 50;
+      default: a factor with which the largest displacement is clearly visible
     - `width` of the picture, inches (100 pixels each); typical: 6.4 (the default). Drawing takes most of the computing time,
       in proportion to `seconds` times `fps`
 
@@ -91,29 +91,29 @@ def animate(
     >>> film.count, film.figure.axes[2].get_xlabel()
     (98, 'time, s')
     """
-    owner = checked_scene(_scene_of(motion, scene))
+    owner = drawable_scene(_scene_of(motion, scene))
     if path is not None and Path(path).suffix.lower() not in (".gif", ".html", ".htm"):
         raise InputError("path", f"is {quoted(str(path))}; a film must be a .gif or .html file")
     if isinstance(fps, bool) or not isinstance(fps, int) or not 1 <= fps <= 50:
         raise InputError("fps", f"is {quoted(fps)}; it must be a whole number of pictures a second, 1 to 50")
     first, last = _time_range(motion, begin, end)
-    speed = _fastest(motion, owner)
+    speed = _highest_speed(motion, owner)
     turns = speed * (last - first) / (2.0 * np.pi)
-    lasts = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
-    pictures = int(np.ceil(turns / _TURNS_PER_PICTURE)) if lasts is None else lasts * fps
+    duration = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
+    pictures = int(np.ceil(turns / _TURNS_PER_PICTURE)) if duration is None else duration * fps
     count = round(float(np.clip(pictures, 2, _MAX_PICTURES)))
     if turns / count > _MAX_TURNS_PER_PICTURE:
-        most = first + _MAX_TURNS_PER_PICTURE * 2.0 * np.pi * count / speed
+        latest_end = first + _MAX_TURNS_PER_PICTURE * 2.0 * np.pi * count / speed
         problem = f"turns the rotor by {turns / count:.3g} turns from one picture to the next, which looks like another speed"
-        raise InputError("end", f"{problem}; end at {most:.4g} s or before, or make the film longer")
-    # An orbit is periodic: the picture after the last one would be the first one.
+        raise InputError("end", f"{problem}; end at {latest_end:.4g} s or before, or make the film longer")
+    # An orbit is periodic; the picture after the last picture would be the first picture.
     time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
     dense = np.linspace(time[0], time[-1], max(400, count))
-    shown, history = (
+    film_motion, history = (
         motion_of_run(motion, times) if isinstance(motion, Run) else motion_of_orbit(motion, owner, times)
         for times in (time, dense)
     )
-    film = _film(owner, shown, history, float(fps), magnify, width)
+    film = _film(owner, film_motion, history, float(fps), magnify, width)
     if path is not None:
         film.save(path)
     return film
@@ -138,112 +138,115 @@ def _time_range(motion: Run | Orbit, begin: Number | None, end: Number | None) -
         ends = (max(last - 4.0 * period, float(window.time[0])), last)
     else:
         ends = (0.0, 8.0 * np.pi / float(motion.omega) if np.isfinite(motion.omega) else 1.0)
-    given = [None if x is None else float(number(x, "s", name, low=0.0)) for x, name in ((begin, "begin"), (end, "end"))]
-    first, last = (default if x is None else x for x, default in zip(given, ends, strict=True))
+    requested = [None if x is None else float(number(x, "s", name, low=0.0)) for x, name in ((begin, "begin"), (end, "end"))]
+    first, last = (default if x is None else x for x, default in zip(requested, ends, strict=True))
     if not first < last:
         raise InputError("end", f"is {last:.6g} s; it must be after the beginning, {first:.6g} s")
     return first, last
 
 
-def _fastest(motion: Run | Orbit, scene: Scene) -> float:
+def _highest_speed(motion: Run | Orbit, scene: Scene) -> float:
     """Return the highest speed of rotor and loads, rad/s."""
     if isinstance(motion, Run):
-        kept = motion.window
-        speeds = [*kept.rotor_speeds, *(own.rate[0] for own in kept.state.exciters if own.rate)]
-        return max(float(np.max(np.abs(each), initial=1e-300)) for each in speeds)
+        window = motion.window
+        speeds = [*window.rotor_speeds, *(state.rate[0] for state in window.state.exciters if state.rate)]
+        return max(float(np.max(np.abs(speed), initial=1e-300)) for speed in speeds)
     return float(max(motion.rotor_speed, motion.omega)) if np.isfinite(motion.rotor_speed) else float(scene.drive.speed)
 
 
-def _film(scene: Scene, shown: SampledMotion, history: SampledMotion, fps: float, magnify: float | None, width: float) -> Film:
-    if not _NARROWEST <= width <= _WIDEST:
-        raise InputError("width", f"is {width:g} inches; it must be from {_NARROWEST:g} to {_WIDEST:g}")
+def _film(
+    scene: Scene, film_motion: SampledMotion, history: SampledMotion, fps: float, magnify: float | None, width: float
+) -> Film:
+    if not _MIN_WIDTH <= width <= _MAX_WIDTH:
+        raise InputError("width", f"is {width:g} inches; it must be from {_MIN_WIDTH:g} to {_MAX_WIDTH:g}")
     view = view_of(scene)
     left, right, bottom, top = view.limits
     tall = width * (top - bottom) / (right - left)
-    figure, (stage, lower, below) = panels(3, size=(width, (0.8 * tall + 2.9) / 3.0))
+    figure, (stage, lower, lowest) = panels(3, size=(width, (0.8 * tall + 2.9) / 3.0))
     grid = stage.get_gridspec()
     assert grid is not None
     grid.set_height_ratios([0.8 * tall + 0.3, 1.3, 1.3])
     figure.set_dpi(100.0)
     fit(stage, view.limits)
-    given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
-    chosen = view.magnified(shown.displacement) if given is None else given
-    reach = chosen * view.scale
-    farthest = float(np.max(np.abs(shown.displacement), initial=0.0)) * view.scale
-    if chosen * farthest > (most_seen := _MAX_DRAWN_HEIGHTS * (top - bottom)):
+    magnify_given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
+    magnification = view.magnified(film_motion.displacement) if magnify_given is None else magnify_given
+    reach = magnification * view.scale
+    farthest = float(np.max(np.abs(film_motion.displacement), initial=0.0)) * view.scale
+    if magnification * farthest > (most_seen := _MAX_DRAWN_HEIGHTS * (top - bottom)):
         raise InputError(
-            "magnify", f"is {chosen:g}, which moves the machine out of the figure; at most {most_seen / farthest:.3g}"
+            "magnify", f"is {magnification:g}, which moves the machine out of the figure; at most {most_seen / farthest:.3g}"
         )
-    poses = list(map(shown.pose, range(shown.time.size)))
+    poses = list(map(film_motion.pose, range(film_motion.time.size)))
     forces = np.array([view.support_forces(pose) for pose in poses])
-    most = max(float(np.max(np.abs(forces), initial=0.0)), float(np.max(np.abs(shown.force))), 1e-300)
-    per_newton = 0.7 / most
+    largest_force = max(float(np.max(np.abs(forces), initial=0.0)), float(np.max(np.abs(film_motion.force))), 1e-300)
+    per_newton = 0.7 / largest_force
 
     def parts(k: int) -> list[Part]:
-        return [*view.parts(poses[k], reach), *view.arrows(poses[k], shown.force[k], per_newton)]
+        return [*view.parts(poses[k], reach), *view.arrows(poses[k], film_motion.force[k], per_newton)]
 
     artists = [put(stage, part) for part in parts(0)]
     clock = stage.set_title("t", loc="left", family="monospace", fontsize="medium")
-    slower = (shown.time.size / fps) / (shown.time[-1] - shown.time[0])
-    note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x as large"
+    slower = (film_motion.time.size / fps) / (film_motion.time[-1] - film_motion.time[0])
+    note = f"slowed down {slower:.3g} x, displacements drawn {magnification:.3g} x as large"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
     # Texts that are wider than the picture must not reduce the size of the drawing.
     for text in stage.texts:
         text.set_in_layout(False)
-    cursors = _plot_histories((lower, below), scene, history)
+    cursors = _plot_histories((lower, lowest), scene, history)
     directions = scene.machine.structure().foundation_directions
     directions = directions if len(directions) > 1 else ("foundation force",)
     heading = "    " if len(directions) == 1 else "  force "  # both components fit above the picture
 
     def update(k: int) -> None:
         for artist, part in zip(artists, parts(k), strict=True):
-            _move(artist, part.points)
-        total = ", ".join(f"{name}{force:7.0f} N" for name, force in zip(directions, shown.force[k], strict=True))
-        clock.set_text(f"t = {shown.time[k]:7.3f} s{heading}{total}")
+            _move_artist(artist, part.points)
+        total = ", ".join(f"{name}{force:7.0f} N" for name, force in zip(directions, film_motion.force[k], strict=True))
+        clock.set_text(f"t = {film_motion.time[k]:7.3f} s{heading}{total}")
         for cursor in cursors:
-            cursor.set_xdata([shown.time[k]] * 2)
+            cursor.set_xdata([film_motion.time[k]] * 2)
 
     update(0)
     moving: list[Artist] = [*artists, clock, *cursors]
-    return Film(figure, update, moving, shown.time.size, fps)
+    return Film(figure, update, moving, film_motion.time.size, fps)
 
 
-def _move(artist: Line2D | Polygon, points: np.ndarray) -> None:
+def _move_artist(artist: Line2D | Polygon, points: np.ndarray) -> None:
     if isinstance(artist, Line2D):
         artist.set_data(points[:, 0], points[:, 1])
     else:
         artist.set_xy(points)
 
 
-def _plot_histories(axes: tuple[Axes, Axes], scene: Scene, shown: SampledMotion) -> list[Line2D]:
-    """Plot displacements and force over time, and return a moving time cursor for each."""
+def _plot_histories(axes: tuple[Axes, Axes], scene: Scene, history: SampledMotion) -> list[Line2D]:
+    """Plot displacements and force over time, and return the time cursor of each plot."""
     upper, lower = axes
     structure = scene.machine.structure()
     for k, name in enumerate(structure.coordinates):
         label = name if structure.units[k] == "m" else f"{name} (mrad)"
         look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.2}
-        upper.plot(shown.time, 1e3 * shown.displacement[:, k], label=label, **look)
+        upper.plot(history.time, 1e3 * history.displacement[:, k], label=label, **look)
     upper.set_ylabel("mm, mrad" if "rad" in structure.units else "mm")
     legend_above(upper, 6)
     for k, name in enumerate(structure.foundation_directions):
         look = {"color": "black" if k else COLORS[1], "ls": STROKES[k], "lw": 1.2}
-        lower.plot(shown.time, shown.force[:, k], label=f"foundation force, {name}", **look)
+        lower.plot(history.time, history.force[:, k], label=f"foundation force, {name}", **look)
     lower.set(ylabel="N", xlabel="time, s")
     legend_above(lower)
     for axis in (upper, lower):
-        axis.set_xlim(shown.time[0], shown.time[-1])
-    return [axis.axvline(shown.time[0], color=GUIDE, lw=1.2) for axis in (upper, lower)]
+        axis.set_xlim(history.time[0], history.time[-1])
+    return [axis.axvline(history.time[0], color=GUIDE, lw=1.2) for axis in (upper, lower)]
 
 
 _MAX_ANGLE_BETWEEN_SAMPLES = 1.2
-"""Rotation of a load between two samples of a run, rad, up to which interpolation is accurate enough."""
+"""Largest rotation of a load between two samples of a run, rad, at which interpolation is accurate enough."""
 
 
 class SampledMotion(NamedTuple):
     """Motion of a machine at the times of a film.
 
-    **Attributes**: `time` (nt,) s; `displacement`, `velocity` (nt, nd); `rotors`, a `RotorPose` for each exciter, whose arrays
-    have a leading axis over the times; `force` on the foundation, (nt, directions) N.
+    **Attributes**: `time` (nt,), s; `displacement` (nt, nd), m, and `velocity` (nt, nd), m/s (tilts: rad, rad/s); `rotors`: a
+    `RotorPose` for each exciter, whose arrays have a leading axis over the times; `force` on the foundation (nt, directions),
+    N.
     """
 
     time: np.ndarray
@@ -263,19 +266,22 @@ def motion_of_run(run: Run, time: np.ndarray) -> SampledMotion:
     Velocities and forces are interpolated linearly. **Raises** `InputError` for times outside the stored states, and for states
     that are too far apart.
     """
-    kept = _stored_states(run, time)
-    t = np.asarray(kept.time, float)
+    stored = _stored_states(run, time)
+    t = np.asarray(stored.time, float)
     k = np.clip(np.searchsorted(t, time, side="right") - 1, 0, t.size - 2)
     h = t[k + 1] - t[k]
     share = (time - t[k]) / h
-    state = kept.state
-    near = np.unique(np.concatenate([k, k + 1]))
-    speeds = [own.rate[0] if own.rate else rotor for own, rotor in zip(state.exciters, kept.rotor_speeds, strict=True)]
-    rate = max(float(np.max(np.abs(np.asarray(each)[near]), initial=0.0)) for each in speeds)
+    state = stored.state
+    used_states = np.unique(np.concatenate([k, k + 1]))
+    speeds = [
+        state_of_exciter.rate[0] if state_of_exciter.rate else rotor
+        for state_of_exciter, rotor in zip(state.exciters, stored.rotor_speeds, strict=True)
+    ]
+    rate = max(float(np.max(np.abs(np.asarray(speed_history)[used_states]), initial=0.0)) for speed_history in speeds)
     if rate * np.max(h) > _MAX_ANGLE_BETWEEN_SAMPLES:
-        most = int(np.ceil(t.size * rate * np.max(h) / _MAX_ANGLE_BETWEEN_SAMPLES))
+        needed_samples = int(np.ceil(t.size * rate * np.max(h) / _MAX_ANGLE_BETWEEN_SAMPLES))
         problem = f"has {t.size} samples, between which loads turn by up to {rate * np.max(h):.3g} rad"
-        raise InputError("run", f"{problem}; simulate with samples={most}, or animate the last turns only")
+        raise InputError("run", f"{problem}; simulate with samples={needed_samples}, or animate the last turns only")
 
     def cubic(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
         s, step = (x.reshape(-1, *[1] * (value.ndim - 1)) for x in (share, h))
@@ -288,34 +294,40 @@ def motion_of_run(run: Run, time: np.ndarray) -> SampledMotion:
 
     q, v = np.asarray(state.displacement, float), np.asarray(state.velocity, float)
     rotors = []
-    for own, *rotor in zip(state.exciters, kept.rotor_angles, kept.rotor_speeds, strict=True):
-        angle = [cubic(_continuous_angle(u, w, t), w) for u, w in zip(arrays(own.angle), arrays(own.rate), strict=True)]
+    for state_of_exciter, *rotor in zip(state.exciters, stored.rotor_angles, stored.rotor_speeds, strict=True):
+        angle = [
+            cubic(_continuous_angle(u, w, t), w)
+            for u, w in zip(arrays(state_of_exciter.angle), arrays(state_of_exciter.rate), strict=True)
+        ]
         turn, speed = arrays(rotor)
         rotors.append(RotorPose(tuple(angle), cubic(_continuous_angle(turn, speed, t), speed)))
-    force = np.asarray(kept.foundation_force, float)
+    force = np.asarray(stored.foundation_force, float)
     between = (1.0 - share)[:, None] * force[k] + share[:, None] * force[k + 1]
     velocity = (1.0 - share)[:, None] * v[k] + share[:, None] * v[k + 1]
     return SampledMotion(time, cubic(q, v), velocity, tuple(rotors), between)
 
 
 def _stored_states(run: Run, time: np.ndarray) -> Trajectory:
-    """Return stored states of a run that include these times: those of its window if it includes them."""
+    """Return stored states of a run that include these times: the window if it includes them, otherwise the trajectory.
+
+    **Raises** `InputError` if neither includes them.
+    """
     slack = 1e-9 * max(float(run.window.time[-1]), 1e-300)
-    kept = [run.window, *([] if run.trajectory is None else [run.trajectory])]
-    for states in kept:
+    available = [run.window, *([] if run.trajectory is None else [run.trajectory])]
+    for states in available:
         if float(states.time[0]) - slack <= time[0] and time[-1] <= float(states.time[-1]) + slack:
             return states
-    first, last = float(kept[-1].time[0]), float(kept[-1].time[-1])
+    first, last = float(available[-1].time[0]), float(available[-1].time[-1])
     problem = f"selects {time[0]:.6g} to {time[-1]:.6g} s; the run keeps {first:.6g} to {last:.6g} s"
     raise InputError("begin", problem + ("" if run.trajectory is not None else " (simulate with save='all' for the rest)"))
 
 
 def _continuous_angle(angle: np.ndarray, rate: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return continuous angles (nt, ...) from angles modulo a turn; their rates determine the number of whole turns."""
+    """Return continuous angles (nt, ...) from angles modulo 2 pi; the rates determine the number of whole turns."""
     step = np.diff(time).reshape(-1, *[1] * (angle.ndim - 1))
-    foreseen = 0.5 * step * (rate[1:] + rate[:-1])
+    predicted = 0.5 * step * (rate[1:] + rate[:-1])
     change = np.diff(angle, axis=0)
-    change = change + 2.0 * np.pi * np.round((foreseen - change) / (2.0 * np.pi))
+    change = change + 2.0 * np.pi * np.round((predicted - change) / (2.0 * np.pi))
     return np.concatenate([angle[:1], angle[:1] + np.cumsum(change, axis=0)])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxvib.draw.machine.svg import svg
 from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
-from jaxvib.show.sketch import checked_scene
+from jaxvib.show.sketch import drawable_scene
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose, RotorPose, at_rest, caption, places_of
 from jaxvib.steady.jams.jam import Jam
@@ -22,7 +22,7 @@ _PERIOD_SECONDS = 1.6
 def moving_svg(scene: Scene, jam: Jam) -> str:
     """Return the sketch of a scene that moves in a jam mode, with the forces on the foundation as arrows.
 
-    The rotor turns at its own speed, faster than the loads. Coincident loads are drawn at the same place.
+    The rotor turns faster than the loads. Coincident loads are drawn at the same place.
 
     **Arguments**: `scene` of platforms, and a `jam` of it, from `jam_modes`.
 
@@ -36,7 +36,7 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     >>> moving_svg(scene, jv.jam_modes(scene).select(1)).count("<animate") > 10
     True
     """
-    view = view_of(checked_scene(scene))
+    view = view_of(drawable_scene(scene))
     omega, amplitude = float(jam.omega), np.asarray(jam.displacement)
     if not np.isfinite(omega) or not np.isfinite(amplitude).all():
         raise ComputationError("absent", f"jam mode {int(jam.mode)} cannot be shown:  {jam.message}")
@@ -45,21 +45,23 @@ def moving_svg(scene: Scene, jam: Jam) -> str:
     wave = np.exp(1j * theta)[:, None] * amplitude
     displacement, velocity = np.real(wave), np.real(1j * omega * wave)
     angles = theta[:, None] + np.zeros_like(first)
-    own = places_of(scene.loads, (angles, *others))  # one call for all poses
+    load_positions = places_of(scene.loads, (angles, *others))  # one call for all poses
     poses = [
-        Pose(q, v, (RotorPose((angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in own]),))
+        Pose(q, v, (RotorPose((angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in load_positions]),))
         for k, (q, v, angle) in enumerate(zip(displacement, velocity, angles, strict=True))
     ]
     forces = [view.support_forces(pose) for pose in poses]
     totals = [np.array([force[:, 1].sum()]) for force in forces]
-    most = max(float(np.max(np.abs(np.concatenate([np.ravel(x) for x in (*forces, *totals)])))), 1e-300)
+    largest_force = max(float(np.max(np.abs(np.concatenate([np.ravel(x) for x in (*forces, *totals)])))), 1e-300)
     magnified = view.magnified(displacement)
     reach = magnified * view.scale
-    frames = [[*view.parts(p, reach), *view.arrows(p, total, 0.7 / most)] for p, total in zip(poses, totals, strict=True)]
+    frames = [
+        [*view.parts(p, reach), *view.arrows(p, total, 0.7 / largest_force)] for p, total in zip(poses, totals, strict=True)
+    ]
     slower = _PERIOD_SECONDS * omega / (2.0 * np.pi)
     head = (
         f"{caption(scene)}\njam mode {int(jam.mode)}, {jam.judgement}: slowed down {slower:.3g} x, displacements drawn "
-        f"{magnified:.3g} x as large, longest arrow {most:.3g} N"
+        f"{magnified:.3g} x as large, longest arrow {largest_force:.3g} N"
     )
     return svg(
         view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _PERIOD_SECONDS, float(jam.rotor_speed) / omega
@@ -74,5 +76,5 @@ def sketch_svg(scene: Scene) -> str:
     >>> "M = " in sketch_svg(jv.scene_from_toml(TEMPLATES["planar_rotor"]))
     True
     """
-    view, pose = view_of(checked_scene(scene)), at_rest(scene)
+    view, pose = view_of(drawable_scene(scene)), at_rest(scene)
     return svg(view.limits, [view.parts(pose, 0.0)], [view.texts(pose, 0.0)], caption(scene), _PERIOD_SECONDS, 0.0)

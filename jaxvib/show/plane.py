@@ -12,28 +12,29 @@ from jaxvib.draw.style import COLORS, Look
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.structures.plane_body import PlaneBody
 from jaxvib.show.view import BODY, FOUNDATION, View, tie_parts
-from jaxvib.show.wheel import Pose, Wheel, shown
+from jaxvib.show.wheel import Pose, Wheel, value_text
 
 _WIDTH = 6.0
 """Width of the area of a body, in units of the drawing, that contains the points to which something is attached."""
 
-_MARGIN = 0.32
+_OUTLINE_MARGIN = 0.32
 """Distance of the outline of a body from the points of its supports, and from the rims of its exciters."""
 
-_SPRING = 1.6
+_SPRING_LENGTH = 1.6
 """Length of a spring from the body to the foundation, in units of the drawing."""
 
-_TURN: Look = {"color": COLORS[1], "zorder": 3.7}
+_TURN_STYLE: Look = {"color": COLORS[1], "zorder": 3.7}
 
 _STEEP_SPRING_SINE = np.sin(np.radians(40.0))
-"""Sine of the angle to the horizontal above which a spring is drawn downward; a flatter one is drawn sideways."""
+"""Sine of the angle to the horizontal above which a spring is drawn downward; a flatter spring is drawn sideways."""
 
 
 class _Strut(NamedTuple):
     """Spring with its damper, from the body to the foundation.
 
-    **Attributes**: `support`: index of its support; `start`: its end on the body; `way`: the vector from there to its end on
-    the foundation; `along`: unit vector of its direction (angle of the support, plus a right angle for the second spring).
+    **Attributes**: `support`: index of its support; `start`: its end on the body; `way`: the vector from `start` to its end on
+    the foundation; `along`: unit vector of its direction (angle of the support, plus a right angle for the second spring);
+    `stiffness`, N/m; `damping`, N s/m.
     """
 
     support: int
@@ -45,85 +46,91 @@ class _Strut(NamedTuple):
 
 
 class PlaneView(View):
-    """Body to scale, with its outline about the points to which something is attached. Springs have no scale."""
+    """Drawing of a body to scale, with its outline about the points to which something is attached. Springs are not to
+    scale."""
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
         machine = scene.machine
         assert isinstance(machine, PlaneBody)
-        self._supports = [np.asarray(each.at, float) for each in machine.supports]
-        self._axes = [np.zeros(2) if each.position is None else np.asarray(each.position, float) for each in scene.exciters]
+        self._supports = [np.asarray(item.at, float) for item in machine.supports]
+        self._axes = [np.zeros(2) if item.position is None else np.asarray(item.position, float) for item in scene.exciters]
         points = np.array([*self._supports, *self._axes, np.zeros(2)])
         span = np.ptp(points, axis=0)
         self.scale = _WIDTH / max(float(span[0]), 1.6 * float(span[1]), 1e-9)
-        away = [float(np.hypot(*(one - other))) for k, one in enumerate(self._axes) for other in self._axes[:k]]
-        nearest = self.scale * min((x for x in away if x > 0.0), default=1.0)
+        distances = [float(np.hypot(*(first - second))) for k, first in enumerate(self._axes) for second in self._axes[:k]]
+        nearest = self.scale * min((x for x in distances if x > 0.0), default=1.0)
         self.wheels = [Wheel(exciter, float(np.clip(0.33 * nearest, 0.12, 0.3))) for exciter in scene.exciters]
         self.struts = [strut for k in range(len(self._supports)) for strut in self._struts(k, points)]
-        radii = [_MARGIN] * len(self._supports) + [_MARGIN + wheel.rim for wheel in self.wheels] + [_MARGIN]
+        radii = (
+            [_OUTLINE_MARGIN] * len(self._supports) + [_OUTLINE_MARGIN + wheel.rim for wheel in self.wheels] + [_OUTLINE_MARGIN]
+        )
         outline = _hull(np.concatenate([circle(tuple(at), r, 41) for at, r in zip(self.scale * points, radii, strict=True)]))
-        moved = [*(outline / self.scale), *self._supports, *self._axes, np.zeros(2)]
-        self._rows = np.stack([np.asarray(machine.rows_at(jnp.asarray(at))) for at in moved])
-        self._moved, self._corners = np.asarray(moved), len(outline)
+        points_of_body = [*(outline / self.scale), *self._supports, *self._axes, np.zeros(2)]
+        self._rows = np.stack([np.asarray(machine.rows_at(jnp.asarray(at))) for at in points_of_body])
+        self._moved, self._corners = np.asarray(points_of_body), len(outline)
         self._below = 0.5 * float(np.min(outline[:, 0]) + np.max(outline[:, 0])), float(np.min(outline[:, 1])) - 0.12
         self.limits = self._limits(outline)
 
     def _struts(self, k: int, points: np.ndarray) -> list[_Strut]:
-        """Return the springs of a support, each downward if it is steep, otherwise away from the middle of the body."""
-        each = self.scene.machine.supports[k]  # pyright: ignore[reportAttributeAccessIssue]
-        found = []
+        """Return the springs of support `k`. A steep spring is drawn downward, a flat one away from the middle of the body."""
+        support = self.scene.machine.supports[k]  # pyright: ignore[reportAttributeAccessIssue]
+        struts = []
         for j in range(2):
-            angle = float(each.angle) + 0.5 * np.pi * j
+            angle = float(support.angle) + 0.5 * np.pi * j
             along = np.array([np.cos(angle), np.sin(angle)])
             outward = np.sign(self._supports[k][0] - np.mean(points[:, 0])) or 1.0
             sign = -np.sign(along[1]) if abs(along[1]) > _STEEP_SPRING_SINE else outward * np.sign(along[0])
-            values = float(each.stiffness[j]), float(each.damping[j])
+            values = float(support.stiffness[j]), float(support.damping[j])
             if max(values) > 0.0:
-                found.append(_Strut(k, self.scale * self._supports[k], _SPRING * sign * along, along, *values))
-        return found
+                struts.append(_Strut(k, self.scale * self._supports[k], _SPRING_LENGTH * sign * along, along, *values))
+        return struts
 
     def _limits(self, outline: np.ndarray) -> tuple[float, float, float, float]:
-        every = np.concatenate([outline, *([strut.start + strut.way] for strut in self.struts)])
+        points = np.concatenate([outline, *([strut.start + strut.way] for strut in self.struts)])
         tops = [self.scale * at + 2.0 * wheel.rim for at, wheel in zip(self._axes, self.wheels, strict=True)]
-        every = np.concatenate([every, tops])
-        (left, bottom), (right, top) = np.min(every, axis=0), np.max(every, axis=0)
+        points = np.concatenate([points, tops])
+        (left, bottom), (right, top) = np.min(points, axis=0), np.max(points, axis=0)
         return float(left) - 0.8, float(right) + 1.7, float(bottom) - 1.0, float(top) + 0.3
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation, springs and dampers, the body, its centre of mass, the exciters."""
-        now = self.scale * self._moved + reach * self._rows @ pose.displacement
-        corners, rest = now[: self._corners], now[self._corners :]
+        positions = self.scale * self._moved + reach * self._rows @ pose.displacement
+        corners, rest = positions[: self._corners], positions[self._corners :]
         ends, axes, centre = rest[: len(self._supports)], rest[len(self._supports) : -1], rest[-1]
-        found = []
+        parts = []
         for strut in self.struts:
             end = strut.start + strut.way
-            side = 0.4 * np.array([strut.way[1], -strut.way[0]]) / _SPRING
-            found.append(Part(ground(tuple(end - side), tuple(end + side)), FOUNDATION))
-            found += tie_parts(tuple(ends[strut.support]), tuple(end), strut.stiffness, strut.damping, _SPRING)
-        found.append(Part(corners, BODY, True))
-        found += [Part(circle(tuple(at), 0.06, 15), {"fc": "black", "ec": "none", "zorder": 2.8}, True) for at in ends]
-        found += _centre_mark(centre)
+            side = 0.4 * np.array([strut.way[1], -strut.way[0]]) / _SPRING_LENGTH
+            parts.append(Part(ground(tuple(end - side), tuple(end + side)), FOUNDATION))
+            parts += tie_parts(tuple(ends[strut.support]), tuple(end), strut.stiffness, strut.damping, _SPRING_LENGTH)
+        parts.append(Part(corners, BODY, True))
+        parts += [Part(circle(tuple(at), 0.06, 15), {"fc": "black", "ec": "none", "zorder": 2.8}, True) for at in ends]
+        parts += _centre_mark(centre)
         for at, wheel, rotor in zip(axes, self.wheels, pose.rotors, strict=True):
-            found += wheel.parts((float(at[0]), float(at[1])), rotor)
+            parts += wheel.parts((float(at[0]), float(at[1])), rotor)
             arc, head = turning_arrow((float(at[0]), float(at[1])), wheel.rim + 0.13, wheel.direction)
-            found += [Part(arc, {**_TURN, "lw": 1.6}), Part(head, {"fc": _TURN["color"], "ec": "none", "zorder": 3.7}, True)]
-        return found
+            parts += [
+                Part(arc, {**_TURN_STYLE, "lw": 1.6}),
+                Part(head, {"fc": _TURN_STYLE["color"], "ec": "none", "zorder": 3.7}, True),
+            ]
+        return parts
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return mass and inertia of the body, the values of the supports, the numbers of the exciters."""
         small: Look = {"fontsize": "small"}
         mass, inertia = float(self.mass[0, 0]), float(self.mass[2, 2])
-        words = f"M = {shown(mass, 'kg')}, J = {shown(inertia, 'kg m²')}"
+        words = f"M = {value_text(mass, 'kg')}, J = {value_text(inertia, 'kg m²')}"
         bottom = self.limits[2]
-        found = [Text(*self._below, words, {**small, "ha": "center", "va": "top"})]
-        seen: dict[int, list[_Strut]] = {}
+        texts = [Text(*self._below, words, {**small, "ha": "center", "va": "top"})]
+        struts_of_support: dict[int, list[_Strut]] = {}
         for strut in self.struts:
-            seen.setdefault(strut.support, []).append(strut)
-        for struts in seen.values():
+            struts_of_support.setdefault(strut.support, []).append(strut)
+        for struts in struts_of_support.values():
             lowest = min(struts, key=lambda strut: float((strut.start + strut.way)[1]))
             x, y = lowest.start + lowest.way
             lines = [_pair([s.stiffness for s in struts], "N/m"), _pair([s.damping for s in struts], "N s/m")]
-            found.append(
+            texts.append(
                 Text(
                     float(x),
                     max(float(y) - 0.25, bottom + 0.05),
@@ -135,21 +142,21 @@ class PlaneView(View):
             for k, (at, wheel) in enumerate(zip(self._axes, self.wheels, strict=True)):
                 x, y = self.scale * at
                 look: Look = {"fontsize": "x-small", "ha": "center", "va": "top"}
-                found.append(Text(float(x), float(y) - wheel.rim - 0.05, str(k), look))
-        return found
+                texts.append(Text(float(x), float(y) - wheel.rim - 0.05, str(k), look))
+        return texts
 
     def supports(self) -> list[tuple[float, float]]:
         """Return the points of the supports on the body."""
         return [tuple((self.scale * at).tolist()) for at in self._supports]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return the force of each support on the foundation, both springs and dampers together."""
+        """Return the force of each support on the foundation (supports, 2), N: the sum over its two springs and dampers."""
         rows = self._rows[self._corners : self._corners + len(self._supports)]
-        moved, rate = rows @ pose.displacement, rows @ pose.velocity
+        displacement, rate = rows @ pose.displacement, rows @ pose.velocity
         force = np.zeros((len(self._supports), 2))
         for strut in self.struts:
             k = strut.support
-            force[k] += (strut.stiffness * strut.along @ moved[k] + strut.damping * strut.along @ rate[k]) * strut.along
+            force[k] += (strut.stiffness * strut.along @ displacement[k] + strut.damping * strut.along @ rate[k]) * strut.along
         return force
 
 
@@ -157,7 +164,7 @@ def _pair(values: list[float], unit: str) -> str:
     """Return the values of both springs of a support; "" if all are 0."""
     if not any(values):
         return ""
-    return " | ".join(shown(value, unit) for value in dict.fromkeys(values))
+    return " | ".join(value_text(value, unit) for value in dict.fromkeys(values))
 
 
 def _centre_mark(at: np.ndarray) -> list[Part]:
@@ -165,7 +172,7 @@ def _centre_mark(at: np.ndarray) -> list[Part]:
     quarters = [np.concatenate([[at], at + 0.12 * _arc(begin), [at]]) for begin in (0.0, np.pi)]
     look = {"fc": "black", "ec": "none", "zorder": 2.9}
     rim = Part(circle((float(at[0]), float(at[1])), 0.12, 25), {"color": "black", "lw": 0.8, "zorder": 2.9})
-    return [rim, *(Part(each, look, True) for each in quarters)]
+    return [rim, *(Part(quarter, look, True) for quarter in quarters)]
 
 
 def _arc(begin: float) -> np.ndarray:
@@ -178,15 +185,15 @@ def _hull(points: np.ndarray) -> np.ndarray:
     ordered = sorted(map(tuple, np.round(points, 9).tolist()))
 
     def chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-        found: list[tuple[float, float]] = []
+        corners: list[tuple[float, float]] = []
         for x, y in points:
-            while len(found) > 1:
-                (ax, ay), (bx, by) = found[-2:]
+            while len(corners) > 1:
+                (ax, ay), (bx, by) = corners[-2:]
                 if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0.0:
                     break
-                found.pop()
-            found.append((x, y))
-        return found[:-1]
+                corners.pop()
+            corners.append((x, y))
+        return corners[:-1]
 
     outline = chain(ordered) + chain(ordered[::-1])
     return np.array([*outline, outline[0]])

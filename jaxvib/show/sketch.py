@@ -20,10 +20,10 @@ from jaxvib.show.wheel import at_rest, caption
 from jaxvib.steady.points import Deck
 from jaxvib.units.known import require_known
 
-_INCH = 0.62
+_INCHES_PER_UNIT = 0.62
 """Inches per unit of a drawing."""
 
-_LETTER = 0.072
+_LETTER_WIDTH = 0.072
 """Mean width of a letter of a small text, inches."""
 
 Limits = tuple[float, float, float, float]
@@ -42,8 +42,8 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
     **Arguments**
 
     - `scene` with any kind of machine
-    - `deck`: the motion of points of a body in a plane, from `Run.deck`; their ellipses are drawn, magnified
-    - `ax`: axes to draw onto
+    - `deck`: the motion of points of a body in a plane, from `Run.deck`, whose magnified ellipses are drawn; default: none
+    - `ax`: axes to draw onto; default: a new figure
 
     **Returns** a matplotlib figure, or the given `ax`.
 
@@ -56,12 +56,12 @@ def sketch(scene: Scene, *, deck: Deck | None = None, ax: Axes | None = None) ->
     >>> [text.get_text() for text in jv.sketch(scene).axes[0].texts][:2]
     ['40 N/mm\\n30 N s/m', 'M1 = 50 kg']
     """
-    view = view_of(checked_scene(scene))
+    view = view_of(drawable_scene(scene))
     pose, title = at_rest(scene), caption(scene)
     parts, texts = view.parts(pose, 0.0), view.texts(pose, 0.0)
     limits = left, right, bottom, top = _limits(parts, texts)
-    wide = max(_INCH * (right - left), _LETTER * max(map(len, title.splitlines())))
-    tall = _INCH * (top - bottom) + 0.25 + 0.18 * len(title.splitlines())
+    wide = max(_INCHES_PER_UNIT * (right - left), _LETTER_WIDTH * max(map(len, title.splitlines())))
+    tall = _INCHES_PER_UNIT * (top - bottom) + 0.25 + 0.18 * len(title.splitlines())
     figure, (axis,) = panels(1, size=(wide, tall), ax=ax)
     fit(axis, limits)
     for part in parts:
@@ -82,7 +82,7 @@ def _limits(parts: Sequence[Part], texts: Sequence[Text]) -> Limits:
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     for text in texts:
         lines = text.text.splitlines()
-        width, height = _LETTER / _INCH * max(map(len, lines)), 0.17 / _INCH * len(lines)
+        width, height = _LETTER_WIDTH / _INCHES_PER_UNIT * max(map(len, lines)), 0.17 / _INCHES_PER_UNIT * len(lines)
         across = {"center": 0.5, "right": 1.0}.get(text.look.get("ha", "left"), 0.0)
         up = {"center": 0.5, "top": 1.0}.get(text.look.get("va", "baseline"), 0.0)
         corner = np.array([text.x - across * width, text.y - up * height])
@@ -107,7 +107,7 @@ def _draw_deck(axis: Axes, view: View, deck: Deck, limits: Limits) -> None:
     axis.text(right, bottom, note, ha="right", va="bottom", fontsize="x-small", color="#555555")
 
 
-def checked_scene(scene: object) -> Scene:
+def drawable_scene(scene: object) -> Scene:
     """Return the scene. **Raises** `InputError` for an object that is not a scene, and for a scene with traced numbers."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")

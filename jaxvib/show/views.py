@@ -13,7 +13,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.plane import PlaneView
 from jaxvib.show.view import BODY, FOUNDATION, RotorView, View, spring_text, tie_parts
-from jaxvib.show.wheel import Pose, places_of, shown
+from jaxvib.show.wheel import Pose, places_of, value_text
 
 
 class Tie(NamedTuple):
@@ -36,7 +36,7 @@ class Tie(NamedTuple):
 
 
 def order_of_ties(ties: list[Tie], levels: int) -> list[int]:
-    """Return an order of the ties from left to right for which few ties cross other platforms and platforms are short.
+    """Return an order of the ties from left to right with which few ties cross other platforms and the platforms are short.
 
     Pairs of ties are swapped until no swap is an improvement.
 
@@ -49,8 +49,8 @@ def order_of_ties(ties: list[Tie], levels: int) -> list[int]:
         place = {tie: x for x, tie in enumerate(order)}
         spans = []
         for level in range(1, levels + 1):
-            own = [place[k] for k, tie in enumerate(ties) if level in (tie.low, tie.high)]
-            spans.append((min(own), max(own)) if own else (0, 0))
+            places = [place[k] for k, tie in enumerate(ties) if level in (tie.low, tie.high)]
+            spans.append((min(places), max(places)) if places else (0, 0))
         crossed = sum(
             spans[level - 1][0] < place[k] < spans[level - 1][1]
             for k, tie in enumerate(ties)
@@ -63,13 +63,13 @@ def order_of_ties(ties: list[Tie], levels: int) -> list[int]:
         swaps = [(i, j) for i in range(len(order)) for j in range(i)]
         candidates = []
         for i, j in swaps:
-            other = order.copy()
-            other[i], other[j] = other[j], other[i]
-            candidates.append((cost(other), other))
-        least, other = min(candidates, default=(best, order))
-        if not least < best - 1e-12:
+            swapped = order.copy()
+            swapped[i], swapped[j] = swapped[j], swapped[i]
+            candidates.append((cost(swapped), swapped))
+        lowest_cost, swapped = min(candidates, default=(best, order))
+        if not lowest_cost < best - 1e-12:
             return order
-        best, order = least, other
+        best, order = lowest_cost, swapped
 
 
 class PlatformView(RotorView):
@@ -95,8 +95,8 @@ class PlatformView(RotorView):
         self.x = {k: float(starts[p] + (0.5 * widths[p] if self.ties[k].exciter else 0.45)) for p, k in enumerate(order)}
         self.spans = []
         for level in range(1, n + 1):
-            own = [p for p, k in enumerate(order) if level in (self.ties[k].low, self.ties[k].high)]
-            self.spans.append((float(starts[own[0]]), float(starts[own[-1] + 1])) if own else (0.0, self.lane))
+            places = [p for p, k in enumerate(order) if level in (self.ties[k].low, self.ties[k].high)]
+            self.spans.append((float(starts[places[0]]), float(starts[places[-1] + 1])) if places else (0.0, self.lane))
         self.width = float(starts[-1])
         self.limits = (-0.3, max(self.width + 1.3, 6.5), -0.9, (n + 0.55) * self.pitch + 0.2)
 
@@ -105,36 +105,36 @@ class PlatformView(RotorView):
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """Return the foundation, the springs and dampers, the platforms, the exciter."""
-        found = [Part(ground((-0.2, 0.0), (self.width, 0.0)), FOUNDATION)]
+        parts = [Part(ground((-0.2, 0.0), (self.width, 0.0)), FOUNDATION)]
         for k, tie in enumerate(self.ties):
             if not tie.exciter:
                 low, high = (self._height(level, pose, reach) for level in (tie.low, tie.high))
                 low += 0.5 * self.thick if tie.low else 0.0
                 length = (tie.high - tie.low) * self.pitch - self.thick
                 ends = (self.x[k], low), (self.x[k], high - 0.5 * self.thick)
-                found += tie_parts(*ends, tie.stiffness, tie.damping, length)
+                parts += tie_parts(*ends, tie.stiffness, tie.damping, length)
         for level, (left, right) in enumerate(self.spans, start=1):
             y = self._height(level, pose, reach)
-            found.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), BODY, True))
-        return found + self.wheel.parts((self.x[len(self.ties) - 1], self._height(self.exciter, pose, reach)), pose.rotors[0])
+            parts.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), BODY, True))
+        return parts + self.wheel.parts((self.x[len(self.ties) - 1], self._height(self.exciter, pose, reach)), pose.rotors[0])
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return the masses on the platforms and the values beside the springs."""
-        found = []
+        texts = []
         for k, tie in enumerate(self.ties):
             if not tie.exciter:
                 middle = 0.5 * self.pitch * (tie.low + tie.high if tie.high - tie.low == 1 else 2 * tie.high - 1)
                 place = (self.x[k] + 0.42, middle)
-                found.append(Text(*place, spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
+                texts.append(Text(*place, spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
         for level, (left, right) in enumerate(self.spans, start=1):
             # The text is on the longer piece of the platform beside the exciter.
             x = self.x[len(self.ties) - 1]
             edges = [(left, x - self.wheel.rim), (x + self.wheel.rim, right)] if level == self.exciter else [(left, right)]
             a, b = max(edges, key=lambda edge: edge[1] - edge[0])
-            text = f"M{level} = {shown(float(self.mass[level - 1, level - 1]), 'kg')}"
+            text = f"M{level} = {value_text(float(self.mass[level - 1, level - 1]), 'kg')}"
             place = (0.5 * (a + b), self._height(level, pose, reach))
-            found.append(Text(*place, text, {"ha": "center", "va": "center", "fontsize": "small"}))
-        return found
+            texts.append(Text(*place, text, {"ha": "center", "va": "center", "fontsize": "small"}))
+        return texts
 
     def supports(self) -> list[tuple[float, float]]:
         """Return the lower ends of the supports."""
@@ -167,47 +167,49 @@ class FrontView(RotorView):
         x, y = self._centre(pose, reach)
         k, c = self.foundation_stiffness[1], self.foundation_damping[1]
         stiffness, damping = float(np.max(k)), float(np.max(c))
-        found = [Part(ground((-1.2, -2.4), (1.6, -2.4)), FOUNDATION), Part(ground((-2.7, 1.2), (-2.7, -1.6)), FOUNDATION)]
-        found += tie_parts((x, -2.4), (x, y - self.wheel.rim), stiffness, damping)
-        found += tie_parts((-2.7, y), (x - self.wheel.rim, y), stiffness, damping)
-        found += self.wheel.parts((x, y), pose.rotors[0])
-        return found + (self._section(pose) if self.section else [])
+        parts = [Part(ground((-1.2, -2.4), (1.6, -2.4)), FOUNDATION), Part(ground((-2.7, 1.2), (-2.7, -1.6)), FOUNDATION)]
+        parts += tie_parts((x, -2.4), (x, y - self.wheel.rim), stiffness, damping)
+        parts += tie_parts((-2.7, y), (x - self.wheel.rim, y), stiffness, damping)
+        parts += self.wheel.parts((x, y), pose.rotors[0])
+        return parts + (self._section(pose) if self.section else [])
 
     def _section(self, pose: Pose) -> list[Part]:
         """Return the magnified cross-section of the track with the balls in it; the axis is on the left."""
         loads = self.scene.loads
         first, *others = (np.asarray(u, float) for u in loads.rest())
         turn = np.linspace(0.0, 2.0 * np.pi, 61)
-        round_it = [np.full_like(turn, first[0]), turn, *(np.full_like(turn, u[0]) for u in others[1:])]
-        across, up, along = places_of(loads, round_it)
-        away = np.hypot(across, up)
-        middle = 0.5 * (np.max(away) + np.min(away))
-        own = float(getattr(loads, "ball_radius", 0.0))
-        scale = 0.85 / (0.5 * np.ptp(away) + own)
+        circle_points = [np.full_like(turn, first[0]), turn, *(np.full_like(turn, u[0]) for u in others[1:])]
+        across, up, along = places_of(loads, circle_points)
+        distance = np.hypot(across, up)
+        middle = 0.5 * (np.max(distance) + np.min(distance))
+        ball_radius = float(getattr(loads, "ball_radius", 0.0))
+        scale = 0.85 / (0.5 * np.ptp(distance) + ball_radius)
         centre = np.array([3.2, 0.0])
-        found = [Part(circle(tuple(centre), 0.85), {"fc": "white", "ec": "black", "lw": 1.4, "zorder": 3}, True)]
-        found.append(
-            Part(centre + scale * np.stack([away - middle, along], 1), {"color": GUIDE, "ls": ":", "lw": 0.8, "zorder": 3.1})
+        parts = [Part(circle(tuple(centre), 0.85), {"fc": "white", "ec": "black", "lw": 1.4, "zorder": 3}, True)]
+        parts.append(
+            Part(
+                centre + scale * np.stack([distance - middle, along], 1), {"color": GUIDE, "ls": ":", "lw": 0.8, "zorder": 3.1}
+            )
         )
         across, up, along = (np.broadcast_to(x, (loads.count,)) for x in places_of(loads, pose.rotors[0].angle))
         places = centre + scale * np.stack([np.hypot(across, up) - middle, along], 1)
         for j, place in enumerate(places):
-            behind = np.sum(np.hypot(*(places[:j] - place).T) < 0.02)  # balls that a ball of the same size would cover
+            hidden_count = np.sum(np.hypot(*(places[:j] - place).T) < 0.02)  # balls that a ball of the same size would cover
             look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "lw": 0.8, "zorder": 3.5 + 0.01 * j}
-            found.append(Part(circle(tuple(place), max(scale * own, 0.08) * 0.75**behind, 31), look, True))
-        return found
+            parts.append(Part(circle(tuple(place), max(scale * ball_radius, 0.08) * 0.75**hidden_count, 31), look, True))
+        return parts
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return the mass, and the values of the supports, which are equal in both directions."""
         label = spring_text(float(np.max(self.foundation_stiffness[1])), float(np.max(self.foundation_damping[1])))
         small: Look = {"fontsize": "small"}
-        mass = f"M = {shown(float(self.mass[0, 0]), 'kg')}"
-        found = [
+        mass = f"M = {value_text(float(self.mass[0, 0]), 'kg')}"
+        texts = [
             Text(0.55, -1.75, label, {**small, "va": "center"}),
             Text(-1.95, 0.62, label, {**small, "ha": "center", "va": "center"}),
             Text(1.05, 1.2, mass, small),
         ]
-        return [*found, Text(3.2, -1.15, "section of the track,\naxis to the left", {**small, "ha": "center", "va": "top"})][
+        return [*texts, Text(3.2, -1.15, "section of the track,\naxis to the left", {**small, "ha": "center", "va": "top"})][
             : 4 if self.section else 3
         ]
 
@@ -216,7 +218,7 @@ class FrontView(RotorView):
         return [(0.0, -2.4), (-2.7, 0.0)]
 
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """Return the vertical component of T_K q + T_C q' on the foundation and the horizontal one on the wall.
+        """Return the vertical component of T_K q + T_C q' as force on the foundation, the horizontal one as force on the wall.
 
         T_K is `foundation_stiffness`, T_C is `foundation_damping`.
         """
@@ -251,47 +253,47 @@ class ShaftView(RotorView):
         return reach * float(self._rows(float(s))[axis] @ pose.displacement)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """Return foundation, supports, shaft and body, a disc with loads at each station, and the rotor along its axis."""
-        found = [Part(ground((-3.2, -2.2), (3.2, -2.2)), FOUNDATION)]
+        """Return foundation, supports, shaft and body, a disc with loads at each station, and the rotor seen along its axis."""
+        parts = [Part(ground((-3.2, -2.2), (3.2, -2.2)), FOUNDATION)]
         for s, k, c in self.stands:
-            found += tie_parts((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
+            parts += tie_parts((self._x(s), -2.2), (self._x(s), self._y(s, pose, reach)), k, c)
         ends = [self.middle - 3.1 / self.along, self.middle + 3.1 / self.along]
         line = np.array([[self._x(s), self._y(s, pose, reach)] for s in ends])
-        found.append(Part(line, {"color": "black", "lw": 3.5, "zorder": 2.6, "solid_capstyle": "round"}))
+        parts.append(Part(line, {"color": "black", "lw": 3.5, "zorder": 2.6, "solid_capstyle": "round"}))
         body = [-0.9 / self.along, 0.9 / self.along]
         corners = [(s, side) for s, side in ((body[0], -1), (body[1], -1), (body[1], 1), (body[0], 1))]
         points = np.array([[self._x(s), self._y(s, pose, reach) + 0.38 * side] for s, side in corners])
-        found.append(Part(points, BODY, True))
+        parts.append(Part(points, BODY, True))
         for s in np.unique(self.stations):
             x, y = self._x(s), self._y(s, pose, reach)
             disc = box(x - 0.09, x + 0.09, y - self.wheel.rim, y + self.wheel.rim)
-            found.append(Part(disc, {"fc": "#f4f4f4", "ec": "black", "lw": 1.2, "zorder": 3.0}, True))
+            parts.append(Part(disc, {"fc": "#f4f4f4", "ec": "black", "lw": 1.2, "zorder": 3.0}, True))
         up = [] if self.wheel.loads is None else self.wheel.places(pose.rotors[0])[1]
         for j, (s, _) in enumerate(zip(self.stations, up, strict=False)):
             place = (self._x(s), self._y(s, pose, reach) + float(up[j]))
             look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "lw": 0.8, "zorder": 3.4 + 0.01 * j}
-            found.append(Part(circle(place, self.wheel.size, 31), look, True))
+            parts.append(Part(circle(place, self.wheel.size, 31), look, True))
         centre = (self.front + self._y(0.0, pose, reach, 0), self._y(0.0, pose, reach))
-        return found + self.wheel.parts(centre, pose.rotors[0])
+        return parts + self.wheel.parts(centre, pose.rotors[0])
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Return mass, inertias and supports, and the positions of supports and stations from the centre of mass."""
         small: Look = {"fontsize": "small"}
-        turning = self.mount.gyroscopic
-        inertia = f"M = {shown(float(self.mass[0, 0]), 'kg')}\nA = {shown(float(self.mass[2, 2]), 'kg m²')}"
-        if turning is not None:
-            inertia += f"\nC = {shown(float(np.max(np.abs(np.asarray(turning)))), 'kg m²')}"
-        found = [Text(self._x(0.0), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
+        gyroscopic = self.mount.gyroscopic
+        inertia = f"M = {value_text(float(self.mass[0, 0]), 'kg')}\nA = {value_text(float(self.mass[2, 2]), 'kg m²')}"
+        if gyroscopic is not None:
+            inertia += f"\nC = {value_text(float(np.max(np.abs(np.asarray(gyroscopic)))), 'kg m²')}"
+        texts = [Text(self._x(0.0), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
         for s, k, c in self.stands:
             text = f"{spring_text(k, c)}\nat {1e3 * s:+.4g} mm"
             right = s >= 0.0
             place = self._x(s) + (0.42 if right else -0.42)
-            found.append(Text(place, -1.55, text, {**small, "va": "center", "ha": "left" if right else "right"}))
-        shown_at = sorted({round(1e3 * float(s), 6) for s in self.stations})
-        label = ", ".join(f"{s:+.4g}" for s in shown_at) + " mm"
-        found.append(Text(0.0, 1.3, f"loads at {label}", {**small, "ha": "center", "va": "bottom"}))
-        found.append(Text(self.front, -1.2, "along the axis", {**small, "ha": "center", "va": "top"}))
-        return found
+            texts.append(Text(place, -1.55, text, {**small, "va": "center", "ha": "left" if right else "right"}))
+        stations = sorted({round(1e3 * float(s), 6) for s in self.stations})
+        label = ", ".join(f"{s:+.4g}" for s in stations) + " mm"
+        texts.append(Text(0.0, 1.3, f"loads at {label}", {**small, "ha": "center", "va": "bottom"}))
+        texts.append(Text(self.front, -1.2, "along the axis", {**small, "ha": "center", "va": "top"}))
+        return texts
 
     def supports(self) -> list[tuple[float, float]]:
         """Return the lower ends of the supports."""

@@ -1,4 +1,4 @@
-"""Rotor with its loads, seen along its axis, and numbers in the units of a drawing."""
+"""Drawing of a rotor with its loads, seen along its axis, and texts with the values of a machine."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from jaxvib.machine.scene import Exciter, Scene
 class RotorPose(NamedTuple):
     """Positions of a rotor and its loads at an instant.
 
-    **Attributes**: `angle`, the angles of the loads and their further coordinates if there are any, (count,) each; `turn`, the
-    angle of the rotor, rad; `positions` of the loads relative to the centre of the rotor, (count,) for each direction, or None
-    if they have not been computed yet.
+    **Attributes**: `angle`: arrays (count,) with the angles of the loads, rad, and with further coordinates of the loads, if
+    any; `turn`: the angle of the rotor, rad; `positions`: arrays (count,) with the positions of the loads relative to the
+    centre of the rotor, m, one for each direction, or None if they are not computed yet.
     """
 
     angle: tuple[np.ndarray, ...]
@@ -33,7 +33,7 @@ class RotorPose(NamedTuple):
 class Pose(NamedTuple):
     """Positions of all parts at an instant.
 
-    **Attributes**: `displacement` (nd,) m and `velocity` (nd,) m/s, for tilts rad and rad/s; `rotors`, a `RotorPose` for each
+    **Attributes**: `displacement` (nd,), m, and `velocity` (nd,), m/s (tilts: rad, rad/s); `rotors`: a `RotorPose` for each
     exciter.
     """
 
@@ -52,10 +52,10 @@ _UNITS = {
 }
 
 
-def shown(value: float, unit: str) -> str:
-    """Return a number with its unit as a drawing shows it.
+def value_text(value: float, unit: str) -> str:
+    """Return an SI value as text with the unit that drawings use.
 
-    >>> shown(5e4, "N/m"), shown(0.12, "m"), shown(0.05, "kg")
+    >>> value_text(5e4, "N/m"), value_text(0.12, "m"), value_text(0.05, "kg")
     ('50 N/mm', '120 mm', '50 g')
     """
     choices = _UNITS[unit]
@@ -64,9 +64,9 @@ def shown(value: float, unit: str) -> str:
 
 
 def _span(values: np.ndarray, unit: str) -> str:
-    """Return the common value of several numbers, or their range."""
+    """Return the common value of several numbers, or their range, as text."""
     low, high = float(np.min(values)), float(np.max(values))
-    return shown(low, unit) if high - low <= 1e-12 * abs(high) else f"{shown(low, unit)} to {shown(high, unit)}"
+    return value_text(low, unit) if high - low <= 1e-12 * abs(high) else f"{value_text(low, unit)} to {value_text(high, unit)}"
 
 
 def places_of(loads: Loads, angle: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -83,10 +83,10 @@ def track_radius(loads: Loads) -> float:
 def at_rest(scene: Scene) -> Pose:
     """Return the pose of a sketch: no displacement, and loads spread evenly so that each is visible."""
     zero = np.zeros(len(scene.machine.structure().coordinates))
-    return Pose(zero, zero, tuple(RotorPose(_spread(exciter.loads), 0.0) for exciter in scene.exciters))
+    return Pose(zero, zero, tuple(RotorPose(_evenly_spread(exciter.loads), 0.0) for exciter in scene.exciters))
 
 
-def _spread(loads: Loads | None) -> tuple[np.ndarray, ...]:
+def _evenly_spread(loads: Loads | None) -> tuple[np.ndarray, ...]:
     if loads is None:
         return ()
     first, *others = (np.asarray(u, float) for u in loads.rest())
@@ -99,12 +99,15 @@ def caption(scene: Scene) -> str:
     for k, exciter in enumerate(scene.exciters):
         lines.setdefault("\n".join(_words_of(exciter)), []).append(k)
     if len(scene.exciters) == 1:
-        found = list(lines)
+        lines_of_text = list(lines)
     else:
-        found = [f"exciter {', '.join(map(str, own))}: {line.replace(chr(10), ', ')}" for line, own in lines.items()]
+        lines_of_text = [
+            f"exciter {', '.join(map(str, numbers_of_exciters))}: {line.replace(chr(10), ', ')}"
+            for line, numbers_of_exciters in lines.items()
+        ]
     if scene.all_effects:
-        found.append("with " + ", ".join(dict.fromkeys(map(_effect_words, scene.all_effects))))
-    return "\n".join(found)
+        lines_of_text.append("with " + ", ".join(dict.fromkeys(map(_effect_words, scene.all_effects))))
+    return "\n".join(lines_of_text)
 
 
 def _effect_words(effect: Effect) -> str:
@@ -114,20 +117,20 @@ def _effect_words(effect: Effect) -> str:
     if spec is None or spec.units != ("kg m",):
         return words
     moment: Any = getattr(effect, "moment")  # noqa: B009, not every effect has it
-    return f"{words} {shown(float(moment), 'kg m')}"
+    return f"{words} {value_text(float(moment), 'kg m')}"
 
 
 def _words_of(exciter: Exciter) -> list[str]:
     """Return lines with the loads and the unbalance of an exciter, and with its drive."""
     loads, drive, words = exciter.loads, exciter.drive, []
     if exciter.unbalance is not None:
-        words.append(f"unbalance {shown(float(exciter.unbalance), 'kg m')}")
+        words.append(f"unbalance {value_text(float(exciter.unbalance), 'kg m')}")
     if loads is not None:
-        each = " each" if loads.count > 1 else ""
+        suffix = " each" if loads.count > 1 else ""
         named = loads.kind.replace("_", " ") + ("s" if loads.count > 1 else "")
-        words += [f"{loads.count} {named}, m = {_span(np.asarray(loads.mass), 'kg')}{each}"]
+        words += [f"{loads.count} {named}, m = {_span(np.asarray(loads.mass), 'kg')}{suffix}"]
         radius = getattr(loads, "radius", None)
-        words += [f"R = {shown(track_radius(loads), 'm') if radius is None else _span(np.asarray(radius), 'm')}"]
+        words += [f"R = {value_text(track_radius(loads), 'm') if radius is None else _span(np.asarray(radius), 'm')}"]
         drag = getattr(loads, "drag", None)
         if drag is not None:
             words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")
@@ -138,43 +141,44 @@ def _words_of(exciter: Exciter) -> list[str]:
 class Wheel:
     """Rotor of an exciter with its loads and its unbalance, seen along its axis.
 
-    **Attributes**: `radius` of the loads' circle in the drawing, `rim` of the rotor; `scale`, units of the drawing per metre
+    **Attributes**: `radius` of the circle of the loads and `rim`, the radius of the rotor, in units of the drawing; `scale`:
+    units of the drawing per metre.
     """
 
     def __init__(self, exciter: Exciter, radius: float):
         self.loads, self.radius, self.direction = exciter.loads, radius, exciter.direction
         self.unbalanced = exciter.unbalance is not None
         self.scale = radius / (0.1 if self.loads is None else track_radius(self.loads))
-        own = getattr(self.loads, "ball_radius", None)
-        self.size = 0.12 * radius / 0.7 if own is None else max(float(own) * self.scale, 0.05)
+        ball_radius = getattr(self.loads, "ball_radius", None)
+        self.size = 0.12 * radius / 0.7 if ball_radius is None else max(float(ball_radius) * self.scale, 0.05)
         self.rim = radius + max(1.15 * self.size, 0.1)
 
     def places(self, pose: RotorPose) -> list[np.ndarray]:
         """Return the loads' positions relative to the axis, in units of the drawing, see `places_of`."""
         assert self.loads is not None
-        own = places_of(self.loads, pose.angle) if pose.positions is None else pose.positions
-        return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in own]
+        positions = places_of(self.loads, pose.angle) if pose.positions is None else pose.positions
+        return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in positions]
 
     def parts(self, centre: tuple[float, float], pose: RotorPose) -> list[Part]:
-        """Return the rim, the loads' circle, two spokes and the unbalance, which turn with the rotor, and the loads."""
-        found = [
+        """Return the rim, the circle of the loads, two spokes and the unbalance, or a mark, of the rotor, and the loads."""
+        parts = [
             Part(circle(centre, self.rim), {"fc": "#f4f4f4", "ec": "black", "lw": 1.4, "zorder": 3}, True),
             Part(circle(centre, self.radius), {"color": GUIDE, "lw": 0.7, "ls": ":", "zorder": 3.1}),
         ]
         for turn in (pose.turn, pose.turn + 0.5 * np.pi):
             e = np.array([np.cos(turn), np.sin(turn)])
             look = {"color": "#9a9a9a", "lw": 1.0, "zorder": 3.2}
-            found.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look, axis=centre))
+            parts.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look, axis=centre))
         if self.unbalanced:
-            found.append(
+            parts.append(
                 Part(sector(centre, 0.85 * self.rim, pose.turn), {"fc": "#555555", "ec": "black", "zorder": 3.3}, True, centre)
             )
         else:
             mark = circle(tuple(centre + 0.82 * self.rim * np.array([np.cos(pose.turn), np.sin(pose.turn)])), 0.05)
-            found.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre))
-        found += self._load_parts(centre, pose)
-        found.append(Part(circle(centre, 0.04, 13), {"fc": "black", "ec": "none", "zorder": 3.6}, True))
-        return found
+            parts.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre))
+        parts += self._load_parts(centre, pose)
+        parts.append(Part(circle(centre, 0.04, 13), {"fc": "black", "ec": "none", "zorder": 3.6}, True))
+        return parts
 
     def _load_parts(self, centre: tuple[float, float], pose: RotorPose) -> list[Part]:
         if self.loads is None:

@@ -221,7 +221,7 @@ def test_the_campbell_diagram_is_the_rotors_whirl(kind):
     """Read back by the numbers at the ticks, lines are the whirls of each sense, and every critical speed is written."""
     scene = jv.scene_from_toml(TEMPLATES[kind])
     most = 1.4 * float(scene.drive.speed)
-    found = jax.device_get(jv.whirl(scene, np.linspace(0.0, most, pictures._SPEEDS)))
+    found = jax.device_get(jv.whirl(scene, np.linspace(0.0, most, pictures._CAMPBELL_SPEEDS)))
     drawn = ElementTree.fromstring(pictures.diagram(scene, most))
     across, up = _axes(_texts(drawn))
     for color, dashes, own in (("#004488", None, found.forward), ("#d55e00", "4 2", ~found.forward)):

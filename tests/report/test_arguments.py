@@ -3,7 +3,7 @@
 import pytest
 
 import jaxvib as jv
-from jaxvib.report.arguments import GROUPS, arguments_of, described
+from jaxvib.report.arguments import GROUPS, arguments_of, builder_of
 
 PLATFORMS = {"mass": "kg", "stiffness": "N/m", "damping": "N s/m"}
 LINKED = PLATFORMS | {"link_stiffness": "N/m", "link_damping": "N s/m"}
@@ -82,7 +82,7 @@ UNITS = {
 
 @pytest.mark.parametrize(("group", "kind"), [(group, kind) for group, kinds in UNITS.items() for kind in kinds])
 def test_every_number_of_a_part_has_its_unit(group, kind):
-    listed = {argument.name: argument.unit for argument in arguments_of(described(group, kind)) if argument.unit}
+    listed = {argument.name: argument.unit for argument in arguments_of(builder_of(group, kind)) if argument.unit}
     assert listed == UNITS[group][kind]
 
 
@@ -91,7 +91,7 @@ def test_parts_are_those_of_the_list():
 
 
 def test_needed_arguments_have_no_default():
-    by_name = {argument.name: argument for argument in arguments_of(described("effects", "stop"))}
+    by_name = {argument.name: argument for argument in arguments_of(builder_of("effects", "stop"))}
     assert [name for name, argument in by_name.items() if argument.needed] == ["stiffness", "gap"]
     assert by_name["side"].default == "both" and by_name["position"].default is None
 
@@ -100,7 +100,7 @@ def test_texts_are_chosen_from_the_allowed_ones():
     allowed = {
         argument.name: argument.allowed
         for kind in ("gravity", "stop", "dry_friction")
-        for argument in arguments_of(described("effects", kind))
+        for argument in arguments_of(builder_of("effects", kind))
         if argument.allowed
     }
     assert allowed == {"along": ("up", "axis"), "side": ("above", "below", "both"), "reaction": ("exact", "run_up", "steady")}
@@ -109,4 +109,4 @@ def test_texts_are_chosen_from_the_allowed_ones():
 @pytest.mark.parametrize(("group", "name", "field"), [("machine", "rotor", "group"), ("machines", "rotors", "name")])
 def test_an_unknown_part_is_refused(group, name, field):
     with pytest.raises(jv.InputError, match=rf"^{field} is '.*'; did you mean '(machines|rotor)'"):
-        described(group, name)
+        builder_of(group, name)
