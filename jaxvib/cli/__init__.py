@@ -29,7 +29,7 @@ def main() -> None:
         gc.freeze()  # garbage collection of the modules would take one fifth of the time of a short command
         gc.enable()
         code = run(sys.argv[1:])
-    except KeyboardInterrupt:  # an interrupt before the command began, or a second one during the handling of the first
+    except KeyboardInterrupt:  # an interrupt before the command began, or a second interrupt while the first was handled
         code = 1
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
@@ -41,8 +41,8 @@ def main() -> None:
 def _exit_at_once(code: int) -> None:
     """Exit without cleanup of the interpreter.
 
-    Threads may still be compiling. A normal exit would destroy XLA while they use it: if an earlier join of a thread was
-    interrupted, CPython before 3.13 regards the thread as finished and does not wait for it.
+    Threads may still be compiling. A normal exit would destroy XLA while the threads use it: if an earlier join of a thread was
+    interrupted, CPython before 3.13 regards this thread as finished and does not wait for it.
     """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
@@ -51,7 +51,7 @@ def _exit_at_once(code: int) -> None:
 
 
 def prepare() -> None:
-    """Enable double precision and the cache of compiled programs on disk, which makes the second call of a command fast."""
+    """Enable double precision, and the cache of compiled programs on disk, which makes later calls of a command fast."""
     from jaxvib.runtime.startup import start
 
     with warnings.catch_warnings(record=True) as found:

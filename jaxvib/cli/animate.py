@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.option("--mode", type=int, help="Number of the jam mode; without --until, the film shows the exact motion of this mode.")
 @click.option("--begin", help="First time of the film, such as 4.5s [four vibration periods before the end].")
 @click.option("--end", help="Last time of the film [end of the run].")
-@click.option("--seconds", help="Duration of the film, s [10 frames for each turn of the rotor].")
+@click.option("--seconds", help="Duration of the film, s [about 11 frames for each turn of the rotor].")
 @click.option("--fps", type=int, default=20, show_default=True, help="Frames per second.")
 @click.option("--magnify", type=float, help="Magnification of displacements, relative to the circle of the loads [automatic].")
 @click.option("--width", type=float, default=6.4, show_default=True, help="Width of the film, in hundreds of pixels.")

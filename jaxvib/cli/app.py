@@ -1,4 +1,4 @@
-"""Group of the commands, and their common parts: scenes, JSON, files, exit codes."""
+"""Group of all commands, and their common parts: scenes, options, tables, error messages, exit codes."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     if speed is not None:
         scene = _with_exciters(scene, lambda each: each.with_parts(each.loads, ConstantSpeed(speed), each.effects))
     elif constant:
-        scene = _with_exciters(scene, _at_final_speed)
-    there = [effect.kind for effect in scene.all_effects]
+        scene = _with_exciters(scene, _with_final_speed)
+    kinds = [effect.kind for effect in scene.all_effects]
     for kind in without:
-        if kind not in there:
-            raise InputError("--without", f"is {quoted(kind)}; the scene's effects are: {', '.join(there) or 'none'}")
+        if kind not in kinds:
+            raise InputError("--without", f"is {quoted(kind)}; the scene's effects are: {', '.join(kinds) or 'none'}")
     scene = _without_effects(scene, without) if without else scene
     for note in (*implausible_numbers(scene), *start_notes(scene)):
         click.echo(f"note: {note}", err=True)
@@ -67,14 +67,14 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
 
 
 def _with_exciters(scene: Scene, change: Callable[[Exciter], Exciter]) -> Scene:
-    """Return a scene with changed exciters."""
+    """Return a scene whose exciters are changed by a function."""
     from jaxvib.machine.scene import Scene  # slow import, which --help does not need
 
-    return Scene(scene.machine, exciters=[change(each) for each in scene.exciters], effects=scene.effects)
+    return Scene(scene.machine, exciters=[change(exciter) for exciter in scene.exciters], effects=scene.effects)
 
 
-def _at_final_speed(exciter: Exciter) -> Exciter:
-    """Return an exciter whose run-up, if it has one, is replaced by its final speed, with a message on stderr."""
+def _with_final_speed(exciter: Exciter) -> Exciter:
+    """Return an exciter at a constant speed: a run-up is replaced by its final speed, with a message on stderr."""
     from jaxvib.display import speed_text  # slow imports, which --help does not need
     from jaxvib.machine.drives.drive import ConstantSpeed
 
@@ -87,14 +87,14 @@ def _at_final_speed(exciter: Exciter) -> Exciter:
 
 
 def _without_effects(scene: Scene, kinds: Sequence[str]) -> Scene:
-    """Return a scene without some kinds of effects on the machine and on its exciters."""
+    """Return a scene without the effects of these kinds, both on the machine and on its exciters."""
     from jaxvib.machine.scene import Scene  # slow import, which --help does not need
 
-    def kept(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    def remaining(effects: Sequence[Effect]) -> tuple[Effect, ...]:
         return tuple(effect for effect in effects if effect.kind not in kinds)
 
-    exciters = [each.with_parts(each.loads, each.drive, kept(each.effects)) for each in scene.exciters]
-    return Scene(scene.machine, exciters=exciters, effects=kept(scene.effects))
+    exciters = [exciter.with_parts(exciter.loads, exciter.drive, remaining(exciter.effects)) for exciter in scene.exciters]
+    return Scene(scene.machine, exciters=exciters, effects=remaining(scene.effects))
 
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
@@ -167,15 +167,15 @@ def require_tolerances(scene: Scene, tolerances: Sequence[str]) -> None:
         read_tolerances(scene, tolerances)
 
 
-def tolerance_table(found: Sequence[ToleranceRange], tolerances: Sequence[str]) -> str:
+def tolerance_table(ranges: Sequence[ToleranceRange], tolerances: Sequence[str]) -> str:
     """Return the ranges of quantities over machines within tolerances as a table."""
     from jaxvib.display import shown_unit
 
     rows = []
-    for each in found:
-        unit, factor = shown_unit(each.unit, max(abs(each.design), abs(each.high)))
-        values = [f"{factor * x:.4g}" for x in (each.design, each.low, each.high, each.worst)]
-        rows.append([f"{each.words}, {unit}".rstrip(", "), *values, f"{100.0 * each.share:.3g} %"])
+    for entry in ranges:
+        unit, factor = shown_unit(entry.unit, max(abs(entry.design), abs(entry.high)))
+        values = [f"{factor * x:.4g}" for x in (entry.design, entry.low, entry.high, entry.worst)]
+        rows.append([f"{entry.words}, {unit}".rstrip(", "), *values, f"{100.0 * entry.share:.3g} %"])
     head = ["light loads", "design", "95 % from", "to", "worst", "machines that have or meet it"]
     return table(f"machines with {', '.join(tolerances)}", head, rows)
 
@@ -188,15 +188,15 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     from rich.console import Console  # slow import, which --json does not need
     from rich.table import Table
 
-    drawn = Table(title=title, title_justify="left")
-    shown = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
-    for k in shown:
-        drawn.add_column(columns[k], justify="left" if k == 0 else "right", overflow="fold")
+    rich_table = Table(title=title, title_justify="left")
+    shown_columns = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
+    for k in shown_columns:
+        rich_table.add_column(columns[k], justify="left" if k == 0 else "right", overflow="fold")
     for row in rows:
-        drawn.add_row(*(row[k] for k in shown))
+        rich_table.add_row(*(row[k] for k in shown_columns))
     console = Console(width=80)
     with console.capture() as capture:
-        console.print(drawn)
+        console.print(rich_table)
     return capture.get().rstrip()
 
 
@@ -235,7 +235,7 @@ _GROUPS = {
 }
 """Commands by purpose, each with the module of `jaxvib.cli` that contains it."""
 
-_HOMES = {name: home for group in _GROUPS.values() for name, home in group.items()}
+_MODULES = {name: home for group in _GROUPS.values() for name, home in group.items()}
 
 _ARGUMENTS = {
     "scene": "a scene file, such as `jaxvib new two-mass > machine.toml` makes",
@@ -245,31 +245,32 @@ _ARGUMENTS = {
     "recording": "a file of a recorder, such as run_up.csv",
     "source": "a scene file, or a run.npz that `jaxvib simulate` saved",
 }
-"""Descriptions of arguments of commands, for messages about missing ones."""
+"""Descriptions of the arguments of commands, for messages about missing arguments."""
 
 
 class _Lazy(click.Group):
-    """Commands whose modules are imported when they are called, or when help lists them all."""
+    """Group of commands whose modules are imported when a command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(_HOMES)
+        return sorted(_MODULES)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands with their summaries, read from the source files, because importing all would take a second."""
-        widest = max(map(len, _HOMES))
+        """List the commands with their summaries. The summaries are read from the source files, because an import of all
+        modules would take a second."""
+        widest = max(map(len, _MODULES))
         for title, group in _GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl([(name.ljust(widest), _first_line(name)) for name in group])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name in _HOMES:
-            importlib.import_module(f"jaxvib.cli.{_HOMES[cmd_name]}")
+        if cmd_name in _MODULES:
+            importlib.import_module(f"jaxvib.cli.{_MODULES[cmd_name]}")
         return super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command of the first argument. **Raises** a usage error that suggests a similar name."""
-        if args and not args[0].startswith("-") and args[0] not in _HOMES:
-            ctx.fail(f"No such command {quoted(args[0])}.{_similar(args[0], list(_HOMES))}")
+        if args and not args[0].startswith("-") and args[0] not in _MODULES:
+            ctx.fail(f"No such command {quoted(args[0])}.{_similar(args[0], list(_MODULES))}")
         return super().resolve_command(ctx, args)
 
 
@@ -281,7 +282,7 @@ def _similar(name: str, allowed: Sequence[str]) -> str:
 
 def _first_line(name: str) -> str:
     """Return the first sentence of a command's docstring, up to a full stop or semicolon."""
-    source = Path(__file__).parent.joinpath(*_HOMES[name].split(".")).with_suffix(".py").read_text(encoding="utf-8")
+    source = Path(__file__).parent.joinpath(*_MODULES[name].split(".")).with_suffix(".py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef) and any(_is_command(decorator, name) for decorator in node.decorator_list):
             return " ".join(re.split(r"[.;](?=\s|$)", ast.get_docstring(node) or "", maxsplit=1)[0].split())
@@ -346,7 +347,7 @@ def run(arguments: list[str]) -> int:
         # a command whose result is a failure exits with its own code
         return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False, obj=tuple(arguments)) or 0
     except InputError as error:
-        error = _of_command_line(arguments, error)
+        error = _with_option_names(arguments, error)
         message = f"{error}{_remedy_hint(arguments, error)}"
         return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
     except ComputationError as error:
@@ -379,11 +380,15 @@ def run(arguments: list[str]) -> int:
         return _failed(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
 
 
-def _of_command_line(arguments: list[str], error: InputError) -> InputError:
-    """Return an error of a function for the command line, with options in place of arguments of the function."""
+def _with_option_names(arguments: list[str], error: InputError) -> InputError:
+    """Return an error with the names of options of the command line in place of the arguments of a function."""
     command = app.commands.get(arguments[0]) if arguments else None
-    options = [] if command is None else [each for each in command.params if isinstance(each, click.Option)]
-    names = {each.name: each.opts[-1] for each in options}
+    options = (
+        []
+        if command is None
+        else [option_of_command for option_of_command in command.params if isinstance(option_of_command, click.Option)]
+    )
+    names = {option_of_command.name: option_of_command.opts[-1] for option_of_command in options}
     field, problem = names.get(error.field, error.field), error.problem
     if field == "drive.speed" and "--speed" in arguments:
         field = "--speed"
@@ -393,7 +398,7 @@ def _of_command_line(arguments: list[str], error: InputError) -> InputError:
 
 
 def _remedy_hint(arguments: list[str], error: InputError) -> str:
-    """Return a hint to the option that removes an excluded effect or replaces an excluded drive; empty for other errors."""
+    """Return a hint to the option that removes an unsupported effect or replaces an unsupported drive; "" for other errors."""
     table, _, name = error.field.partition(".")
     command = app.commands.get(arguments[0]) if arguments else None
     options = [] if command is None else [option.name for option in command.params]

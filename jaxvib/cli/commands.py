@@ -91,14 +91,15 @@ def simulate(
         **options,
     )
     output.picture("history.png", lambda: run.plot())
-    output.keep("run.npz", run)
+    output.save_result("run.npz", run)
     output.csv(csv, run, "time")
     measures = run_measures(run)
     output.done(run_document(run, measures), lambda: run.summary(measures), "simulate", run)
 
 
 def _long(scene: jv.Scene, until: str) -> bool:
-    """Return True for a run that is so long that a progress bar is useful; a program with a progress bar cannot be stored."""
+    """Return True for a run that is so long that a progress bar is useful. Short runs have none, because a program with a
+    progress bar cannot be stored."""
     from jaxvib.units import number
 
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)

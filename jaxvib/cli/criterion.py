@@ -31,8 +31,8 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
     from jaxvib.steady.balance.states import balanced_intervals
 
     loaded = loaded_scene(scene, without)
-    judged = jv.criterion(loaded)
-    document = criterion_table(judged)
+    result = jv.criterion(loaded)
+    document = criterion_table(result)
     top = 1.5 * max([*document["resonances"], *document["damped_resonances"], float(loaded.drive.speed)])
     exact = None
     if check:
@@ -63,8 +63,8 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         from jaxvib.display import speed_text, speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
-        rows = [[label, f"{scale * w:.6g}"] for label, w in judged.speeds.labelled()]
-        damped = [[label, f"{scale * w:.6g}"] for label, w in judged.speeds.labelled(damped=True)]
+        rows = [[label, f"{scale * w:.6g}"] for label, w in result.speeds.labelled()]
+        damped = [[label, f"{scale * w:.6g}"] for label, w in result.speeds.labelled(damped=True)]
         kinds = [("balancing", "loads spread and balance"), ("gathering", "loads stay together")]
         spans = [[words, *_ends(span, scale)] for name, words in kinds for span in document[name]]
         spans += [["balancing, exactly", *_ends(span, scale)] for span in exact or []]
@@ -78,7 +78,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
             lines.append(f"exact stability was computed up to {speed_text(top)}")
         return "\n".join(lines)
 
-    output.done(document, text, "criterion", judged)
+    output.done(document, text, "criterion", result)
 
 
 def _ends(span: Sequence[float | None], scale: float) -> list[str]:
@@ -113,47 +113,49 @@ def balance(
     from jaxvib.units import number  # slow import, which --help does not need
 
     loaded = loaded_scene(scene, without, speed)
-    ends = None if between is None else [float(number(each, "rad/s", "--between", low=0.0)) for each in between]
-    found = jv.balanced_states(loaded)
-    judged = [found.stability(k) for k in range(len(found.angles))]
-    stable = [] if ends is None else [found.intervals(*ends, arrangement=k, points=points) for k in range(len(judged))]
-    output.picture("balance.png", found.plot)
+    ends = None if between is None else [float(number(end, "rad/s", "--between", low=0.0)) for end in between]
+    states = jv.balanced_states(loaded)
+    stabilities = [states.stability(k) for k in range(len(states.angles))]
+    stable = [] if ends is None else [states.intervals(*ends, arrangement=k, points=points) for k in range(len(stabilities))]
+    output.picture("balance.png", states.plot)
     document = {
         "rotor_speed": loaded.drive.speed,
-        "status": found.message,
-        "share": found.share,
-        "neutral_directions": found.names,
+        "status": states.message,
+        "share": states.share,
+        "neutral_directions": states.names,
         "arrangements": [
-            {"angles": angles, **fields_of(each, "stable", "is_decided", "growth", "error")}
+            {"angles": angles, **fields_of(end, "stable", "is_decided", "growth", "error")}
             | ({"stable_between": stable[k]} if stable else {})
-            for k, (angles, each) in enumerate(zip(found.angles, judged, strict=True))
+            for k, (angles, end) in enumerate(zip(states.angles, stabilities, strict=True))
         ],
     }
-    output.done(document, lambda: _balance_text(found, judged, stable), "balance", found)
+    output.done(document, lambda: _balance_text(states, stabilities, stable), "balance", states)
 
 
-def _balance_text(found: jv.BalancedStates, judged: list[BalancedStability], stable: list[list[list[float]]]) -> str:
+def _balance_text(states: jv.BalancedStates, stabilities: list[BalancedStability], stable: list[list[list[float]]]) -> str:
     """Return the arrangements as a table, below lines with the answer."""
     from jaxvib.display import speed_text, speed_unit  # slow imports, which --help does not need
     from jaxvib.results.status import status_name
     from jaxvib.steady.jams.phases import degrees
 
     unit, scale = speed_unit()
-    names = [status_name(each.status) for each in judged]
+    names = [status_name(stability.status) for stability in stabilities]
     answer = next((name for name in ("stable", "undecided", "unstable") if name in names), "impossible")
-    lines = [f"balanced motion at {speed_text(found.scene.drive.speed)}: {answer}", textwrap.fill(found.message, 80)]
-    for k, share in enumerate(found.share):
-        plane = f" in plane {k + 1}" if len(found.share) > 1 else ""
+    lines = [f"balanced motion at {speed_text(states.scene.drive.speed)}: {answer}", textwrap.fill(states.message, 80)]
+    for k, share in enumerate(states.share):
+        plane = f" in plane {k + 1}" if len(states.share) > 1 else ""
         lines.append(f"imbalance{plane}: {100.0 * share:.4g} % of the unbalance of all loads{' there' if plane else ''}")
     rows = [
-        [str(k + 1), name, f"{each.growth:.4g}", " ".join(f"{degrees(float(a)):.4g}" for a in angles)]
-        for k, (name, each, angles) in enumerate(zip(names, judged, found.angles, strict=True))
+        [str(k + 1), name, f"{stability.growth:.4g}", " ".join(f"{degrees(float(a)):.4g}" for a in angles)]
+        for k, (name, stability, angles) in enumerate(zip(names, stabilities, states.angles, strict=True))
     ]
     if rows:
         head = ["arrangement", "", "growth, 1/s", "angles of the loads in the rotor, degrees"]
         lines.append(table("arrangements (growth below 0: disturbances decay)", head, rows))
     if stable:
-        spans = [[str(k + 1), *(f"{scale * end:.6g}" for end in span)] for k, each in enumerate(stable) for span in each]
+        spans = [
+            [str(k + 1), *(f"{scale * end:.6g}" for end in span)] for k, stability in enumerate(stable) for span in stability
+        ]
         lines.append(
             table("rotor speeds at which an arrangement is stable", ["arrangement", f"from, {unit}", f"to, {unit}"], spans)
             if spans

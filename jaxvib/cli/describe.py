@@ -30,17 +30,17 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
     from jaxvib.report.arguments import GROUPS, arguments_of, builder_of
 
     if group is None:
-        known = {word: list(kinds) for word, kinds in GROUPS.items()}
-        output.done({"groups": known}, lambda: "\n".join(f"{g}: {', '.join(k)}" for g, k in known.items()), "describe")
+        groups = {word: list(kinds) for word, kinds in GROUPS.items()}
+        output.done({"groups": groups}, lambda: "\n".join(f"{g}: {', '.join(k)}" for g, k in groups.items()), "describe")
         return
     if group not in GROUPS and name is None:
-        home = next((each for each, kinds in GROUPS.items() if group in kinds), None)
-        if home is None:
-            every = [*GROUPS, *(kind for kinds in GROUPS.values() for kind in kinds)]
-            raise InputError("name", f"is {quoted(group)}; {suggest_name(group, every)}")
-        group, name = home, group
+        group_of_part = next((each for each, kinds in GROUPS.items() if group in kinds), None)
+        if group_of_part is None:
+            all_names = [*GROUPS, *(kind for kinds in GROUPS.values() for kind in kinds)]
+            raise InputError("name", f"is {quoted(group)}; {suggest_name(group, all_names)}")
+        group, name = group_of_part, group
     kinds = GROUPS.get(group, {}) if name is None else {name: builder_of(group, name)}
-    found = [
+    parts_found = [
         {
             "kind": kind,
             "about": (inspect.getdoc(build) or "").split("\n\n")[0].replace("\n", " "),
@@ -52,23 +52,23 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
     def text() -> str:
         parts = []
         for kind, build in kinds.items():
-            parts.append(_wrapped(f"{kind}: {(inspect.getdoc(build) or '').split(chr(10) * 2)[0]}", ""))
-            parts += [_argument(argument) for argument in arguments_of(build)]
+            parts.append(_wrap(f"{kind}: {(inspect.getdoc(build) or '').split(chr(10) * 2)[0]}", ""))
+            parts += [_argument_text(argument) for argument in arguments_of(build)]
             parts.append("")
         if name is not None:
             parts.append((inspect.getdoc(kinds[name]) or "").split(">>>")[0].rstrip())
         return "\n".join(parts).rstrip()
 
-    output.done({group: found}, text, "describe")
+    output.done({group: parts_found}, text, "describe")
 
 
-def _argument(argument: Argument) -> str:
+def _argument_text(argument: Argument) -> str:
     """Return an argument as a line with its unit, default and allowed values, followed by its meaning."""
     default = "needed" if argument.needed else f"default {argument.default or 'none'}"
     facts = [argument.unit, default, ", ".join(argument.allowed) or argument.bounds]
-    head = _wrapped(f"{argument.name}: {'; '.join(filter(None, facts))}", "  ")
-    return f"{head}\n{_wrapped(argument.meaning, '      ')}" if argument.meaning else head
+    head = _wrap(f"{argument.name}: {'; '.join(filter(None, facts))}", "  ")
+    return f"{head}\n{_wrap(argument.meaning, '      ')}" if argument.meaning else head
 
 
-def _wrapped(text: str, indent: str) -> str:
+def _wrap(text: str, indent: str) -> str:
     return textwrap.fill(" ".join(text.split()), _WIDTH, initial_indent=indent, subsequent_indent=indent)

@@ -1,4 +1,4 @@
-"""Common parts of commands: measures of a vibration, choice of steps, JSON documents of runs."""
+"""Common parts of commands about motions: measures of a vibration, choice of steps, JSON documents of runs."""
 
 from __future__ import annotations
 
@@ -17,23 +17,26 @@ SEPARATION = click.option(
 )
 
 
-_POINT = "jaxvib.deck_point"
+_DECK_KEY = "jaxvib.deck_point"
 """Key of the values of --deck and --slope in the context of click."""
 
 
 def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options --deck and --slope, which `measures_of` reads, to a command."""
 
-    def keep(context: click.Context, parameter: click.Parameter, value: Any) -> None:
+    def store_value(context: click.Context, parameter: click.Parameter, value: Any) -> None:
         if isinstance(value, tuple):
             from jaxvib.units import numbers  # slow import, which --help does not need
 
             value = [numbers([part.strip() for part in point.split(",")], "m", "--deck", 2).tolist() for point in value]
         if value:
-            context.meta.setdefault(_POINT, {})[parameter.name] = value
+            context.meta.setdefault(_DECK_KEY, {})[parameter.name] = value
 
     slope = click.option(
-        "--slope", expose_value=False, callback=keep, help="Slope of the deck of a body in a plane, such as '-15 deg' [0]."
+        "--slope",
+        expose_value=False,
+        callback=store_value,
+        help="Slope of the deck of a body in a plane, such as '-15 deg' [0].",
     )
     deck = click.option(
         "--deck",
@@ -41,7 +44,7 @@ def deck_options(command: Callable[..., Any]) -> Callable[..., Any]:
         metavar="X,Y",
         multiple=True,
         expose_value=False,
-        callback=keep,
+        callback=store_value,
         help="Point of the deck of a body in a plane for stroke, throw and conveying speed, m, such as 1.5,0.1, repeatable "
         "[centre of mass].",
     )
@@ -56,27 +59,27 @@ def measures_of(scene: jv.Scene, motion: jv.Jam | jv.PhaseJam | jv.Orbit | jv.Vi
     import jax  # slow import, which --help does not need
 
     require_deck_options(scene)
-    given = dict(click.get_current_context().meta.get(_POINT, {}))
-    if "at" in given:
-        given["at"] = given["at"][0] if len(given["at"]) == 1 else given["at"]
-    return jax.device_get(jv.vibration_measures(scene, motion, **given))
+    deck = dict(click.get_current_context().meta.get(_DECK_KEY, {}))
+    if "at" in deck:
+        deck["at"] = deck["at"][0] if len(deck["at"]) == 1 else deck["at"]
+    return jax.device_get(jv.vibration_measures(scene, motion, **deck))
 
 
 def require_deck_options(scene: jv.Scene) -> None:
     """**Raises** `InputError` for the options --deck and --slope with a machine that is not a body in a plane."""
-    given = click.get_current_context().meta.get(_POINT, {})
-    if given and scene.machine.places != "plane":
-        option = "--deck" if "at" in given else "--slope"
+    deck = click.get_current_context().meta.get(_DECK_KEY, {})
+    if deck and scene.machine.places != "plane":
+        option = "--deck" if "at" in deck else "--slope"
         raise InputError(option, f"is for bodies in a plane, not for a machine of kind '{scene.machine.kind}'; leave it out")
 
 
 def run_measures(run: jv.Run) -> jv.VibrationMeasures | None:
-    """Return the measures of a run; None if its window has too few turns."""
+    """Return the measures of a run; None if its window is too short for them."""
     return measures_of(run.scene, run.vibration()) if run.has_vibration else None
 
 
 def indented(title: str, measures: jv.VibrationMeasures) -> str:
-    """Return the measures as text below a title."""
+    """Return a title, and below it the measures as indented text."""
     return "\n".join([title, *(f"  {line}" for line in measures.summary().splitlines())])
 
 
@@ -86,7 +89,7 @@ def chosen_steps(tolerance: float | None) -> jv.Tolerance | None:
 
 
 def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, object]:
-    """Return the final values of a motion, and the values measured over its last turns."""
+    """Return the final values of a motion, and the values that were measured in its window, for a document."""
     structure = scene.machine.structure()
     speeds = [speed[-1] for speed in run.window.rotor_speeds]
     return {
@@ -102,7 +105,7 @@ def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, o
 
 
 def run_document(run: jv.Run, measures: jv.VibrationMeasures | None) -> dict[str, object]:
-    """Return the quantities of a run over its last turns, its error and its cost."""
+    """Return the quantities of a run in its window, its error and its cost, for a document."""
     return {
         **measured_document(run, run.scene),
         **({} if measures is None else {"measures": measures.document()}),
@@ -112,12 +115,12 @@ def run_document(run: jv.Run, measures: jv.VibrationMeasures | None) -> dict[str
     }
 
 
-def _regime(found: jv.Regime) -> dict[str, object]:
+def _regime(regime: jv.Regime) -> dict[str, object]:
     """Return the regime and the quantities from which it follows, with the names of `RegimeName` and `PhasePattern`."""
     return {
-        "name": found.label,
-        "pattern": found.pattern_label,
-        **fields_of(found, "mode", "resonance", "resonance_speed", "ripple", "phase", "unbalance"),
-        "rotor_caught": found.caught,
-        "change": found.change,
+        "name": regime.label,
+        "pattern": regime.pattern_label,
+        **fields_of(regime, "mode", "resonance", "resonance_speed", "ripple", "phase", "unbalance"),
+        "rotor_caught": regime.caught,
+        "change": regime.change,
     }

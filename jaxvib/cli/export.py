@@ -11,8 +11,15 @@ from jaxvib.cli.app import Output, app, loaded_scene
 from jaxvib.errors import InputError
 
 _KINDS = ("fmu", "state-space", "uff")
-_ONLY = {"fmi": "fmu", "drive": "fmu", "source_only": "fmu", "mode": "state-space", "quantity": "uff", "rotor_speed": None}
-"""Options that apply to one kind of file only; None: to all kinds except fmu."""
+_KIND_OF_OPTION = {
+    "fmi": "fmu",
+    "drive": "fmu",
+    "source_only": "fmu",
+    "mode": "state-space",
+    "quantity": "uff",
+    "rotor_speed": None,
+}
+"""Kind of file to which an option applies, by option; None: all kinds except fmu."""
 
 
 @app.command("export")
@@ -35,22 +42,22 @@ _ONLY = {"fmi": "fmu", "drive": "fmu", "source_only": "fmu", "mode": "state-spac
 @click.option("--json", "as_json", is_flag=True, help="Print only one JSON document on stdout.")
 def export(scene: Path, to: str, out: Path, as_json: bool, **options: object) -> None:
     """Write SCENE for other tools: an FMU, a state-space model (MAT) or a universal file (UFF)."""
-    given = {name: value for name, value in options.items() if value is not None}
-    for name in given:
-        if to not in ([_ONLY[name]] if _ONLY[name] else ["state-space", "uff"]):
+    options_given = {name: value for name, value in options.items() if value is not None}
+    for name in options_given:
+        if to not in ([_KIND_OF_OPTION[name]] if _KIND_OF_OPTION[name] else ["state-space", "uff"]):
             raise InputError(f"--{name.replace('_', '-')}", f"cannot be used with --to {to}; leave it out")
     loaded, output = loaded_scene(scene), Output(as_json, None, scene=scene)
     if to == "fmu":
-        source_only = bool(given.pop("source_only", False))
-        unit = jv.export_fmu(loaded, out, binary=not source_only, **given)  # pyright: ignore[reportArgumentType]
+        source_only = bool(options_given.pop("source_only", False))
+        unit = jv.export_fmu(loaded, out, binary=not source_only, **options_given)  # pyright: ignore[reportArgumentType]
         path, message = unit.path, unit.message
     elif to == "uff":
-        path = jv.export_uff(loaded, out, **given)  # pyright: ignore[reportArgumentType]
+        path = jv.export_uff(loaded, out, **options_given)  # pyright: ignore[reportArgumentType]
         message = f"{len(jv.read_uff(path).functions)} frequency response functions, nodes and mode shapes"
     else:
-        mode = given.pop("mode", None)
+        mode = options_given.pop("mode", None)
         at = "rest" if mode is None else jv.jam_modes(loaded).select(mode)  # pyright: ignore[reportArgumentType]
-        model = jv.state_space(loaded, at, **given)  # pyright: ignore[reportArgumentType]
+        model = jv.state_space(loaded, at, **options_given)  # pyright: ignore[reportArgumentType]
         path, message = model.save(out), model.about
     output.files.append(str(path))
     output.done({"kind": to, "path": str(path), "message": message}, lambda: message, "export")

@@ -62,19 +62,19 @@ def modes(
         raise InputError("--tolerance", "is for light loads on platforms that stay together; leave it or the other option out")
     require_tolerances(loaded, tolerances)
     if exact:
-        _exact(loaded, csv, output)
+        _print_exact_jams(loaded, csv, output)
         return
     if phases or loaded.mounting.axes != (1,):
         if csv is not None:
             raise InputError(
                 "--csv", "writes branches over the load speed, which jams with unequal phases do not have; use --json"
             )
-        _phases(loaded, output)
+        _print_phase_jams(loaded, output)
         return
-    _light(loaded, csv, tolerances, output)
+    _print_light_jams(loaded, csv, tolerances, output)
 
 
-def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], output: Output) -> None:
+def _print_light_jams(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], output: Output) -> None:
     """Print the jams of light, coincident loads, and their folds."""
     import jax  # slow imports, which --help does not need
     import numpy as np
@@ -82,25 +82,25 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
     from jaxvib.steady.jams.jam import STABILITY_CRITERION
     from jaxvib.steady.jams.phases import growth_of_free_loads
 
-    found = jax.device_get(jv.jam_modes(scene))  # NumPy arrays, because indexing JAX arrays would compile programs
+    modes_found = jax.device_get(jv.jam_modes(scene))  # NumPy arrays, because indexing JAX arrays would compile programs
     output.picture("branches.png", lambda: jv.branches(scene).plot())
     if csv is not None:
         output.csv(csv, jv.branches(scene), "point")
-    jams = [found.select(k) for k in found.mode_numbers()]
-    growth = dict(zip(found.mode.tolist(), growth_of_free_loads(scene, found.omega).tolist(), strict=True))
-    staying = [jam for jam in jams if bool(jam.stable) and not growth[int(jam.mode)] > 0.0]
-    measures = {int(jam.mode): measures_of(scene, jam) for jam in staying}
-    folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
-    ranges = ranges_within(scene, [int(jam.mode) for jam in staying], tolerances)
+    jams = [modes_found.select(k) for k in modes_found.mode_numbers()]
+    growth = dict(zip(modes_found.mode.tolist(), growth_of_free_loads(scene, modes_found.omega).tolist(), strict=True))
+    remaining = [jam for jam in jams if bool(jam.stable) and not growth[int(jam.mode)] > 0.0]
+    measures = {int(jam.mode): measures_of(scene, jam) for jam in remaining}
+    folds = [k for k, exists in enumerate(np.asarray(modes_found.folds.exists)) if exists]
+    ranges = ranges_within(scene, [int(jam.mode) for jam in remaining], tolerances)
     document = {
         "rotor_speed": scene.drive.speed,
-        "resonances": found.resonances,
+        "resonances": modes_found.resonances,
         "judged": STABILITY_CRITERION,
         "modes": [_mode_document(jam, growth[int(jam.mode)]) for jam in jams],
-        "unresolved": found.unresolved,
-        "measures": [{"mode": mode, **each.document()} for mode, each in measures.items()],
-        "folds": [{"omega": found.folds.omega[k], "rotor_speed": found.folds.rotor_speed[k]} for k in folds],
-        **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {}),
+        "unresolved": modes_found.unresolved,
+        "measures": [{"mode": mode, **entry.document()} for mode, entry in measures.items()],
+        "folds": [{"omega": modes_found.folds.omega[k], "rotor_speed": modes_found.folds.rotor_speed[k]} for k in folds],
+        **({"tolerances": [entry._asdict() for entry in ranges]} if tolerances else {}),
     }
 
     def text() -> str:
@@ -108,35 +108,37 @@ def _light(scene: jv.Scene, csv: Path | None, tolerances: tuple[str, ...], outpu
         from jaxvib.steady.jams.jam import modes_table
 
         unit, scale = speed_unit()
-        head, *rows = modes_table(found, growth)
+        head, *rows = modes_table(modes_found, growth)
         lines = [
-            f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(found.resonances)}",
+            f"rotor {speed_text(scene.drive.speed)}; resonances {speed_text(modes_found.resonances)}",
             table("jam modes (light loads); amplitudes and foundation force are zero to peak", head, rows)
             if rows
             else "no jam mode at this speed",
         ]
         if rows:
             lines.append("stays, no: after a small disturbance the loads (balls, rollers, pendulums) leave this jam")
-        lines += [text] if (text := found.unresolved_text()) else []
+        lines += [text] if (text := modes_found.unresolved_text()) else []
         if tolerances:
             lines.append(tolerance_table(ranges, tolerances))
-        for mode, each in measures.items():
-            lines.append(indented(f"mode {mode}:", each))
+        for mode, entry in measures.items():
+            lines.append(indented(f"mode {mode}:", entry))
         if folds:
-            pairs = [[f"{scale * found.folds.omega[k]:.5g}", f"{scale * found.folds.rotor_speed[k]:.5g}"] for k in folds]
+            pairs = [
+                [f"{scale * modes_found.folds.omega[k]:.5g}", f"{scale * modes_found.folds.rotor_speed[k]:.5g}"] for k in folds
+            ]
             lines.append(table("folds: two jams merge", [f"loads, {unit}", f"rotor, {unit}"], pairs))
         return "\n".join([*lines, *_left_out(scene)])
 
-    output.done(document, text, "modes", found)
+    output.done(document, text, "modes", modes_found)
 
 
 def _mode_document(jam: jv.Jam, growth: float) -> dict[str, Any]:
-    first, last = fields_of(jam, "mode", "omega", "stable"), fields_of(jam, "amplitude", "foundation_force")
-    return {**first, "growth_of_free_loads": growth, "status": jam.message, **last}
+    beginning, end = fields_of(jam, "mode", "omega", "stable"), fields_of(jam, "amplitude", "foundation_force")
+    return {**beginning, "growth_of_free_loads": growth, "status": jam.message, **end}
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
-    """Return a line about the effects that a table of jams of light loads ignores; an empty list for a balanced rotor."""
+    """Return a line about the imbalances that a table of jams of light loads ignores; an empty list for a balanced rotor."""
     from jaxvib.machine.effects.base import has_term
     from jaxvib.machine.effects.terms import RotorImbalance
 
@@ -145,14 +147,14 @@ def _left_out(scene: jv.Scene) -> list[str]:
     return [f"amplitudes and forces are those of the loads only: {adds}"] if named else []
 
 
-def _phases(scene: jv.Scene, output: Output) -> None:
+def _print_phase_jams(scene: jv.Scene, output: Output) -> None:
     """Print the jams of light loads at any phases."""
     from jaxvib.results.status import sentence
     from jaxvib.steady.jams.phases import degrees
 
-    found = jv.phase_jams(scene)
-    output.picture("phases.png", lambda: found.plot())
-    jams = [found.select(k) for k in range(found.omega.shape[0])]
+    result = jv.phase_jams(scene)
+    output.picture("phases.png", lambda: result.plot())
+    jams = [result.select(k) for k in range(result.omega.shape[0])]
     measures = [measures_of(scene, jam) if jam.stable else None for jam in jams]
     document = {
         "rotor_speed": scene.drive.speed,
@@ -162,9 +164,9 @@ def _phases(scene: jv.Scene, output: Output) -> None:
                 **fields_of(jam, "omega", "stable", "growth"),
                 "pattern": jam.pattern_label,
                 **fields_of(jam, "phase", "amplitude", "foundation_force"),
-                **({} if own is None else {"measures": own.document()}),
+                **({} if measures_of_jam is None else {"measures": measures_of_jam.document()}),
             }
-            for jam, own in zip(jams, measures, strict=True)
+            for jam, measures_of_jam in zip(jams, measures, strict=True)
         ],
     }
 
@@ -187,25 +189,31 @@ def _phases(scene: jv.Scene, output: Output) -> None:
         title = f"light-load jams with unequal phases; rotor {rotor}"
         if not rows:
             return f"no jam at {rotor}"
-        kept = ", ".join(f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable)
-        conclusion = f"loads can stay jammed at {kept}" if kept else "none of them is stable: light loads cannot stay jammed"
-        each = [
-            indented(f"at {speed_text(jam.omega)}:", own) for jam, own in zip(jams, measures, strict=True) if own is not None
+        stable_text = ", ".join(f"{speed_text(jam.omega)} ({sentence(jam.pattern)})" for jam in jams if jam.stable)
+        conclusion = (
+            f"loads can stay jammed at {stable_text}"
+            if stable_text
+            else "none of them is stable: light loads cannot stay jammed"
+        )
+        measure_texts = [
+            indented(f"at {speed_text(jam.omega)}:", measures_of_jam)
+            for jam, measures_of_jam in zip(jams, measures, strict=True)
+            if measures_of_jam is not None
         ]
-        return "\n".join([conclusion, table(title, head, rows), *each, *_left_out(scene)])
+        return "\n".join([conclusion, table(title, head, rows), *measure_texts, *_left_out(scene)])
 
-    output.done(document, text, "modes", found)
+    output.done(document, text, "modes", result)
 
 
-def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
-    """Print all exact jams, also those that do not exist for light loads, and the special points."""
+def _print_exact_jams(scene: jv.Scene, csv: Path | None, output: Output) -> None:
+    """Print all exact jams, including those that do not exist for light loads, and the special points."""
     from jaxvib.steady.orbits.search import exact_mode_speeds  # slow import: it needs the time integrator
 
     light = jv.jam_modes(scene)
     numbers = sorted({*light.mode_numbers(), *exact_mode_speeds(scene)})
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
-    known = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
-    measures = {k: measures_of(scene, jam) for k, jam in known.items() if jam.stable}
+    existing = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
+    measures = {k: measures_of(scene, jam) for k, jam in existing.items() if jam.stable}
     diagram = jv.branches(scene, exact=True)
     output.picture("branches.png", lambda: diagram.plot())
     output.csv(csv, diagram, "point")
@@ -220,10 +228,10 @@ def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
                 "status": jam.message,
                 **({"measures": measures[k].document()} if k in measures else {}),
             }
-            for k, jam in known.items()
+            for k, jam in existing.items()
         ],
         "special": [fields_of(p, "omega", "rotor_speed", "kind") for p in diagram.special],
-        "missing": [{"mode": k, "status": jam.message} for k, jam in jams.items() if k not in known],
+        "missing": [{"mode": k, "status": jam.message} for k, jam in jams.items() if k not in existing],
     }
 
     def text() -> str:
@@ -240,14 +248,14 @@ def _exact(scene: jv.Scene, csv: Path | None, output: Output) -> None:
                 *(f"{1e3 * float(a):.5g}" for a in jam.amplitude),
                 f"{float(jam.foundation_force):.5g}",
             ]
-            for k, jam in known.items()
+            for k, jam in existing.items()
         ]
         head = ["mode", unit, "exactly", "multiplier", *(f"{name}, mm" for name in names), "foundation force, N"]
         points = [[p.kind.replace("_", " "), f"{scale * p.omega:.6g}", f"{scale * p.rotor_speed:.6g}"] for p in diagram.special]
         lines = [
             f"rotor {speed_text(scene.drive.speed)}",
             table("exact jams; amplitudes and force are zero to peak", head, rows),
-            *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in known),
+            *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in existing),
             *(indented(f"mode {k}:", each) for k, each in measures.items()),
         ]
         if points:

@@ -43,8 +43,8 @@ def optimize(
 
     loaded = load_design(design)
     require_tolerances(loaded.space.scene, tolerances)
-    given = {"starts": starts, "seed": seed, "searcher": searcher}
-    options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
+    overrides = {"starts": starts, "seed": seed, "searcher": searcher}
+    options = {**loaded.search, **{name: value for name, value in overrides.items() if value is not None}}
     with output.progress() as progress:
         best = synthesize(
             loaded.space,
@@ -55,7 +55,7 @@ def optimize(
             progress=progress,
             **options,
         )
-    output.keep("search.npz", best)
+    output.save_result("search.npz", best)
     path = output.file("found.toml")
     if path is not None:
         source = design.parent / read_toml(design)["scene"]
@@ -65,9 +65,12 @@ def optimize(
     _draw_working_regime(output, loaded, best)
     if best.run is not None:
         output.picture("history.png", best.run.plot)
-        output.keep("run.npz", best.run)
-    ranges = tolerance_ranges(best.scene, _toleranced(loaded), list(tolerances)) if tolerances else []
-    document = {**_document(best), **({"tolerances": [each._asdict() for each in ranges]} if tolerances else {})}
+        output.save_result("run.npz", best.run)
+    ranges = tolerance_ranges(best.scene, _quantities_with_ranges(loaded), list(tolerances)) if tolerances else []
+    document = {
+        **_document(best),
+        **({"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}),
+    }
     parts = [tolerance_table(ranges, tolerances)] if tolerances else []
     output.done(document, lambda: "\n".join([_text(best), *parts]), "optimize", best)
 
@@ -77,12 +80,12 @@ def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> Non
     import jaxvib as jv
     from optimize.quantities.exciters import deck_points
 
-    sought = (
+    quantities = (
         design.objective,
         *(demand.quantity for demand in design.subject_to),
         *(held.quantity for held in design.space.held),
     )
-    points = deck_points(sought)
+    points = deck_points(quantities)
     regime = None if points is None else jv.working_regime(best.scene, throw=False)
     if regime is None or not bool(regime.stable):
         return
@@ -91,8 +94,8 @@ def _draw_working_regime(output: Output, design: Design, best: Synthesis) -> Non
         output.picture("deck.png", lambda: jv.sketch(best.scene, deck=regime.deck(points)))
 
 
-def _toleranced(design: Design) -> list[Quantity | Demand]:
-    """Return the quantities of a design whose ranges within tolerances are shown: the objective, the force, the demands."""
+def _quantities_with_ranges(design: Design) -> list[Quantity | Demand]:
+    """Return the quantities and demands whose ranges within tolerances are shown: objective, foundation force, demands."""
     from optimize import foundation_force
 
     mode = design.objective.mode
@@ -116,12 +119,12 @@ def _document(best: Synthesis) -> dict:
 def _text(best: Synthesis) -> str:
     from optimize.result import objective_text
 
-    counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
+    counts = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
     rows = best.rows()
     heads = ["", "before", "after", "exact", "verified"]
     columns = [k for k in range(len(heads)) if k < 3 or any(row[k] for row in rows)]
-    drawn = table(objective_text(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
-    checked = "verified by the full equations, integrated until the motion settled"
+    quantities = table(objective_text(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
+    verification = "verified by the full equations, integrated until the motion settled"
     if best.verified is None:
-        checked = f"not verified: {best.unverified}"
-    return "\n".join([f"{best.message}\n{counted}", drawn, *(line.strip() for line in best.findings()), checked])
+        verification = f"not verified: {best.unverified}"
+    return "\n".join([f"{best.message}\n{counts}", quantities, *(line.strip() for line in best.findings()), verification])

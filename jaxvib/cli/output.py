@@ -80,7 +80,8 @@ class Output:
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[None]:
-        """Show the elapsed time on the last line of a terminal, after one second and until the command prints something."""
+        """Show the elapsed time on the last line of a terminal, from one second after the start until the command prints
+        something."""
         if sys.stderr.isatty():
             threading.Thread(target=self._show_elapsed_time, daemon=True).start()
         try:
@@ -122,13 +123,13 @@ class Output:
             raise InputError(option, f"is {quoted(str(folder))}, which cannot be created ({error.strerror})") from error
 
     def file(self, name: str) -> Path | None:
-        """Return the path of a result file; None without --out."""
+        """Return the path of a result file, which is added to the list of written files; None without --out."""
         if self.folder is None:
             return None
         self.files.append(str(self.folder / name))
         return self.folder / name
 
-    def keep(self, name: str, result: Result) -> None:
+    def save_result(self, name: str, result: Result) -> None:
         """Save a result to the file `name` if --out is used."""
         path = self.file(name)
         if path is not None:
@@ -152,7 +153,7 @@ class Output:
             self.figures.append((Path(name).stem.replace("_", " "), figure))
 
     def csv(self, path: Path | None, result: Result, axis: str) -> None:
-        """Write the values of a result along an axis, in display units, to the CSV file of --csv, if there is one."""
+        """Write the values of a result along an axis, in display units, to the CSV file `path`; None writes nothing."""
         if path is None:
             return
         from jaxvib.results.csv import write_csv  # slow import, which --help does not need
@@ -193,9 +194,9 @@ class Output:
         scene = getattr(result, "scene", None)
         if not isinstance(scene, Scene):
             scene = None if self.scene is None else load_scene(self.scene)
-        draws = getattr(jv, "sketch", None)
+        draw_sketch = getattr(jv, "sketch", None)
         arguments = click.get_current_context().find_root().obj or [name]
-        found = Report(
+        page = Report(
             title=self.title or (name if self.scene is None else f"{name}: {self.scene.stem}"),
             author=self.author or "",
             command=" ".join(["jaxvib", *arguments]),
@@ -203,8 +204,8 @@ class Output:
             units={} if result is None else units_of(result),
             text=text(),
             scene=scene,
-            sketch=None if scene is None or draws is None else draws(scene),
+            sketch=None if scene is None or draw_sketch is None else draw_sketch(scene),
             figures=self.figures,
         )
-        path.write_text(found.html(), encoding="utf-8")
+        path.write_text(page.html(), encoding="utf-8")
         self.files.append(str(path))

@@ -33,12 +33,12 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
 
     loaded = loaded_scene(scene)
     rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
-    found = jv.whirl(loaded, [rotor_speed], loads=loads)
-    turning = zip(found.critical.speed, found.critical.forward, found.critical.straight, strict=True)
-    critical = [{"speed": float(w), "forward": bool(f), "straight": bool(s)} for w, f, s in turning if np.isfinite(w)]
-    moving = zip(found.speed[0], found.decay[0], found.forward[0], found.straight[0], strict=True)
-    whirls = [{"speed": float(w), "decay": float(d), "forward": bool(f), "straight": bool(s)} for w, d, f, s in moving]
-    top = 1.3 * max([rotor_speed, *(each["speed"] for each in critical)])
+    result = jv.whirl(loaded, [rotor_speed], loads=loads)
+    critical_speeds = zip(result.critical.speed, result.critical.forward, result.critical.straight, strict=True)
+    critical = [{"speed": float(w), "forward": bool(f), "straight": bool(s)} for w, f, s in critical_speeds if np.isfinite(w)]
+    whirl_speeds = zip(result.speed[0], result.decay[0], result.forward[0], result.straight[0], strict=True)
+    whirls = [{"speed": float(w), "decay": float(d), "forward": bool(f), "straight": bool(s)} for w, d, f, s in whirl_speeds]
+    top = 1.3 * max([rotor_speed, *(entry["speed"] for entry in critical)])
     speeds = np.linspace(0.0, top, 161)
     output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed))
     if csv is not None:
@@ -50,16 +50,16 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
 
         unit, scale = speed_unit()
 
-        def sense(each: dict[str, Any]) -> str:
-            return "straight" if each["straight"] else "forward" if each["forward"] else "backward"
+        def sense(entry: dict[str, Any]) -> str:
+            return "straight" if entry["straight"] else "forward" if entry["forward"] else "backward"
 
         rows = [[sense(w), f"{scale * w['speed']:.6g}"] for w in critical]
-        moving = [[sense(w), f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w in whirls]
+        whirl_speeds = [[sense(w), f"{scale * w['speed']:.6g}", f"{w['decay']:.4g}"] for w in whirls]
         return "\n".join(
             [
                 table("critical speeds: whirl speed = rotor speed", ["", unit], rows),
-                table(f"whirl at {speed_text(rotor_speed)}", ["", unit, "decay, 1/s"], moving),
+                table(f"whirl at {speed_text(rotor_speed)}", ["", unit, "decay, 1/s"], whirl_speeds),
             ]
         )
 
-    output.done(document, text, "whirl", found)
+    output.done(document, text, "whirl", result)

@@ -13,7 +13,7 @@ from small_machine import small_run
 
 import jaxvib as jv
 import optimize
-from jaxvib.cli.app import _HOMES, app, loaded_scene, run
+from jaxvib.cli.app import _MODULES, app, loaded_scene, run
 from jaxvib.machine.files import EFFECTS, SCREENS, SECTIONS, TEMPLATES
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
@@ -236,19 +236,19 @@ def test_overview_has_the_summary_of_each_command():
     code += "except SystemExit: print('jax' in sys.modules, 'numpy' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.endswith("False False\n")
-    for name in _HOMES:
+    for name in _MODULES:
         command = app.get_command(None, name)
         begins = command.get_short_help_str(30).removesuffix("...").split()[:4]
         assert " ".join(begins) in " ".join(said.split())
 
 
 def test_help_imports_nothing_slow_and_lists_the_choices():
-    code = "import sys; from jaxvib.cli.app import _HOMES, run\n"
-    code += "for name in _HOMES: assert run([name, '--help']) == 0\nprint('numpy' in sys.modules)"
+    code = "import sys; from jaxvib.cli.app import _MODULES, run\n"
+    code += "for name in _MODULES: assert run([name, '--help']) == 0\nprint('numpy' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.endswith("False\n")
     options = {
-        (name, p.name): tuple(getattr(p.type, "choices", ())) for name in _HOMES for p in app.get_command(None, name).params
+        (name, p.name): tuple(getattr(p.type, "choices", ())) for name in _MODULES for p in app.get_command(None, name).params
     }
     assert options["cost", "quantity"] == QUANTITIES and options["cost", "solvers"] == tuple(SOLVERS)
     machines = tuple(name.replace("_", "-") for name in (*TEMPLATES, *SCREENS))

@@ -54,7 +54,7 @@ def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
 
 
 def test_progress_is_lines_where_there_is_no_terminal(typed, monkeypatch):
-    monkeypatch.setattr(command, "_QUIET", 0.0)
+    monkeypatch.setattr(command, "_SECONDS_BETWEEN_LINES", 0.0)
     _, _, err = typed("sweep", "study.toml")
     lines = err.splitlines()
     # Chunks of 4, 4 and 2 cases are computed in threads; any of them can end first.
@@ -77,7 +77,7 @@ def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
         if len(reports) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(command._Lines, "__call__", stop_once)
+    monkeypatch.setattr(command._ProgressLines, "__call__", stop_once)
     code, _, err = typed("sweep", "study.toml")
     assert code == 1 and "finished cases are saved in study.zarr; run the same command again to continue" in err
     code, out, _ = typed("show", "study.zarr")

@@ -34,7 +34,7 @@ def place(low=0.2, high=1.2):
     return {"exciters[1].position[0]": (low, high), "exciters[1].position[1]": (low, high)}
 
 
-def test_search_finds_the_place_at_which_the_body_does_not_turn():
+def test_search_finds_the_position_without_rotation():
     """Ideal drives force the body along x: its turn is 0 if i (a_2 - a_1) - (b_1 + b_2) = 2 D_(psi x) / D_xx."""
     machine, speed = screen().machine, 100.0
     drive = jv.ConstantSpeed(speed)

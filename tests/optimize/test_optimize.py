@@ -55,7 +55,7 @@ def test_random_starts_find_the_antiphase_machine(light):
     assert found.converged >= 190
 
 
-def test_what_is_held_is_kept(light):
+def test_held_quantities_keep_their_values(light):
     space, found = light
     for z in found.designs[::40]:
         s = space.at(jnp.asarray(z))
@@ -64,7 +64,7 @@ def test_what_is_held_is_kept(light):
     assert np.all((found.designs >= 0.0) & (found.designs <= 1.0))
 
 
-def test_the_winner_is_the_least_on_a_dense_scan(light):
+def test_best_design_is_the_minimum_of_a_dense_scan(light):
     """Two quantities held leave a curve of machines; the search's winner is its lowest point."""
     _, found = light
 
@@ -87,7 +87,7 @@ def test_the_winner_is_the_least_on_a_dense_scan(light):
     np.testing.assert_allclose(scan[3], found.after.force_per_amplitude, rtol=1e-5)
 
 
-def test_antiphase_ratio_tends_to_one_as_damping_goes():
+def test_antiphase_ratio_tends_to_one_without_damping():
     off = []
     for damping in (1e-3, 1e-4, 1e-5):
         space = antiphase_space(damping)
@@ -97,7 +97,7 @@ def test_antiphase_ratio_tends_to_one_as_damping_goes():
     assert off[2] < 5e-3
 
 
-def test_winner_holds_in_the_full_equations():
+def test_best_design_agrees_with_the_full_equations():
     found = synthesize(antiphase_space(1e-2), force_per_amplitude(mode=3), starts=8)
     assert found.verified is not None and found.run is not None
     assert found.run.drift < 1e-6
@@ -112,7 +112,7 @@ def test_winner_holds_in_the_full_equations():
     assert len(found.plot().axes) == 1 and len(found.plot_convergence().axes) == 1
 
 
-def test_same_seed_same_answer():
+def test_same_seed_gives_the_same_result():
     space = antiphase_space(1e-2)
     one, two = (synthesize(space, force_per_amplitude(mode=3), starts=4, seed=7, verify=False) for _ in range(2))
     np.testing.assert_array_equal(one.designs, two.designs)
@@ -192,21 +192,21 @@ def space_of(free, held=()):
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=3), rate=2.0), "rate is 2.0"),
     ],
 )
-def test_wrong_designs_are_said_in_one_sentence(make, says):
+def test_wrong_designs_raise_clear_errors(make, says):
     with pytest.raises(jv.InputError) as caught:
         make()
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_no_possible_start_is_a_named_failure():
+def test_search_without_a_start_has_a_named_status():
     space = DesignSpace(published(speed=0.3).scene(), {"machine.stiffness": (0.1, 0.3)})
     with pytest.raises(jv.ComputationError) as caught:
         synthesize(space, foundation_force(mode=4), starts=4)
     assert caught.value.status == "no_feasible_start"
 
 
-def test_own_quantities_can_be_sought():
+def test_quantities_of_users_can_be_objectives():
     space = DesignSpace(scene("two_mass"), {"machine.stiffness": (1e4, 1e5)})
     wish = Quantity("distance", "N/m", lambda s, modes: jnp.sum((s.machine.stiffness - 3e4) ** 2))
     found = synthesize(space, wish, starts=4)
@@ -272,7 +272,7 @@ seed = 3
 """
 
 
-def test_design_files_mean_what_they_say(tmp_path, monkeypatch):
+def test_design_files_equal_designs_in_python(tmp_path, monkeypatch):
     (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
     (tmp_path / "design.toml").write_text(DESIGN)
     design = load_design(tmp_path / "design.toml")
@@ -318,7 +318,7 @@ def test_design_files_mean_what_they_say(tmp_path, monkeypatch):
         (("# tolerances", "tolerances"), "objective.statistic is 'worts'"),
     ],
 )
-def test_wrong_design_files_are_said_in_one_sentence(tmp_path, change, says):
+def test_wrong_design_files_raise_clear_errors(tmp_path, change, says):
     (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
     text = DESIGNS["design"].replace(*change).replace('# statistic = "worst"', 'statistic = "worts"')
     (tmp_path / "design.toml").write_text(text)

@@ -99,7 +99,7 @@ def test_not_dominated_rows_are_those_of_all_comparisons():
     assert not_dominated(np.array([[3.0, -1.0]])) == [0] and not_dominated(np.array([[0.0, 2.0], [0.0, 1.0]])) == [1]
 
 
-def test_rows_alike_within_what_searches_keep_count_once():
+def test_rows_equal_within_tolerance_count_once():
     """1e-7 of the largest value of a column that hardly changes, 1e-6 of the range of one that does."""
     assert not_dominated(np.array([[1e6, 2.0], [1e6 + 0.05, 1.0]])) == [1]
     assert not_dominated(np.array([[1e6, 2.0], [1e6 + 0.2, 1.0]])) == [0, 1]

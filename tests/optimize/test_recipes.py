@@ -16,7 +16,7 @@ from optimize.recipes import anti_resonance, antiphase, lightest_exciter, retune
 SCENE = scene("two_mass", speed=120.0)
 
 
-def test_a_front_holds_the_machines_between_two_best_ones():
+def test_front_contains_machines_between_its_ends():
     """The squares of the distances to (2, 5) and (6, 5): the front is the line between them, sqrt(a) + sqrt(b) = 4."""
 
     def distance(at):
@@ -33,14 +33,14 @@ def test_a_front_holds_the_machines_between_two_best_ones():
     assert len(both.values) == len(both.machines) == 1  # one machine is the best of both
 
 
-def test_one_spring_is_chosen_to_be_exchanged():
+def test_retune_selects_one_spring():
     wish = Quantity("wish", "", lambda s: (s.machine.link_stiffness[0] / 1e5 - 3.0) ** 2 + s.machine.stiffness[0] / 1e5)
     found = retune(SCENE, wish, starts=4)
     assert found[0][0] == "machine.link_stiffness[0]" and len(found) == 3
     np.testing.assert_allclose(found[0][1].scene.machine.link_stiffness, [3e5], rtol=1e-4)
 
 
-def test_springs_are_ranked_by_the_best_that_each_search_found(monkeypatch):
+def test_springs_are_ranked_by_their_best_machine(monkeypatch):
     """The order does not depend on the end points of other starts."""
     ends = {"machine.stiffness[0]": [3.0, 9.0], "machine.stiffness[1]": [4.0, 4.0], "machine.link_stiffness[0]": [1.0, 99.0]}
 
@@ -65,7 +65,7 @@ def test_recipes_are_designs():
         assert design.space.size == free and len(design.subject_to) == demands
 
 
-def test_recipes_seek_and_hold_what_they_are_named_for():
+def test_recipes_have_their_objective_and_held_values():
     design = antiphase(SCENE, range_=4.0)
     assert design.objective == force_per_amplitude(mode=3)
     assert [held.quantity.name for held in design.space.held] == ["jam_frequency", "support_frequency_squared"]
@@ -84,7 +84,7 @@ def test_recipes_seek_and_hold_what_they_are_named_for():
     np.testing.assert_allclose(wide.subject_to[0].constant, 0.5 * float(amplitude(mode=3, of=1)(SCENE)))
 
 
-def test_recipes_leave_springs_that_are_not_there():
+def test_recipes_create_no_absent_springs():
     hung = eqx.tree_at(lambda s: s.machine.stiffness, SCENE, jnp.array([5e4, 0.0]))
     assert [place.name for place in widest_range(hung, mode=3).space.free] == [
         "machine.stiffness[0]",
@@ -147,7 +147,7 @@ def test_the_spring_that_is_exchanged_is_the_best_of_a_scan():
 
 
 @pytest.mark.slow
-def test_the_lightest_exciter_shakes_so_in_the_full_equations():
+def test_lightest_exciter_holds_in_the_full_equations():
     best = lightest_exciter(SCENE, "42 mm", mode=3).run(starts=8)
     assert best.run is not None and best.verified is not None
     np.testing.assert_allclose(float(amplitude(mode=3, tier="exact")(best.scene)), 0.042, rtol=0.02)  # to leading order 0.042
@@ -180,6 +180,6 @@ def test_the_widest_range_is_that_of_the_whole_branch():
         (lambda: pareto(None, None, None, points=1), "space is None; it must be a DesignSpace"),
     ],
 )
-def test_wrong_recipes_are_said_in_one_sentence(make, says):
+def test_wrong_recipes_raise_clear_errors(make, says):
     with pytest.raises(jv.InputError, match=says):
         make()

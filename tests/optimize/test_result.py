@@ -25,7 +25,7 @@ def limit(what, value, at, *, broken=0.0, active=True, gain=0.0):
     return Limit(what, "m", value, at, broken, active, 0.0, gain)
 
 
-def test_results_are_given_in_the_units_of_designers(searched):
+def test_results_are_shown_in_practical_units(searched):
     limits = (
         limit("first at most 2 mm", 2e-3, 2e-3, gain=-0.5),
         limit("second at most 3 mm", 3.3e-3, 3e-3, broken=0.1),
@@ -82,7 +82,7 @@ def test_fronts_are_shown_in_units_of_their_largest_values():
         )
 
 
-def test_shortfalls_are_told_in_a_designers_units():
+def test_shortfalls_are_shown_in_practical_units():
     assert limit("x", 3.3e-3, 3e-3, broken=0.1).shortfall() == "at best 3.3 mm, 10 % off"
     assert limit("x", math.nan, 3e-3, broken=math.inf).shortfall() == "the nearest machine does not have this quantity"
 
@@ -97,12 +97,12 @@ def test_shortfalls_are_told_in_a_designers_units():
         (0.0, "changed by 1 %: about +0 % of the objective"),
     ],
 )
-def test_slopes_tell_small_changes_only(searched, gain, says):
+def test_predictions_are_limited_to_small_changes(searched, gain, says):
     (line,) = dataclasses.replace(searched, limits=(limit("a", 1.0, 1.0, gain=gain),), influences=(), machines=()).findings()
     assert line == f"  at its limit: a (1 m); {says}"
 
 
-def test_figures_show_what_was_found(searched, monkeypatch):
+def test_figures_show_the_results(searched, monkeypatch):
     """Before against after, the best start among all, the second quantity across: in a designer's units."""
     shown = {}
     for name in ("before_after", "convergence", "front_chart"):

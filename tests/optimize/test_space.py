@@ -60,7 +60,7 @@ def test_ties_follow_in_order():
     np.testing.assert_allclose(all_of_them.at(jnp.array([0.0, 1.0])).machine.damping, [10.0, 90.0])
 
 
-def test_what_is_held_is_off_by_its_share():
+def test_residual_of_a_held_quantity_is_relative():
     space = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}, [hold(total("machine.stiffness"), "100 N/mm")])
     from optimize.quantities.evaluation import Evaluation
 
@@ -103,16 +103,16 @@ FREE = {"machine.stiffness": (1e4, 9e4)}
         (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", True)}), "give a number greater than 0"),
         (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", "half")}), "give a number greater than 0"),
         (lambda: DesignSpace(SCENE, FREE, [hold(total("machine.stiffness"), 8e4)] * 2), "more free parameters than held"),
-        (lambda: DesignSpace(scene(speed=1e-3), FREE, [hold(jam_frequency(mode=5))]), "give the value at which it is held"),
+        (lambda: DesignSpace(scene(speed=1e-3), FREE, [hold(jam_frequency(mode=5))]), "give the value that it must keep"),
     ],
 )
-def test_wrong_spaces_are_said_in_one_sentence(make, says):
+def test_wrong_spaces_raise_clear_errors(make, says):
     with pytest.raises(jv.InputError) as caught:
         make()
     assert says in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_tie_keeps_no_ratio_to_what_is_nothing():
+def test_tie_to_a_parameter_of_zero_is_refused():
     """Nor where only one of several numbers is."""
     half = eqx.tree_at(lambda s: s.machine.damping, SCENE, jnp.array([0.0, 9.0]))
     ties = {"machine.stiffness": ("machine.damping", "keep")}
@@ -120,7 +120,7 @@ def test_a_tie_keeps_no_ratio_to_what_is_nothing():
         DesignSpace(half, {"loads.drag": (1.0, 2.0)}, ties=ties)
 
 
-def test_springs_that_are_not_there_stay_away():
+def test_absent_springs_stay_absent():
     """Zeros of an array are freed, tied and chosen only if they are named."""
     chain = scene("network")  # supports 1e4, 0, 0, 2e4, 1e3
     space = DesignSpace(chain, {"machine.stiffness": (1e3, 9e4, "even"), "loads.drag": (1.0, 2.0)})
@@ -149,7 +149,7 @@ def test_springs_that_are_not_there_stay_away():
 
 
 @pytest.mark.parametrize("wrong", [None, True, 10**400, np.zeros(0), np.zeros((2, 2)), np.ones(2) + 1j, np.ma.masked])
-def test_designs_that_are_no_arrays_of_their_size_are_refused(wrong):
+def test_designs_of_wrong_size_are_refused(wrong):
     space = DesignSpace(SCENE, free={"machine.stiffness[0]": (1e4, 9e4), "machine.stiffness[1]": (1e4, 9e4)})
     for ask, name in ((space.at, "z"), (space.scene_of, "values"), (lambda z: space.within(z, z), "low")):
         with pytest.raises(jv.InputError, match=rf"^{name} (is|has) .*(an array|numbers|masked)"):

@@ -53,7 +53,7 @@ def test_the_table_has_each_quantity_once():
     assert rows[3] == ("mass of platforms and loads", "kg", 1.0, 3.0, 5.0, 7.0) and rows[4][2:] == (2.0, 4.0, 6.0, 8.0)
 
 
-def test_other_tiers_are_told_where_there_are_such():
+def test_table_has_other_tiers_if_they_exist():
     quantities = [total_mass(), jam_frequency(mode=3), expected(jam_frequency(mode=3), {"loads.drag": 0.05}, samples=2)]
     exact, time = _other_tiers(SCENE, quantities, True, None, 3)
     np.testing.assert_allclose(exact[1], float(jv.jam_orbit(SCENE, mode=3).omega), rtol=1e-9)
@@ -70,7 +70,7 @@ def test_other_tiers_are_told_where_there_are_such():
     assert math.isnan(_other_tiers(SCENE, of_run, False, Ran(), None)[1][1])
 
 
-def test_designs_that_keep_demands_rank_first():
+def test_designs_that_meet_demands_rank_first():
     def found(value, violation):
         point = Point(np.zeros((1, 2)), np.array([[value]]), np.zeros((1, 1, 2)), (), (), np.zeros((1, 0)), np.zeros((1, 0, 2)))
         none = Optimality(np.zeros((1, 0)), np.zeros((1, 0)), np.zeros((1, 2)), np.zeros(1))
@@ -82,7 +82,7 @@ def test_designs_that_keep_demands_rank_first():
     assert _rank(found(5.0, 0.0)) < _rank(found(6.0, 9e-8)) < _rank(found(1.0, 0.2)) < _rank(found(0.5, 0.3))
 
 
-def test_numbers_of_loads_that_share_every_number():
+def test_choice_of_the_number_of_loads_needs_equal_loads():
     more = _with_loads(SPACE, 5)
     assert more.scene.loads.count == 5 and more.size == SPACE.size and SPACE.scene.loads.count == 3
     own = DesignSpace(scene("two_mass", "pendulums"), {"machine.stiffness": (1e4, 9e4)})
@@ -101,14 +101,14 @@ def test_numbers_of_loads_that_share_every_number():
         (dict(searcher=None), "searcher is None"),
     ],
 )
-def test_wrong_options_are_said_in_one_sentence(wrong, says):
+def test_wrong_options_raise_clear_errors(wrong, says):
     right = dict(starts=1, seed=0, iterations=1, polishing=0, rate=0.5, searcher="gradients")
     assert _options(**right).rate == 0.5
     with pytest.raises(jv.InputError, match=says):
         _options(**{**right, **wrong})
 
 
-def test_wrong_questions_are_said_in_one_sentence():
+def test_wrong_arguments_raise_clear_errors():
     wish = Quantity("k", "N/m", lambda s: s.machine.stiffness[0])
     running = DesignSpace(jv.Scene(SCENE.machine, SCENE.loads, jv.RunUp(120.0, acceleration=5.0)), {"loads.drag": (1.0, 2.0)})
     for space, subject_to, begin, says in (
@@ -169,7 +169,7 @@ def test_verification_without_exact_motion_starts_in_the_jam(monkeypatch):
     assert asked == [{"mode": 3}] * 2
 
 
-def test_what_is_missing_at_the_start_is_named():
+def test_missing_quantities_of_all_starts_are_named():
     nowhere = Quantity("nowhere", "", lambda s: s.drive.speed * jnp.nan)
     half = [Quantity(f"half {sign:+d}", "", lambda s, sign=sign: jnp.sqrt(sign * (s.loads.drag - 1.5))) for sign in (1, -1)]
     for objective, demands, says in (

@@ -25,22 +25,22 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
     from jaxvib.steady.jams.phases import degrees
 
     loaded = loaded_scene(scene, without)
-    found = jv.synchronous_regimes(loaded)
-    each = [found.select(k) for k in range(found.speed.shape[0])]
-    measures = [measures_of(loaded, regime.vibration()) if regime.stable else None for regime in each]
-    output.picture("regimes.png", found.plot)
-    output.csv(csv, found, "regime")
+    result = jv.synchronous_regimes(loaded)
+    selected = [result.select(k) for k in range(result.speed.shape[0])]
+    measures = [measures_of(loaded, regime.vibration()) if regime.stable else None for regime in selected]
+    output.picture("regimes.png", result.plot)
+    output.csv(csv, result, "regime")
     document = {
         "judged": "by the growth of small disturbances of the averaged motion",
-        "search": status_name(found.search),
+        "search": status_name(result.search),
         "regimes": [
             {
                 "status": regime.message,
                 **fields_of(regime, "speed", "phases", "stable", "growth", "quasi_static", "margin"),
                 **fields_of(regime, "torque", "vibrational_torque", "power", "can_start", "amplitude", "foundation_force"),
-                **({} if own is None else {"measures": own.document()}),
+                **({} if measures_of_regime is None else {"measures": measures_of_regime.document()}),
             }
-            for regime, own in zip(each, measures, strict=True)
+            for regime, measures_of_regime in zip(selected, measures, strict=True)
         ],
     }
 
@@ -58,19 +58,32 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
                 " ".join(f"{float(p):.4g}" for p in regime.power),
                 f"{float(regime.foundation_force):.4g}",
             ]
-            for regime in each
+            for regime in selected
         ]
         if not rows:
-            return found.summary()
+            return result.summary()
         head = [unit, "", " ", "phases, degrees", "margin", "power, W", "foundation force, N"]
-        drawn = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
-        stable = [(regime, own) for regime, own in zip(each, measures, strict=True) if own is not None]
-        ways = ("anticlockwise" if each.direction == 1 else "clockwise" for each in loaded.exciters)
+        drawn_table = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
+        stable = [
+            (regime, measures_of_regime)
+            for regime, measures_of_regime in zip(selected, measures, strict=True)
+            if measures_of_regime is not None
+        ]
+        directions = ("anticlockwise" if exciter.direction == 1 else "clockwise" for exciter in loaded.exciters)
         notes = [
-            f"rotation: {', '.join(f'exciter {k} {way}' for k, way in enumerate(ways))}",
+            f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
         ]
-        return "\n".join([drawn, *notes, *(indented(f"at {speed_text(regime.speed)}, stable:", own) for regime, own in stable)])
+        return "\n".join(
+            [
+                drawn_table,
+                *notes,
+                *(
+                    indented(f"at {speed_text(regime.speed)}, stable:", measures_of_regime)
+                    for regime, measures_of_regime in stable
+                ),
+            ]
+        )
 
-    output.done(document, text, "regimes", found)
+    output.done(document, text, "regimes", result)

@@ -54,7 +54,7 @@ def run_up_map(scene: Path, drags: tuple[str, ...], tolerance: float | None, out
         raise InputError("scene", "has no loads (balls, pendulums); for motors with unbalances use `jaxvib run-up`")
     found = jv.run_up_map(loaded, drag=each, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("run_up_map.png", found.plot)
-    output.keep("run_up_map.npz", found)
+    output.save_result("run_up_map.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))
     rows = [
         {

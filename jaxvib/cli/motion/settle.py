@@ -73,16 +73,18 @@ def settle(
     require_deck_options(loaded)
     run = jv.settle(loaded, stepsize_controller=chosen_steps(tolerance), **options)
     output.picture("history.png", run.plot)
-    output.keep("run.npz", run)
+    output.save_result("run.npz", run)
     measures = run_measures(run)
     ranges = ranges_within(run.scene, _modes_of(run) if tolerances else [], tolerances)
-    document = run_document(run, measures) | ({"tolerances": [each._asdict() for each in ranges]} if tolerances else {})
+    document = run_document(run, measures) | (
+        {"tolerances": [ranges_of_quantity._asdict() for ranges_of_quantity in ranges]} if tolerances else {}
+    )
     table = [tolerance_table(ranges, tolerances)] if tolerances else []
     output.done(document, lambda: "\n".join([run.summary(measures), *table]), "settle", run)
 
 
 def _modes_of(run: jv.Run) -> list[int] | None:
-    """Return the jam mode of a run in a list; None for rotating masses of several exciters or without loads.
+    """Return the jam mode of a run in a list; None for a scene with several exciters or without loads.
 
     **Raises** `InputError` for loads that are not jammed.
     """
@@ -112,7 +114,7 @@ def envelope(
     loaded = loaded_scene(scene, without)
     run = jv.envelope(loaded, stepsize_controller=chosen_steps(tolerance), **_with_start(options))
     output.picture("envelope.png", run.plot)
-    output.keep("envelope.npz", run)
+    output.save_result("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
     measures = measures_of(loaded, run.vibration())
     document = {**measured_document(run, loaded), "measures": measures.document(), "ripple": run.ripple}
@@ -133,11 +135,11 @@ def growth(scene: Path, speed: str | None, output: Output, **options: Any) -> No
     after which derivatives are meaningless."""
     if options["start"] == "spin_up":
         raise InputError("--start", "is 'spin_up'; the growth of disturbances needs a constant speed, use 'rest' or 'jam'")
-    found = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))
-    output.picture("growth.png", found.plot)
-    output.done(found.as_dict(), found.summary, "growth", found)
+    result = jv.growth(loaded_scene(scene, speed=speed, constant=True), **_with_start(options))
+    output.picture("growth.png", result.plot)
+    output.done(result.as_dict(), result.summary, "growth", result)
 
 
 def _with_start(options: dict[str, Any]) -> dict[str, Any]:
-    """Return options of a run; without a `start` it begins in a jam if it has a mode, and otherwise at rest."""
+    """Return the options of a run. If `start` is None, it becomes "jam" for a run with a mode, otherwise "rest"."""
     return {**options, "start": options["start"] or ("rest" if options["mode"] is None else "jam")}

@@ -52,32 +52,33 @@ def stability_map(
 ) -> None:
     """Map the stability of exact jams of SCENE over a parameter; --out draws the map."""
     loaded = loaded_scene(scene, without)
-    make, read = _varied(loaded, vary)
+    make, read = _scene_function_and_reader(loaded, vary)
     x = [read(value, "--value") for value in values]
-    found = jv.stability_map(make, x, omega=_range(omega), points=points)
-    output.picture("stability_map.png", lambda: found.plot(label=_words_of(loaded, vary)))
+    result = jv.stability_map(make, x, omega=_speed_range(omega), points=points)
+    output.picture("stability_map.png", lambda: result.plot(label=_words_of(loaded, vary)))
     rows = [
         {
             "value": float(value),
-            "stable_share": float(found.stable[k].mean()),
-            "special": [fields_of(p, "kind", "omega", "rotor_speed") for p in found.special[k]],
+            "stable_share": float(result.stable[k].mean()),
+            "special": [fields_of(p, "kind", "omega", "rotor_speed") for p in result.special[k]],
         }
-        for k, value in enumerate(found.value)
+        for k, value in enumerate(result.value)
     ]
 
     def text() -> str:
         from jaxvib.display import speed_unit  # slow import, which --help does not need
 
         unit, scale = speed_unit()
-        shown = [
-            [f"{row['value']:.6g}", f"{100.0 * row['stable_share']:.3g} %", _special(row["special"], scale)] for row in rows
+        cells = [
+            [f"{row['value']:.6g}", f"{100.0 * row['stable_share']:.3g} %", _special_text(row["special"], scale)]
+            for row in rows
         ]
-        return table(f"exact jams over {vary}", [vary, "of load speeds stable", f"where stability changes, {unit}"], shown)
+        return table(f"exact jams over {vary}", [vary, "of load speeds stable", f"where stability changes, {unit}"], cells)
 
-    output.done({"vary": vary, "map": rows}, text, "stability_map", found)
+    output.done({"vary": vary, "map": rows}, text, "stability_map", result)
 
 
-def _special(points: list[dict], scale: float) -> str:
+def _special_text(points: list[dict], scale: float) -> str:
     return ", ".join(f"{p['kind'].replace('_', ' ')} {scale * p['omega']:.5g}" for p in points) or "nowhere"
 
 
@@ -105,34 +106,34 @@ def onset(
     output: Output,
 ) -> None:
     """Find the value of a parameter at which a torus bifurcation, or another special point, appears in the diagram of SCENE."""
-    make, read = _varied(loaded_scene(scene, without), vary)
+    make, read = _scene_function_and_reader(loaded_scene(scene, without), vary)
     low, high = (read(value, "--between") for value in between)
-    found = jv.stability_onset(make, kind, (low, high), omega=_range(omega), points=points, accuracy=accuracy)
+    found = jv.stability_onset(make, kind, (low, high), omega=_speed_range(omega), points=points, accuracy=accuracy)
     document = {"vary": vary, "kind": kind, "value": found, "accuracy": accuracy, "between": [low, high]}
-    words = f"{kind.replace('_', ' ')} for {vary} of {found:.6g} and above (relative accuracy {accuracy:g}, SI units)"
-    output.done(document, lambda: words, "onset")
+    sentence = f"{kind.replace('_', ' ')} for {vary} of {found:.6g} and above (relative accuracy {accuracy:g}, SI units)"
+    output.done(document, lambda: sentence, "onset")
 
 
-def _varied(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable[[str, str], float]]:
+def _scene_function_and_reader(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable[[str, str], float]]:
     """Return a function that returns the scene for a value of the parameter `name`, and a function that reads such a value."""
     import jax.numpy as jnp
 
     from jaxvib.machine.numbers.named import find_number, put_numbers
 
-    found = find_number(scene, name, "--vary")
-    return lambda x: put_numbers(scene, (found,), jnp.full(found.size, x)), found.value
+    parameter = find_number(scene, name, "--vary")
+    return lambda x: put_numbers(scene, (parameter,), jnp.full(parameter.size, x)), parameter.value
 
 
 def _words_of(scene: Scene, name: str) -> str:
     """Return the name of a parameter in words, with its SI unit, for an axis."""
     from jaxvib.machine.numbers.named import find_number
 
-    found = find_number(scene, name, "--vary")
-    words = found.words(scene)
-    return f"{words[0] if len(words) == 1 else name}, {found.unit}"
+    parameter = find_number(scene, name, "--vary")
+    words = parameter.words(scene)
+    return f"{words[0] if len(words) == 1 else name}, {parameter.unit}"
 
 
-def _range(omega: tuple[str, str]) -> tuple[float, float]:
+def _speed_range(omega: tuple[str, str]) -> tuple[float, float]:
     from jaxvib.units import number
 
     low, high = (float(number(value, "rad/s", "--omega", low=0.0)) for value in omega)

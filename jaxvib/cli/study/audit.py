@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 @app.command("audit")
 @click.argument("scene", type=click.Path(path_type=Path), required=False)
 @click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
-@click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
+@click.option("--mode", type=int, help="Number of the jam mode [second-highest of those that are stable by slope].")
 @click.option(
     "--until",
-    help="Duration of the run if no jam is compared, such as 20s [100 periods of the lowest natural frequency after the "
-    "run-up].",
+    help="Duration of the run if no jam is compared, such as 20s [100 periods of the lowest natural frequency, plus twice the "
+    "duration of a run-up].",
 )
 @click.option("--start", type=click.Choice(["rest", "turning"]), help="Initial state of a run, in place of a jam.")
 @click.option(
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     "--operations",
     "count_operations",
     is_flag=True,
-    help="Without SCENE: count the operations of effects, drives and coordinates.",
+    help="Without SCENE: count the operations of effects, drives, machines and loads.",
 )
 @WITHOUT
 @shared
@@ -51,11 +51,11 @@ def audit(
     output: Output,
     **options: Any,
 ) -> None:
-    """Report by how much each effect and each tier changes the results of SCENE, and their cost: negligible and missing
+    """Report by how much each effect and each tier changes the results of SCENE, and its cost: negligible and missing
     effects.
 
-    The effects of the scene are removed one at a time, and each effect that it lacks is added with typical values. --out adds
-    the figure."""
+    The effects of the scene are removed one at a time, and effects that the scene lacks are added one at a time, with typical
+    values. --out adds the figure."""
     if count_operations:
         from jaxvib.study.audit.operation_counts import operation_counts  # slow import, which --help does not need
 
@@ -71,34 +71,41 @@ def audit(
     share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
     loaded = loaded_scene(scene, without)
     with output.progress() as progress:
-        found = jv.audit(loaded, accuracy=share, possible=None if add_missing else (), progress=progress, **options)
-    if found.effects:
-        output.picture("audit.png", found.plot)
-    output.done(found.as_dict(), lambda: audit_text(found), "audit", found)
+        result = jv.audit(loaded, accuracy=share, possible=None if add_missing else (), progress=progress, **options)
+    if result.effects:
+        output.picture("audit.png", result.plot)
+    output.done(result.as_dict(), lambda: audit_text(result), "audit", result)
 
 
-def audit_text(found: jv.Audit) -> str:
-    """Return an `Audit` as text."""
-    took = "" if math.isnan(found.seconds) else f", a run of 100 turns {found.seconds:.2g} s, compiled in {found.compile:.2g} s"
-    lines = [f"{found.motion}: {found.kind}; {found.message}", f"equations of motion: {found.operations} operations{took}"]
-    if found.effects:
-        heading = f"changes by effects, %; requested accuracy {100.0 * found.accuracy:g} %"
-        absent = any(not row.present for row in found.effects)
+def audit_text(result: jv.Audit) -> str:
+    """Return the tables and notes of an `Audit` as text."""
+    time_text = (
+        "" if math.isnan(result.seconds) else f", a run of 100 turns {result.seconds:.2g} s, compiled in {result.compile:.2g} s"
+    )
+    lines = [
+        f"{result.motion}: {result.kind}; {result.message}",
+        f"equations of motion: {result.operations} operations{time_text}",
+    ]
+    if result.effects:
+        heading = f"changes by effects, %; requested accuracy {100.0 * result.accuracy:g} %"
+        absent = any(not row.present for row in result.effects)
         head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by"]
-        changes = [_changes(row) for row in found.effects]
+        changes = [_changes(row) for row in result.effects]
         lines.append(table(f"{heading}; in brackets: added effects" if absent else heading, head, changes))
         head = ["effect", "operations", "time of a run", "time to compile"]
-        lines.append(table("cost of effects", head, [_cost(row, found) for row in found.effects]))
-    lines += [f"{row.effect.replace('_', ' ')}: {row.note}" for row in found.effects if row.note]
-    offs = [
+        lines.append(table("cost of effects", head, [_cost(row, result) for row in result.effects]))
+    lines += [f"{row.effect.replace('_', ' ')}: {row.note}" for row in result.effects if row.note]
+    tier_rows = [
         [t.tier, *map(_percent, (t.amplitude, t.foundation_force, t.omega)), _seconds(t.seconds), _seconds(t.compile)]
-        for t in found.tiers
+        for t in result.tiers
     ]
-    if offs:
-        lines.append(table("tiers: error, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], offs))
-    lines += [f"{t.tier}: {t.note}" for t in found.tiers]
-    if found.numbers:
-        numbers = [[n.name, f"{n.value:.3g}", f"{n.limit:.3g}", n.advice] for n in found.numbers]
+    if tier_rows:
+        lines.append(
+            table("tiers: error, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], tier_rows)
+        )
+    lines += [f"{t.tier}: {t.note}" for t in result.tiers]
+    if result.numbers:
+        numbers = [[n.name, f"{n.value:.3g}", f"{n.limit:.3g}", n.advice] for n in result.numbers]
         lines.append(
             table(
                 "effects that are not in the scene, estimated by dimensionless numbers",
@@ -106,7 +113,7 @@ def audit_text(found: jv.Audit) -> str:
                 numbers,
             )
         )
-        lines += [f"{n.name.partition(':')[0]}: {n.note}" for n in found.numbers]
+        lines += [f"{n.name.partition(':')[0]}: {n.note}" for n in result.numbers]
     return "\n".join(lines)
 
 
@@ -120,10 +127,10 @@ def _changes(row: EffectRow) -> list[str]:
     return [_name(row), row.advice, *changes, row.tier.replace("exact orbit", "exact")]
 
 
-def _cost(row: EffectRow, found: jv.Audit) -> list[str]:
+def _cost(row: EffectRow, result: jv.Audit) -> list[str]:
     cost = [f"{row.operations:+d}"]
-    for mine, whole in ((row.seconds, found.seconds), (row.compile, found.compile)):
-        cost.append("" if math.isnan(mine) else f"{100.0 * mine / whole:+.0f} %")
+    for added_time, total_time in ((row.seconds, result.seconds), (row.compile, result.compile)):
+        cost.append("" if math.isnan(added_time) else f"{100.0 * added_time / total_time:+.0f} %")
     return [_name(row), *cost]
 
 

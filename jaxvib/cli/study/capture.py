@@ -62,41 +62,43 @@ def capture(
     if not -1.0 <= low < high <= 0.0:
         raise jv.InputError("--from", f"is {low:g} with --to {high:g}; the speeds must ascend and lie between -1 and 0")
     loaded = loaded_scene(scene)
-    found = jv.capture(
+    result = jv.capture(
         loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, rotation=rotation
     )
-    output.picture("capture.png", found.plot)
+    output.picture("capture.png", result.plot)
 
     def paths() -> Figure:
         from jaxvib.draw.capture import torus_paths
         from jaxvib.study.capture.capture import moving_state
 
         # One run starts just above the threshold, or at the highest speed if no threshold was found.
-        speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high
+        speed = (
+            min(high, float(result.threshold) + 2.0 * float(result.uncertainty)) if math.isfinite(result.threshold) else high
+        )
         until = 2.0 * math.pi * min(turns, 400) / float(loaded.drive.speed)
         run = jv.simulate(loaded, until, start=jv.with_spin(loaded, moving_state(loaded, speed), rotation), estimate=False)
-        kept = run.trajectory
-        assert kept is not None
-        around = np.asarray(kept.state.azimuth) - np.asarray(kept.rotor_angle)[:, None]
-        rate = np.asarray(kept.state.azimuth_rate) / np.asarray(kept.rotor_speed)[:, None] - 1.0
-        return torus_paths(around, np.asarray(kept.state.angle[1]), rate, np.asarray(kept.time))
+        trajectory = run.trajectory
+        assert trajectory is not None
+        relative_angle = np.asarray(trajectory.state.azimuth) - np.asarray(trajectory.rotor_angle)[:, None]
+        rate = np.asarray(trajectory.state.azimuth_rate) / np.asarray(trajectory.rotor_speed)[:, None] - 1.0
+        return torus_paths(relative_angle, np.asarray(trajectory.state.angle[1]), rate, np.asarray(trajectory.time))
 
     output.picture("paths.png", paths)
 
     def text() -> str:
         rows = [
             [f"{v:.5f}", f"{f:.3f}", f"{e:.3f}" if starts > 1 else ""]
-            for v, f, e in zip(found.speed, found.fraction, found.standard_error, strict=True)
+            for v, f, e in zip(result.speed, result.fraction, result.standard_error, strict=True)
         ]
         head = ["initial speed / rotor speed", "share captured", "standard error"]
-        rows = [row for k, row in enumerate(rows) if show_all or _is_near_change(found.fraction, k)]
+        rows = [row for k, row in enumerate(rows) if show_all or _is_near_change(result.fraction, k)]
         title = "starts captured" if show_all else "starts captured, where the share changes (all speeds: --all)"
-        return found.summary() + "\n" + table(title, head, rows)
+        return result.summary() + "\n" + table(title, head, rows)
 
-    document = {**found.as_dict(), **fields_of(found, "fraction", "standard_error")}
-    output.done(document, text, "capture", found)
+    document = {**result.as_dict(), **fields_of(result, "fraction", "standard_error")}
+    output.done(document, text, "capture", result)
 
 
 def _is_near_change(share: np.ndarray, k: int) -> bool:
-    """Return True at both ends, and if the share of a neighbour is different."""
+    """Return True for the first and the last speed, and for speeds at which the share differs from that of a neighbour."""
     return k in (0, len(share) - 1) or share[k] != share[k - 1] or share[k] != share[k + 1]

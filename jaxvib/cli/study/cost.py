@@ -23,7 +23,7 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
 @app.command("cost")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="Computed quantity.")
-@click.option("--mode", type=int, help="Number of the jam mode [highest stable one below the rotor speed].")
+@click.option("--mode", type=int, help="Number of the jam mode [second-highest of those that are stable by slope].")
 @click.option(
     "--until",
     help="Duration of the time integration, such as 20s [20 periods of the lowest natural frequency; for a jam, until "
@@ -51,9 +51,9 @@ def cost(
     options: dict[str, Any] = dict(mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats)
     loaded = loaded_scene(scene, speed=speed)
     with output.progress() as progress:
-        found = jv.work_precision(loaded, quantity, progress=progress, **options)
-    output.picture("cost.png", found.plot)
-    output.done(cost_document(found), lambda: cost_table(found), "cost", found)
+        result = jv.work_precision(loaded, quantity, progress=progress, **options)
+    output.picture("cost.png", result.plot)
+    output.done(cost_document(result), lambda: cost_table(result), "cost", result)
 
 
 def cost_document(cost: Cost) -> dict[str, object]:

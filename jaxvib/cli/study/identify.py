@@ -134,7 +134,7 @@ def _identify_machine(tables: Tables, folder: Path, output: Output, options: lis
     found = jv.identify(fit.scene, fit.runs, unknown=fit.unknown, known=fit.known)
     assert isinstance(found, jv.MachineFit)
     output.picture("fit.png", found.plot)
-    output.keep("fit.npz", found)
+    output.save_result("fit.npz", found)
     path = output.file("found.toml")
     if path is not None:
         path.write_text(rewrite_scene(fit.scene_file.read_text(encoding="utf-8"), found.scene), encoding="utf-8")

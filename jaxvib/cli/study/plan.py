@@ -29,27 +29,29 @@ def plan(identification: Path, fit: Path | None, output: Output) -> None:
     from jaxvib.exchange.recordings.fit_file import fit_from_tables
     from jaxvib.machine.files import read_toml
 
-    given = fit_from_tables(read_toml(identification), identification.parent)
-    if not given.candidates:
+    fit_input = fit_from_tables(read_toml(identification), identification.parent)
+    if not fit_input.candidates:
         raise InputError("candidate", "is missing; write [[candidate]] for each run that could be recorded next")
-    found = jv.load(fit) if fit else jv.identify(given.scene, given.runs, unknown=given.unknown, known=given.known)
-    if not isinstance(found, jv.MachineFit):
-        raise InputError("--fit", f"is a file of {type(found).__name__}; it must be a fit.npz of jaxvib identify")
-    plan = jv.plan_runs(found, given.candidates, given.limits)
+    machine_fit = (
+        jv.load(fit) if fit else jv.identify(fit_input.scene, fit_input.runs, unknown=fit_input.unknown, known=fit_input.known)
+    )
+    if not isinstance(machine_fit, jv.MachineFit):
+        raise InputError("--fit", f"is a file of {type(machine_fit).__name__}; it must be a fit.npz of jaxvib identify")
+    plan = jv.plan_runs(machine_fit, fit_input.candidates, fit_input.limits)
     output.picture("plan.png", plan.plot)
-    output.keep("plan.npz", plan)
+    output.save_result("plan.npz", plan)
     profile = plan.profile
     document = {"status": plan.status_name, "message": plan.message}
     document |= fields_of(plan, "candidates", "numbers", "errors", "now", "minutes", "benefit")
     document["profile"] = None if profile is None else fields_of(profile, "times", "speeds")
 
     def text() -> str:
-        def shown(error: float) -> str:
+        def error_text(error: float) -> str:
             return f"{error:.2g}" if np.isfinite(error) else "-"
 
-        rows = [["so far", "", "", *map(shown, plan.now)]]
+        rows = [["so far", "", "", *map(error_text, plan.now)]]
         for name, minutes, benefit, errors in zip(plan.candidates, plan.minutes, plan.benefit, plan.errors, strict=True):
-            rows.append([name, f"{minutes:.3g}", f"{benefit:.3g}", *map(shown, errors)])
+            rows.append([name, f"{minutes:.3g}", f"{benefit:.3g}", *map(error_text, errors)])
         heads = ["run", "minutes", "benefit per minute", *(f"({k + 1})" for k in range(len(plan.numbers)))]
         lines = [f"({k + 1}) {name}" for k, name in enumerate(plan.numbers)]
         lines.append(table("expected relative standard errors; -: not determined", heads, rows))

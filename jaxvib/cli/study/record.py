@@ -30,19 +30,19 @@ def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None
     from jaxvib.exchange.recordings.read import read_recording
 
     channels = read_recording(recording, rate)
-    found = [overview_of(each) for each in channels]
+    overviews = [overview_of(channel) for channel in channels]
     run = speed_of(channels, pulses, speed, per_turn)
     curve = None if run is None else run.rotor_speed()
-    notes = [note for each in found for note in each.notes] + ([] if run is None else list(run.notes))
+    notes = [note for overview in overviews for note in overview.notes] + ([] if run is None else list(run.notes))
     signals = [
-        (f"{each.name}{f', {each.unit}' if each.unit else ''}", each.time, each.values)
-        for each in channels
-        if each.time is not None
+        (f"{channel.name}{f', {channel.unit}' if channel.unit else ''}", channel.time, channel.values)
+        for channel in channels
+        if channel.time is not None
     ]
     output.picture("recording.png", lambda: recording_chart(signals, curve))
     document = {
         "file": str(recording),
-        "channels": [{k: v for k, v in each._asdict().items() if k != "notes"} for each in found],
+        "channels": [{k: v for k, v in overview._asdict().items() if k != "notes"} for overview in overviews],
         "speed": None,
         "notes": notes,
     }
@@ -50,22 +50,22 @@ def record(recording: Path, pulses: str | None, per_turn: int, speed: str | None
     if curve is not None:
         time, values = curve
         document["speed"] = {"start": values[0], "end": values[-1], "low": np.min(values), "high": np.max(values)}
-        shown = np.linspace(time[0], time[-1], _SHOWN_TIMES)
-        rows_of_speed = [[f"{t:.4g}", speed_text(float(np.interp(t, time, values)), 5)] for t in shown]
+        shown_times = np.linspace(time[0], time[-1], _SHOWN_TIMES)
+        rows_of_speed = [[f"{t:.4g}", speed_text(float(np.interp(t, time, values)), 5)] for t in shown_times]
 
     def text() -> str:
         rows = [
             [
-                each.name,
-                each.unit,
-                "" if np.isnan(each.rate) else f"{each.rate:.6g}",
-                f"{each.samples}",
-                "" if np.isnan(each.start) else f"{each.start:.4g} to {each.end:.4g}",
-                f"{each.low:.4g} to {each.high:.4g}",
-                f"{each.missing or ''}",
-                f"{each.clipped or ''}",
+                overview.name,
+                overview.unit,
+                "" if np.isnan(overview.rate) else f"{overview.rate:.6g}",
+                f"{overview.samples}",
+                "" if np.isnan(overview.start) else f"{overview.start:.4g} to {overview.end:.4g}",
+                f"{overview.low:.4g} to {overview.high:.4g}",
+                f"{overview.missing or ''}",
+                f"{overview.clipped or ''}",
             ]
-            for each in found
+            for overview in overviews
         ]
         heads = ["channel", "unit", "rate, Hz", "readings", "time, s", "values", "missing", "clipped"]
         lines = [table(str(recording), heads, rows)]

@@ -15,7 +15,7 @@ from jaxvib.errors import InputError, optional_module, quoted
 if TYPE_CHECKING:
     from jaxvib.sweeps.sweep import Progress, Sweep
 
-_QUIET = 10.0
+_SECONDS_BETWEEN_LINES = 10.0
 """Time between lines of progress, s, if the output is not a terminal."""
 
 
@@ -46,15 +46,15 @@ def sweep(
         raise InputError("--no-resume", f"is given, but {quoted(str(path))} exists already; give another folder with --store")
     definition = load_study(study)
     output.end_waiting()
-    show = _Lines()
+    show = _ProgressLines()
     try:
-        found = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
+        result = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
     except KeyboardInterrupt:
         show.end()
         click.echo(f"stopped: finished cases are saved in {path}; run the same command again to continue", err=True)
         raise
     show.end()
-    _print_result(found, output, "sweep")
+    _print_result(result, output, "sweep")
 
 
 @app.command("show")
@@ -68,33 +68,33 @@ def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory:
     tornado.png."""
     from jaxvib.sweeps.sweep import open_sweep
 
-    found = open_sweep(store)
+    result = open_sweep(store)
     if output.folder is not None or output.report is not None:
         from jaxvib.sweeps.figures import figures
 
         x, y = over or (None, None)
         for name, figure in figures(store, measure, x=x, y=y, theory=theory):
             output.picture(f"{name}.png", lambda drawn=figure: drawn)
-    _print_result(found, output, "show")
+    _print_result(result, output, "show")
 
 
-def _print_result(found: Sweep, output: Output, name: str) -> None:
+def _print_result(result: Sweep, output: Output, name: str) -> None:
     if name == "sweep":
-        output.picture("sweep.png", found.plot)
+        output.picture("sweep.png", result.plot)
     from jaxvib.sweeps.results import results_table  # slow import, which --help does not need
 
-    rows = [[status, str(cases), f"{100.0 * cases / found.cases:.3g} %"] for status, cases in found.counts]
+    rows = [[status, str(cases), f"{100.0 * cases / result.cases:.3g} %"] for status, cases in result.counts]
 
     def text() -> str:
-        counted = table(found.store, ["status", "cases", "share"], rows)
-        title, heads, results = results_table(found.store)
-        return "\n".join([counted, found.summary(), *([table(title, heads, results)] if results else [])])
+        count_table = table(result.store, ["status", "cases", "share"], rows)
+        title, heads, results = results_table(result.store)
+        return "\n".join([count_table, result.summary(), *([table(title, heads, results)] if results else [])])
 
-    output.done(found.as_dict(), text, name, found)
+    output.done(result.as_dict(), text, name, result)
 
 
-class _Lines:
-    """Progress on the last line of the terminal, or, if the output is not a terminal, as a new line at intervals."""
+class _ProgressLines:
+    """Display of the progress on the last line of a terminal; if the output is not a terminal, as new lines at intervals."""
 
     def __init__(self) -> None:
         self.last = time.monotonic()
@@ -102,11 +102,11 @@ class _Lines:
 
     def __call__(self, now: Progress) -> None:
         share = 100.0 * now.done / now.cases
-        text = f"{now.done} of {now.cases} cases ({share:.1f} %), {now.rate:.3g} a second, {_clock(now.left)} left"
+        text = f"{now.done} of {now.cases} cases ({share:.1f} %), {now.rate:.3g} a second, {_duration_text(now.left)} left"
         if sys.stderr.isatty():
             click.echo(f"\r\x1b[K{text}", nl=False, err=True)
             self.open = True
-        elif time.monotonic() - self.last > _QUIET:
+        elif time.monotonic() - self.last > _SECONDS_BETWEEN_LINES:
             self.last = time.monotonic()
             click.echo(text, err=True)
 
@@ -116,7 +116,7 @@ class _Lines:
             click.echo(err=True)
 
 
-def _clock(seconds: float) -> str:
-    whole = round(seconds)
-    hours, rest = divmod(whole, 3600)
+def _duration_text(seconds: float) -> str:
+    total = round(seconds)
+    hours, rest = divmod(total, 3600)
     return f"{hours} h {rest // 60} min" if hours else f"{rest // 60} min {rest % 60} s" if rest >= 60 else f"{rest} s"

@@ -115,7 +115,7 @@ def test_power_keeps_its_digits_for_any_drag(drag):
         np.testing.assert_allclose(slope(s.machine.stiffness), [right * amount], rtol=1e-6)
 
 
-def test_tiers_agree_with_the_functions_they_stand_for():
+def test_tiers_agree_with_the_functions_of_the_package():
     orbit = jv.jam_orbit(SCENE, mode=3)
     np.testing.assert_allclose(amplitude(mode=3, of=2, tier="exact")(SCENE), orbit.amplitude[1], rtol=1e-12)
     np.testing.assert_allclose(foundation_force(mode=3, tier="exact")(SCENE), orbit.foundation_force, rtol=1e-12)
@@ -132,7 +132,7 @@ def test_tiers_agree_with_the_functions_they_stand_for():
     assert (2.0 * force).at_tier("exact").parts[1].tier == "exact" and peak_force(until=2.0, spin_up=1.0).forward_only
 
 
-def test_cases_are_other_scenes():
+def test_a_case_changes_parameters_of_the_scene():
     heavy = under(jam_frequency(mode=3), "heavy", {"machine.mass[0]": "150 kg", "drive.speed": 130.0})
     there = eqx.tree_at(lambda s: (s.machine.mass, s.drive.speed), SCENE, (jnp.array([150.0, 95.0]), jnp.asarray(130.0)))
     found = evaluate_quantities([heavy, jam_frequency(mode=3)], jax.tree.map(one, SCENE))[0]
@@ -141,7 +141,7 @@ def test_cases_are_other_scenes():
         under(STIFFNESS, "x", {"loads.inertia": 1.0})(SCENE)
 
 
-def test_tolerances_are_kept_by_95_of_100():
+def test_95_of_100_samples_are_within_the_tolerance():
     off = {"machine.stiffness": 0.05}
     stiff = Quantity("k", "N/m", lambda s: s.machine.stiffness[0])
     asked = [expected(stiff, off), worst(stiff, off), quantile(stiff, 0.975, off, samples=1000), -worst(-stiff, off)]
@@ -156,7 +156,7 @@ def test_tolerances_are_kept_by_95_of_100():
 
 
 @pytest.mark.slow
-def test_quantities_in_time():
+def test_quantities_by_time_integration():
     s = jv.Scene(
         jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
         jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5),
@@ -200,17 +200,17 @@ def test_quantities_in_time():
         (lambda: total("machine.length"), "must name parameters of a scene"),
     ],
 )
-def test_wrong_wishes_are_said_in_one_sentence(make, says):
+def test_wrong_quantities_raise_clear_errors(make, says):
     with pytest.raises(jv.InputError) as caught:
         make()
     assert says in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_powers_have_the_power_of_a_unit_or_none():
+def test_power_of_a_quantity_has_the_power_of_its_unit():
     share = Quantity("share", "", lambda s: s.loads.mass / s.machine.mass[0])
     assert (STIFFNESS**2).unit == "(N/m)**2" and (share**2).unit == ""
 
 
-def test_platforms_of_a_phase_stay_with_what_is_made_of_it():
+def test_arithmetic_keeps_the_platforms_of_a_phase():
     for made in (phase(mode=3, of=(2, 1)), -phase(mode=3, of=(2, 1)), 2.0 * phase(mode=3, of=(2, 1))):
         assert made.of == (2, 1)

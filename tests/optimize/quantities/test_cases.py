@@ -77,7 +77,7 @@ def test_a_case_is_a_quantity_of_another_scene():
         (lambda: quantile(FIRST, 0.0, {"machine.stiffness": 0.05}), "less than 1"),
     ],
 )
-def test_wrong_cases_are_said_in_one_sentence(make, says):
+def test_wrong_cases_raise_clear_errors(make, says):
     with pytest.raises(jv.InputError, match=says):
         make()
 

@@ -23,7 +23,7 @@ def modes():
     return jv.jam_modes(SCENE)
 
 
-def test_runs_from_a_jam_last_sixty_lowest_periods(monkeypatch):
+def test_runs_from_a_jam_last_sixty_slowest_periods(monkeypatch):
     asked = []
     monkeypatch.setattr(answers_module, "simulate", lambda scene, until, **more: asked.append((until, more)))
     evaluation = Evaluation(SCENE)
@@ -41,7 +41,7 @@ def test_runs_from_a_jam_last_sixty_lowest_periods(monkeypatch):
     assert kept.jam_run(3) == "the run" and len(asked) == 2
 
 
-def test_runs_of_a_scene_that_is_not_known_are_traced(monkeypatch):
+def test_runs_of_traced_scenes_are_traced(monkeypatch):
     """A search asks for the shapes of all quantities before it has numbers."""
     monkeypatch.setattr(
         answers_module, "simulate", lambda scene, until, **_: SimpleNamespace(window=scene.machine.mass * until)
@@ -86,13 +86,13 @@ def test_modes_are_numbered():
 
 
 @pytest.mark.parametrize(("of", "found"), [(None, (1, 2)), (2, 2), ([1, 2], (1, 2)), ((2, 1), (2, 1)), ((1,), 1)])
-def test_whose_amplitude(of, found):
+def test_default_platforms_of_an_amplitude(of, found):
     assert between(SCENE, of) == found
     assert between(scene("one_mass")) == 1
 
 
 @pytest.mark.parametrize("of", [0, 3, True, 1.0, (1, 1), (1, 3), (1, 2, 1), ()])
-def test_whose_amplitude_there_is_not(of):
+def test_unknown_platforms_of_an_amplitude_are_refused(of):
     with pytest.raises(jv.InputError, match="a pair of different platforms of 1 to 2"):
         between(SCENE, of)
 
@@ -125,7 +125,7 @@ def test_amplitudes_and_forces_of_each_tier():
     np.testing.assert_array_equal(foundation_force(mode=3).pieces(known, -1.0), [-7.0])
 
 
-def test_what_users_give_is_read():
+def test_numbers_and_units_of_users_are_read():
     assert (
         count_required_arguments(lambda s: s) == 1
         and count_required_arguments(lambda s, m: s) == 2
@@ -139,7 +139,7 @@ def test_what_users_give_is_read():
             total(wrong)
 
 
-def test_a_mode_is_not_followed_to_another_one(modes):
+def test_following_does_not_reach_another_mode(modes):
     """The start is the speed of mode 4, where the branch falls; mode 3 lies where it rises."""
     key = ((), ("jam", 3))
     near = {mode: Evaluation(SCENE, {key: modes.select(mode).omega}) for mode in (3, 4)}

@@ -64,7 +64,7 @@ def test_platforms_sag_under_the_weight_above():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-9, 1e9])
-def test_platforms_that_nothing_carries_have_no_deflection(scale):
+def test_unsupported_platforms_have_no_static_deflection(scale):
     """Up to rounding the stiffness matrix is singular: the solution would be 1e13 m, or any number."""
     free = with_springs(THREE, np.zeros(3), scale * np.array([1e4, 5e3, 2e4]))
     for of in (None, 1, 2, 3):
@@ -89,7 +89,7 @@ def cost(prices, *springs):
     return float(spring_cost(prices)(with_springs(SCENE, support, link)))
 
 
-def test_springs_cost_what_the_list_says():
+def test_spring_cost_follows_the_price_list():
     rising = [(1e4, 20.0), ("20 N/mm", 30.0), (4e4, 90.0)]
     assert cost(rising, 1e4, 1.5e4, 3e4) == pytest.approx(20.0 + 25.0 + 60.0)
     assert cost(rising, 0.0, 0.0, 4e4) == pytest.approx(90.0)  # no spring costs nothing

@@ -24,7 +24,7 @@ def evaluation(size, force=None):
 
 @pytest.mark.parametrize("within", [0.05, 0.2])
 @pytest.mark.parametrize("size", [0.02, 3.0])
-def test_the_amplitude_settles_within_a_share(within, size):
+def test_settling_time_ends_within_the_given_share(within, size):
     """size (1 - exp(-t)): off by more than the share of its end until t = -ln(within). Samples are 5 ms apart."""
     asked = settling_time(until=10.0, spin_up="2 s", within=within, of=2)
     last = float(jnp.mean(1.0 - jnp.exp(-TIME[-100:])))
@@ -34,7 +34,7 @@ def test_the_amplitude_settles_within_a_share(within, size):
     np.testing.assert_allclose(later, 4.0, atol=0.006)
 
 
-def test_what_still_changes_settles_at_the_end():
+def test_settling_time_of_unsettled_motion_is_the_end():
     falling = evaluation(2.0 - 0.1 * TIME)
     np.testing.assert_allclose(settling_time(until=10.0, spin_up=2.0, within=0.001, of=2).read(falling), 10.0, atol=0.006)
     # Where not even the last sample is near enough, the end of the run is the answer, and nothing moves it.

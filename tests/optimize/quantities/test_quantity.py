@@ -54,7 +54,7 @@ def test_the_largest_piece_is_the_quantity(quantity, sign, pieces):
     np.testing.assert_allclose(jnp.max(found), sign * quantity(SCENE), rtol=1e-14)
 
 
-def test_functions_of_a_scene_or_of_its_modes_too():
+def test_functions_of_a_scene_and_of_its_jam_modes():
     Quantity("one", "", lambda s: s.drive.speed)
     Quantity("two", "", lambda s, modes: modes.omega[0])
     Quantity("more may be given", "", lambda s, k=3: s.drive.speed)
@@ -63,7 +63,7 @@ def test_functions_of_a_scene_or_of_its_modes_too():
             Quantity("wrong", "", wrong)
 
 
-def test_units_and_words_of_expressions():
+def test_units_and_names_of_expressions():
     force, arm, time = constant("force", 3.0, "N"), constant("arm", 2.0, "m"), constant("time", 1.0, "s")
     expressions = {
         (force + "2 N"): ("force + 2 N", "N"),
@@ -88,14 +88,14 @@ def test_units_and_words_of_expressions():
 
 
 @pytest.mark.parametrize("wrong", [True, float("inf"), None, [1.0]])
-def test_what_is_no_number_is_refused(wrong):
+def test_operands_that_are_not_numbers_are_refused(wrong):
     with pytest.raises(ValueError, match=r"the value combined with a is .*(write a number in|finite number|one number)"):
         A + wrong
     with pytest.raises(ValueError, match=r"is 3\.0; it must be a Quantity"):
         largest(A, 3.0)
 
 
-def test_demands_say_by_how_much_they_are_not_met():
+def test_excess_of_a_demand_is_its_violation():
     evaluation = Evaluation(SCENE)
     most, more, other = A < 3.0, A > 5.0, B < A
     assert (most.constant, more.constant, other.constant) == (3.0, 5.0, None)
@@ -106,7 +106,7 @@ def test_demands_say_by_how_much_they_are_not_met():
     assert (foundation_force(mode=3) < "2 kN").words == "foundation force, mode 3 at most 2 kN"
 
 
-def test_what_asks_knows_its_tiers():
+def test_quantities_list_their_tiers():
     asked = []
 
     def function(evaluation, tier, *settings):
@@ -131,14 +131,14 @@ def test_what_asks_knows_its_tiers():
 
 
 @pytest.mark.parametrize("text", ["10 Hz", "600 rpm", "600 1/min", "10 rps", "62.83185307179586 rad/s"])
-def test_a_text_in_a_sum_is_read_in_the_quantitys_unit(text):
+def test_text_in_a_sum_has_the_unit_of_the_quantity(text):
     speed = constant("speed", 100.0, "rad/s")
     np.testing.assert_allclose((speed - text)(SCENE), 100.0 - 20.0 * np.pi, rtol=1e-14)
     np.testing.assert_allclose((text + speed)(SCENE), 100.0 + 20.0 * np.pi, rtol=1e-14)
     np.testing.assert_allclose((speed < text).constant, 20.0 * np.pi, rtol=1e-14)
 
 
-def test_a_ratio_to_a_text_in_hertz_counts_turns():
+def test_ratio_of_a_speed_to_hertz_counts_revolutions():
     speed = constant("speed", 100.0, "rad/s")
     assert (speed / "10 Hz").unit == ""
     np.testing.assert_allclose((speed / "10 Hz")(SCENE), 5.0 / np.pi, rtol=1e-14)

@@ -84,7 +84,7 @@ def test_the_descent_is_adam_with_an_augmented_lagrangian():
     np.testing.assert_array_equal(told[0][1], found.history[STEPS_PER_CALL - 1])
 
 
-def test_a_step_to_where_there_is_nothing_is_not_taken():
+def test_step_to_a_missing_objective_is_rejected():
     def edge(x, y, log=np.log):
         return np.where(x < 3.0, bowl(x, y), np.nan)
 
@@ -113,7 +113,7 @@ def test_held_quantities_are_corrected_at_every_step(start):
     np.testing.assert_allclose(1.0 + 8.0 * found.point.z[0], [least, 7.0 - least], atol=0.02)
 
 
-def test_the_first_step_goes_along_what_is_held():
+def test_first_step_keeps_the_held_quantity():
     """Adam's first step takes the signs of the gradient's part along x + y = const: both numbers by the rate, one up, one down;
     what was off, the sum by 0.4 of 7, is taken off both alike. A number at its bound stays there."""
     total = plain("sum", lambda x, y: x + y)
@@ -125,7 +125,7 @@ def test_the_first_step_goes_along_what_is_held():
     np.testing.assert_allclose(run(low, np.array([[0.0, 0.625]]), 1).point.z, [[0.0, 0.625]], atol=1e-12)
 
 
-def test_two_things_that_are_held_are_kept_together():
+def test_two_held_quantities_are_kept_together():
     """x + y = 7 and the link at 1e5 x: one number is left, and the least of the bowl on the line is found."""
     total, link = (
         plain("sum", lambda x, y: x + y),

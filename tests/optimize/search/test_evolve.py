@@ -30,7 +30,7 @@ def valleys():
     return Quantity("rugged", "", rugged)
 
 
-def test_cma_finds_the_deepest_of_many_valleys(valleys):
+def test_cma_finds_the_lowest_of_many_minima(valleys):
     space = DesignSpace(SCENE, FREE)
     best = found(space, valleys, starts=20)
     np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [6e4, 5e4], rtol=1e-6)
@@ -52,14 +52,14 @@ def test_cma_searches_a_single_free_number():
     assert best.status_name == "done" and best.designs.shape[1] == 1
 
 
-def test_cma_keeps_demands_and_what_is_held():
+def test_cma_meets_demands_and_held_values():
     best = found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[SUM < "90 N/mm", FIRST < 4.5e4])
     np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [4.5e4, 4.5e4], rtol=1e-6)
     held = DesignSpace(SCENE, FREE, [hold(SUM, 9e4)])
     np.testing.assert_allclose(found(held, NEAREST).after.parameters["machine.stiffness"], [5e4, 4e4], rtol=1e-6)
 
 
-def test_an_interrupt_of_cma_keeps_what_it_has():
+def test_interrupted_cma_returns_its_best_designs():
     def stop(what, share):
         if what.startswith("evolving") and share > 0.2:
             raise KeyboardInterrupt
@@ -68,7 +68,7 @@ def test_an_interrupt_of_cma_keeps_what_it_has():
     assert best.status_name == "interrupted" and np.isfinite(best.values.min())
 
 
-def test_a_searcher_that_is_none_is_refused(monkeypatch):
+def test_unknown_searcher_is_refused(monkeypatch):
     with pytest.raises(jv.InputError, match=r"searcher is 'anneal'; it must be one of: 'gradients', 'cma'"):
         found(DesignSpace(SCENE, FREE), NEAREST, searcher="anneal")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -76,7 +76,7 @@ def test_a_searcher_that_is_none_is_refused(monkeypatch):
         found(DesignSpace(SCENE, FREE), NEAREST)
 
 
-def test_the_best_designs_that_differ_are_kept():
+def test_best_distinct_designs_are_kept():
     designs = np.array([[0.5, 0.5], [0.505, 0.495], [0.2, 0.5], [0.5, 0.52], [0.9, 0.9]])
     merits, kept = _best(np.array([3.0, 2.0, 5.0, 4.0, 1.0]), designs)
     np.testing.assert_array_equal(merits, [1.0, 2.0, 4.0, 5.0])
@@ -111,7 +111,7 @@ def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
     np.testing.assert_array_equal(followed.latest[0], [second[2], *first])
 
 
-def test_evolutions_begin_anew_with_twice_the_population(monkeypatch):
+def test_restarts_have_twice_the_population(monkeypatch):
     begun = []
     strategy = cma.CMAEvolutionStrategy
 
@@ -128,7 +128,7 @@ def test_evolutions_begin_anew_with_twice_the_population(monkeypatch):
     assert 1200 <= found.drawn < 1200 + sizes[-1]
 
 
-def test_an_evolution_counts_and_tells_what_it_tries():
+def test_evolution_counts_and_reports_its_designs():
     """The condition x > 5 alone has the objective: half of what is drawn at first. Breaking x + y <= 9 costs."""
     problem = problem_of(
         DesignSpace(SCENE, FREE),

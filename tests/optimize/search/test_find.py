@@ -36,12 +36,12 @@ def ended(values, violation, z=None):
     return SearchResult(point, np.zeros((1, s)), np.zeros(s), np.asarray(violation), none, s, s, False, BOUNDS)
 
 
-def test_the_best_is_the_least_that_keeps_all_demands():
+def test_best_design_is_the_least_that_meets_all_demands():
     assert ended([3.0, 1.0, 2.0, 2.5], [0.0, 1.0, 9e-8, 0.0]).best == 2
     assert ended([3.0, 1.0, 2.0, 2.5], [2e-7, 0.4, 0.3, 5.0]).best == 0  # none keeps them: the one that nearly does
 
 
-def test_the_few_to_go_on_from_are_the_best_that_differ():
+def test_best_distinct_designs_are_selected():
     z = [[0.5, 0.5], [0.505, 0.493], [0.2, 0.5], [0.5, 0.52], [0.9, 0.9], [0.1, 0.1]]
     found = ended([3.0, 2.0, 5.0, 4.0, np.nan, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], z)
     np.testing.assert_array_equal(_best_distinct(found), [z[1], z[3], z[2], z[5]])  # what keeps no demand comes last
@@ -50,7 +50,7 @@ def test_the_few_to_go_on_from_are_the_best_that_differ():
     assert _best_distinct(ended([np.nan], [np.inf])).shape == (0, 2)
 
 
-def test_how_far_a_number_is_from_its_catalogue():
+def test_distance_of_a_parameter_from_its_catalogue():
     assert (
         _distance_to_catalogue((1.0, 2.0, 4.0), 2.5) == 0.25
         and _distance_to_catalogue((1.0, 2.0, 4.0), 3.5) == 0.125
@@ -59,7 +59,7 @@ def test_how_far_a_number_is_from_its_catalogue():
     assert _distance_to_catalogue((0.0, 2.0), 0.0) == 0.0
 
 
-def test_a_jam_of_another_number_is_no_answer():
+def test_jam_with_another_mode_number_is_rejected():
     problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [], 2)
     z = np.array([[0.5, 0.5], [0.4, 0.3]])
     point = evaluate(problem, z, find_speeds(problem, z))
@@ -70,7 +70,7 @@ def test_a_jam_of_another_number_is_no_answer():
     np.testing.assert_array_equal(kept.slopes, point.slopes)
 
 
-def test_tolerances_count_wherever_they_stand():
+def test_tolerances_are_found_in_nested_quantities():
     space, off = DesignSpace(SCENE, FREE), {"machine.stiffness": 0.05}
     mean = expected(NEAR, off, samples=4)
     for objective, demands, counts in (
@@ -85,7 +85,7 @@ def test_tolerances_count_wherever_they_stand():
 OPTIONS = Options(starts=4, seed=0, iterations=25, rate=0.05, polishing=8)
 
 
-def test_a_search_tells_what_it_does_and_keeps_its_history():
+def test_search_reports_progress_and_history():
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], 4)
     told = []
     found = find(problem, OPTIONS, lambda what, share: told.append((what, share)))
@@ -157,7 +157,7 @@ def test_chosen_rows_of_a_catalogue_are_the_best_of_all():
     np.testing.assert_allclose(found.point.values[found.best, 0], bent(least[0] / 1e4, least[1] / 1e4), rtol=1e-9)
 
 
-def test_a_choice_that_is_the_best_anyway_needs_no_bounds():
+def test_optimum_in_the_catalogue_needs_no_branching():
     _, found = chosen(wish=lambda x, y: (x - 1.5) ** 2 + (y - 4.7) ** 2 + 1.0)
     assert found.nodes == 0
 
@@ -223,7 +223,7 @@ def test_interrupted_choice_is_in_its_catalogue(stage):
     assert found.interrupted and set(np.round(numbers, 6)) <= set(CATALOGUE) and len(after) == 1
 
 
-def test_choices_keep_demands_or_there_are_none(monkeypatch):
+def test_choices_meet_demands_or_none_is_returned(monkeypatch):
     product = plain("product", lambda x, y: x * y)
     problem, found = chosen([product > 9.0])
     tried = {pair: bent(*(np.array(pair) / 1e4)) for pair in itertools.product(CATALOGUE, CATALOGUE) if np.prod(pair) > 9e8}
@@ -235,7 +235,7 @@ def test_choices_keep_demands_or_there_are_none(monkeypatch):
 
 
 @pytest.mark.parametrize("bounds", [((1e4, 4e4), (2e4, 4e4)), ((7e4, 7e4), (7e4, 9e4))])
-def test_between_narrower_bounds_the_best_is_at_them(bounds):
+def test_best_design_in_narrow_bounds_lies_on_a_bound(bounds):
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], 4)
     low, high = (np.array(each) for each in bounds)
     found = find_module._solve_in_bounds(problem, low, high, np.array([[3e4, 3e4], [8e4, 1e4]]), OPTIONS.polishing)

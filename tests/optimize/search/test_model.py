@@ -27,7 +27,7 @@ def shape(equalities=0, demands=0, parts=1):
     return SimpleNamespace(equalities=equalities, demands=(None,) * demands, parts=parts)
 
 
-def test_the_shortest_solution_is_that_of_the_pseudoinverse():
+def test_least_norm_solution_equals_the_pseudoinverse():
     random = np.random.default_rng(0)
     rows, right = random.normal(size=(5, 2, 4)), random.normal(size=(5, 2))
     for size in (1.0, 1e-5):
@@ -156,7 +156,7 @@ def test_curvatures_at_a_kink_are_those_along_it():
     np.testing.assert_allclose(found[0], not_indefinite(hessian, piece_gradients[0, 0] - piece_gradients[0, 2]), atol=1e-8)
 
 
-def test_flat_directions_are_left_a_little_curvature():
+def test_flat_directions_get_a_small_curvature():
     """A model that is flat somewhere would have no least value: 1e-10 of the greatest curvature stays."""
     flat = np.diag([4.0, 0.0, -1.0])[None, :, None, :]
     point = point_of(np.full((1, 3), 0.5), np.array([[-1.0]]), np.ones((1, 1, 3)))
@@ -183,7 +183,7 @@ def test_step_minimizes_the_model_within_the_trust_region():
 
 
 @pytest.mark.parametrize("size", [0.01, 1.0, 4.0])
-def test_a_step_to_where_two_pieces_meet(size):
+def test_step_ends_at_the_kink_of_two_pieces(size):
     """max(2 p, 0.3 - p) + size p^2/2 of one number: they meet at p = 0.1, where 2 s - (1 - s) + size p = 0 shares them. A third
     piece stays below. Demands keep their own multipliers."""
     pieces, piece_gradients = np.array([[0.0, -0.3, 0.3]]), np.array([[[2.0], [-2.0], [-1.0]]])
@@ -206,7 +206,7 @@ def test_a_step_to_where_two_pieces_meet(size):
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
-def test_of_many_pieces_those_count_that_could_be_the_largest(way):
+def test_only_pieces_that_can_become_largest_are_used(way):
     """Forty, of which two meet at the least value: one is below all others now, and steep where the bound leaves room."""
     pieces, piece_gradients = np.full((1, 40), 4.7), way * np.linspace(-1.5, 1.5, 40)[None, :, None]
     pieces[0, [7, 21]], piece_gradients[0, [7, 21], 0] = [5.0, 4.5], [-2.0 * way, 8.0 * way]
@@ -218,7 +218,7 @@ def test_of_many_pieces_those_count_that_could_be_the_largest(way):
     np.testing.assert_allclose(np.sum(step.shares[0] * piece_gradients[0, :, 0]), 0.0, atol=1e-5)
 
 
-def test_what_an_objective_may_fall_by_is_the_models():
+def test_predicted_decrease_is_that_of_the_model():
     """g.p + p.B p/2 to its least value: g.B^-1 g/2, in parts of the objective."""
     random = np.random.default_rng(4)
     root = random.normal(size=(2, 3, 3))
@@ -233,7 +233,7 @@ def test_what_an_objective_may_fall_by_is_the_models():
     )
 
 
-def test_what_constraints_cost_does_not_count_as_a_fall():
+def test_constraint_terms_do_not_count_as_decrease():
     """f = x, to be at least where it is: the slope 1 is paid by the multiplier 1/size, nothing is left. Off by 0.1 the model
     moves there at that price."""
     for size in (1.0, 5.0):
@@ -260,7 +260,7 @@ def test_scale_of_a_zero_objective_is_its_change():
     np.testing.assert_allclose(predicted_decrease(shape(), tip, hessian, model, np.array([7.0])), [awaited], rtol=1e-12)
 
 
-def test_of_several_pieces_the_largest_after_the_step_counts():
+def test_largest_piece_after_the_step_counts():
     pieces, piece_gradients = np.array([[1.0, 0.9]]), np.array([[[-1.0], [0.5]]])
     point = point_of(np.array([[0.5]]), np.array([[1.0]]), piece_gradients[:, :1], pieces, piece_gradients)
     model = Step(np.array([[0.1]]), np.zeros((1, 0)), np.zeros((1, 0)), np.array([[0.5, 0.5]]))

@@ -39,7 +39,7 @@ def test_violation_is_the_largest_residual(held):
     np.testing.assert_array_equal(_merit(held, one, np.ones(1), np.array([1e9])), [9.0])  # rounding costs nothing
 
 
-def test_designs_are_moved_to_the_nearest_that_keep_what_is_held(held):
+def test_restore_moves_to_the_nearest_feasible_design(held):
     start = at(held, (3.0, 2.0), (6.0, 4.0), (1.0, 7.0), (8.0, 1.0))
     # Across the line; to the corner; what is at its bound stays there; no step is longer than 0.3 of a range.
     np.testing.assert_allclose(xy(restore(held, start, 2)), [[4.0, 3.0], [4.0, 3.0], [1.0, 6.0], [4.0, 3.0]], atol=1e-9)
@@ -51,7 +51,7 @@ def test_designs_are_moved_to_the_nearest_that_keep_what_is_held(held):
     assert restore(free, start, 2) is start
 
 
-def test_designs_are_moved_onto_the_kink_that_they_are_at():
+def test_restore_moves_designs_onto_their_kink():
     pieces = [plain(str(k), lambda x, y, k=k: (x - k) ** 2 + (y - 4.0) ** 2 + 1.0) for k in (3.0, 6.0)]
     problem = problem_of(DesignSpace(SCENE, FREE), largest(*pieces), [], starts=2)
     both = np.full((2, 2), 0.5)
@@ -64,7 +64,7 @@ MANY = problem_of(SPACE, NEAR, [FIRST < 4.0, FIRST < 5.0], starts=2)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
-def test_multipliers_are_those_that_the_slopes_were_made_of(scale):
+def test_multipliers_are_recovered_from_their_slopes(scale):
     """One held, two demands, a number at each kind of bound: the objective's slope is put together of known multipliers, and
     multipliers are ratios of slopes, whatever the size of these."""
     random = np.random.default_rng(0)
@@ -84,7 +84,7 @@ def test_multipliers_are_those_that_the_slopes_were_made_of(scale):
     assert np.all(found.kkt < 1e-9)
 
 
-def test_what_does_not_balance_is_the_residual():
+def test_kkt_residual_is_the_unbalanced_slope():
     """A demand that the objective leaves by itself, and bounds that it leaves, hold nothing back: the rest is the residual, in
     parts of the slope, or of the objective where this is larger, and no less than what is off."""
     none = np.zeros((1, 4))
@@ -122,7 +122,7 @@ def test_at_a_kink_the_slopes_of_its_pieces_balance():
     assert found.demands.shape == (3, 0) and found.held.shape == (3, 0)
 
 
-def test_starts_are_the_random_designs_that_have_the_objective():
+def test_starts_are_random_designs_with_an_objective():
     problem = problem_of(DesignSpace(SCENE, FREE), plain("half", lambda x, y: jnp.where(x > 5.0, x * y, jnp.nan)), [], starts=8)
     found = draw_starts(problem, 8, 3, find_speeds)
     random = np.random.default_rng(3)
@@ -134,7 +134,7 @@ def test_starts_are_the_random_designs_that_have_the_objective():
     assert draw_starts(nowhere, 4, 0, find_speeds, rounds=2) == (None, 8, 0, None)
 
 
-def test_starts_are_moved_onto_what_is_held():
+def test_starts_are_moved_to_the_held_values():
     product = plain("product", lambda x, y: x * y)
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(product, 40.0)]), NEAR, [], starts=8)
     found = draw_starts(problem, 8, 0, find_speeds)
@@ -166,7 +166,7 @@ def test_polishing_reports_its_residual_and_ends_early(held):
     np.testing.assert_allclose(shares[:4], [0.25, 0.5, 0.75, 1.0])
 
 
-def test_what_is_left_is_what_the_better_model_may_fall_by():
+def test_remaining_decrease_is_that_of_the_better_model():
     """f = x^2 + y^2 + 2 about its least value, g.g/2 H = f - 2: of the model with f'' it is (f - 2)/f, of that with (f^2/2)''/f
     = f'' + g g/f less by 1 + 2 (f - 2)/f."""
     problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], starts=2)
@@ -175,7 +175,7 @@ def test_what_is_left_is_what_the_better_model_may_fall_by():
     np.testing.assert_allclose(found.remaining_decrease, (f - 2.0) / f / (1.0 + 2.0 * (f - 2.0) / f), rtol=1e-5)
 
 
-def test_polishing_follows_a_bent_valley():
+def test_polishing_follows_a_curved_valley():
     """Rosenbrock's, whose floor is y = 2 + (x - 5)^2/2: quadratic convergence at its end, downhill all the way."""
     valley = plain("valley", lambda x, y: 10.0 * (y - 2.0 - (x - 5.0) ** 2 / 2.0) ** 2 + (x - 4.0) ** 2 + 1.0)
     problem = problem_of(DesignSpace(SCENE, FREE), valley, [], starts=4)
@@ -184,7 +184,7 @@ def test_polishing_follows_a_bent_valley():
     assert np.all(np.diff(ended.history, axis=0) <= 0.0) and np.all(ended.remaining_decrease < 1e-13)
 
 
-def test_a_dear_constraint_is_kept_at_last(held):
+def test_constraint_with_a_large_multiplier_is_met(held):
     """A slope of 1e4 objectives against a demand: its price rises until the demand is kept."""
     steep = plain("steep", lambda x, y: 1.0 - 1e4 * (x - 4.0) + (y - 3.0) ** 2)
     problem = problem_of(DesignSpace(SCENE, FREE), steep, [FIRST < 4.0], starts=2)
@@ -203,7 +203,7 @@ def test_scale_of_a_zero_objective_follows_from_its_slope():
     np.testing.assert_allclose(xy(ended.point), [[6.0, 5.0]], atol=1e-7)
 
 
-def test_the_last_step_is_taken_where_rounding_hides_its_fall():
+def test_step_with_decrease_below_rounding_is_accepted():
     """x^2 + y^2 along x + y = 7 at some 1e-8 from its least value: the fall is 1e-17 of it, the slope still shows the way."""
     squares = plain("squares", lambda x, y: x**2 + y**2)
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), squares, [], starts=16)
@@ -213,7 +213,7 @@ def test_the_last_step_is_taken_where_rounding_hides_its_fall():
     assert np.all(ended.violation < 1e-14)
 
 
-def test_trusted_steps_double_where_they_are_too_short():
+def test_trust_radius_doubles_after_full_steps():
     """Steps from x = 1.4 to 8.6, 0.9 of the range: 0.2, 0.4 and the rest; of steps of 0.2 it would be five."""
     bowl = plain("bowl", lambda x, y: (x - 8.6) ** 2 + (y - 5.0) ** 2 + 1.0)
     problem = problem_of(DesignSpace(SCENE, FREE), bowl, [], starts=2)

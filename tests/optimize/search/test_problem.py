@@ -29,7 +29,7 @@ def scene_of(batch, k):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), batch)
 
 
-def test_values_are_the_objective_what_is_held_and_the_demands():
+def test_values_are_objective_held_quantities_and_demands():
     """Objective 5 - x y; x + y = 7; x at most 4, in parts of 4; y at most x, in parts of the larger at the beginning, 5."""
     space = DesignSpace(SCENE, FREE, [hold(SUM, 7.0)])
     problem = problem_of(space, plain("o", lambda x, y: 5.0 - x * y), [FIRST < 4.0, plain("y", lambda x, y: y) < FIRST], 2)
@@ -46,7 +46,7 @@ def test_values_are_the_objective_what_is_held_and_the_demands():
         evaluate(problem, np.zeros((0, 2)), ())
 
 
-def test_pieces_stand_beside_the_values():
+def test_pieces_follow_the_values():
     problem = problem_of(DesignSpace(SCENE, FREE), largest(FIRST, 2.0 * SUM - 9.0), [FIRST < 4.0], 1)
     point = evaluate(problem, np.array([[0.25, 0.5]]), ())
     np.testing.assert_allclose(point.values, [[7.0, -0.25]])
@@ -66,7 +66,7 @@ def test_scale_of_a_demand_is_its_limit_or_first_value():
 
 
 @pytest.mark.parametrize(("starts", "lanes"), [(1, 1), (2, 2), (3, 4), (33, 64), (1000, 64)])
-def test_designs_that_are_computed_together_are_a_power_of_two(starts, lanes):
+def test_batch_size_is_a_power_of_two(starts, lanes):
     assert problem_of(DesignSpace(SCENE, FREE), NEAREST, [], starts).batch_size == lanes
 
 
@@ -91,7 +91,7 @@ def test_all_derivative_modes_agree_with_derivatives_by_hand():
         assert found == speed_slopes == ()
 
 
-def test_followed_speeds_and_how_they_change():
+def test_followed_speeds_and_their_derivatives():
     """The speed of a jam and its derivative by each number: central differences with steps of 1e-5, rounding 1e-10."""
     problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [], 4)
     assert [asked for _, asked in problem.keys] == [("jam", 3)]
@@ -109,7 +109,7 @@ def test_followed_speeds_and_how_they_change():
     np.testing.assert_allclose(ahead[0], omega + 1e-3 * point.slopes[:, 0].sum(axis=1), rtol=1e-12)
 
 
-def test_guesses_further_off_than_a_fifth_are_not_taken():
+def test_extrapolation_beyond_a_fifth_is_rejected():
     z = np.zeros((4, 2))
     known = np.array([10.0, 10.0, 10.0, np.nan])
     speed_slopes = np.array([[1.0, 0.5], [30.0, 0.0], [-30.0, np.inf], [1.0, 1.0]])
@@ -127,7 +127,7 @@ def test_guesses_further_off_than_a_fifth_are_not_taken():
     np.testing.assert_allclose(two, [[10.15, 19.85], [10.0, 17.0], [10.0, 20.0], [np.nan, np.nan]])
 
 
-def test_points_are_put_together_by_design():
+def test_points_are_combined_by_design():
     values, slopes = np.arange(6.0).reshape(3, 2), np.arange(12.0).reshape(3, 2, 2)
     point = point_of(np.zeros((3, 2)), values.copy(), slopes.copy())
     other = point_of(np.ones((3, 2)), -values, -slopes)
@@ -181,13 +181,13 @@ def test_first_search_uses_leading_order_and_no_tolerances():
         (EXACT, [TIMED], [], False),
     ],
 )
-def test_some_searches_come_first(objective, held, demands, first):
+def test_expensive_searches_begin_with_a_simplified_one(objective, held, demands, first):
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(each, 3.0) for each in held]), objective, demands)
     assert (problem.simplified() is not None) == first
     assert problem.forward_only == (objective is TIMED or TIMED in held)
 
 
-def test_reports_are_those_of_each_scene():
+def test_evaluated_quantities_are_those_of_each_scene():
     batch = scenes_of(problem_of(DesignSpace(SCENE, FREE), NEAREST, [], 4), np.array([[3e4, 4e4], [5e4, 6e4], [7e4, 8e4]]))
     np.testing.assert_array_equal(batch.machine.stiffness, [[3e4, 4e4], [5e4, 6e4], [7e4, 8e4]])
     frequency = jam_frequency(mode=3)

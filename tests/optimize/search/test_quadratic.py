@@ -55,7 +55,7 @@ def test_quadratic_program_is_independent_of_its_batch(monkeypatch):
     np.testing.assert_allclose(beside.p[0], 0.0, atol=1e-9)
 
 
-def test_boxes_and_amounts_may_be_far_from_nothing():
+def test_bounds_and_offsets_may_be_far_from_zero():
     """min p^2/2 between 100 and 101 with p = -1000 required: p is 100, the constraint is penalized, the bound has the rest."""
     box = np.full((1, 1), 100.0), np.full((1, 1), 101.0)
     one = np.ones((1, 1, 1))

@@ -49,13 +49,13 @@ def test_multipliers_are_those_computed_by_hand():
     assert best.rows()[0] == ["stiffness of support 1, N/mm", "50", "45", "", ""]
 
 
-def test_a_demand_that_does_not_hinder_has_no_multiplier():
+def test_inactive_demand_has_no_multiplier():
     best = found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[SUM < "150 N/mm"])
     np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [6e4, 5e4], rtol=1e-6)
     assert not best.limits[0].active and best.limits[0].multiplier == 0.0
 
 
-def test_contradictory_demands_are_named_with_what_is_missing():
+def test_contradictory_demands_are_named_with_their_excess():
     space, demands = DesignSpace(SCENE, FREE), [SUM > "120 N/mm", FIRST < 2e4]
     best = found(space, NEAREST, subject_to=demands, throw=False)  # 2e4 + 9e4 at most
     assert best.status_name == "contradictory" and best.same == 0
@@ -102,14 +102,14 @@ def test_worst_of_samples_ends_at_a_kink():
     assert best.status_name == "done"
 
 
-def test_bounds_that_hinder_are_told():
+def test_active_bounds_are_listed():
     best = found(DesignSpace(SCENE, {"machine.stiffness": (1e4, 5.5e4)}), NEAREST)
     (limit,) = best.limits  # k1 at 5.5; the objective falls by 2 (6 - 5.5) for each 1e4 N/m
     assert limit.what == "stiffness of support 1 at most 55 N/mm"
     np.testing.assert_allclose(limit.multiplier, -1e8 * 5.5, rtol=1e-5)
 
 
-def test_what_is_held_is_held_exactly():
+def test_held_quantities_keep_their_values_exactly():
     least = Quantity("sum of squares", "", lambda s: jnp.sum((s.machine.stiffness / 1e4) ** 2))
     best = found(DesignSpace(SCENE, FREE, [hold(product("machine.stiffness"))]), least)
     np.testing.assert_allclose(best.after.parameters["machine.stiffness"], np.full(2, np.sqrt(15e8)), rtol=1e-6)
@@ -118,7 +118,7 @@ def test_what_is_held_is_held_exactly():
     np.testing.assert_allclose(np.sum(best.after.parameters["machine.stiffness"]), 7e4, rtol=1e-12)
 
 
-def test_ties_make_numbers_follow_others():
+def test_tied_parameters_follow_their_sources():
     ties = {
         "machine.stiffness[1]": ("machine.stiffness[0]", 0.5),
         "machine.link_stiffness": ("machine.stiffness[0]", "keep"),
@@ -175,7 +175,7 @@ def antiphase(damping):
     return DesignSpace(form.scene(), {"machine.stiffness": (0.01, 0.3), "machine.link_stiffness": (0.1, 1.0)}, held)
 
 
-def test_a_demand_on_a_machine_costs_what_its_multiplier_says():
+def test_multiplier_predicts_the_cost_of_a_demand():
     """The multiplier of a demand, against searches with the limit moved to either side."""
     space = antiphase(1e-2)
     stiff = Quantity("k1", "N/m", lambda s: s.machine.stiffness[0])
@@ -215,7 +215,7 @@ def test_exact_designs_begin_at_those_to_leading_order():
 
 
 @pytest.mark.slow
-def test_a_robust_design_is_better_on_machines_it_has_not_seen():
+def test_robust_design_is_better_on_other_samples():
     off = {"machine.stiffness": 0.05}
     force = force_per_amplitude(mode=3)
     space = antiphase(1e-2)
@@ -226,7 +226,7 @@ def test_a_robust_design_is_better_on_machines_it_has_not_seen():
     assert worst(force, off).words.startswith("worst")
 
 
-def test_influences_on_almost_nothing_are_told_in_its_unit():
+def test_influences_on_a_tiny_objective_have_its_unit():
     """The objective nearly vanishes at the best machine, so that per cent of it mean nothing."""
     result = found(DesignSpace(SCENE, FREE), NEAREST + Quantity("rest", "N^2/m^2", lambda s: jnp.asarray(1e-3)))
     lines = [line for line in result.findings() if "1 % less / more" in line]
@@ -234,7 +234,7 @@ def test_influences_on_almost_nothing_are_told_in_its_unit():
     assert "+3.6e+05 N^2/m^2 / +3.6e+05 N^2/m^2" in lines[0] and "%" not in lines[0].split(":")[1]
 
 
-def test_demands_with_room_change_no_search():
+def test_inactive_demands_do_not_change_the_search():
     """The objective vanishes: small multipliers of demands with room would be large beside it."""
     alone = found(DesignSpace(SCENE, FREE), CONE, starts=8)
     beside = found(DesignSpace(SCENE, FREE), CONE, starts=8, subject_to=[FIRST < 8.9e4, SUM > 3e4])

@@ -24,7 +24,7 @@ def ended(z, values, held=(), demands=(), bounds=(0.0, 0.0), violation=None, lim
     return SearchResult(point, np.zeros((1, s)), np.zeros(s), violation, Optimality(*rows, np.zeros(s)), s, s, False, limits)
 
 
-def test_limits_are_told_with_what_moving_them_gains():
+def test_limits_have_the_gain_from_their_change():
     """Objective 5. Held: 7, off by 1e-3, multiplier 2. Demands: at 4 of 4, multiplier 3; with room; broken."""
     demands = [FIRST < 4.0, FIRST < 8.0, SUM < 2.0]
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), WISH, demands)
@@ -45,7 +45,7 @@ def test_limits_are_told_with_what_moving_them_gains():
     assert kept[0].violation == kept[1].violation == 0.0 and kept[1].active and not kept[3].active
 
 
-def test_a_limit_that_is_a_quantity_moves_by_its_value():
+def test_gain_of_a_limit_that_is_a_quantity():
     """y at most x: the multiplier is in parts of the scale, 5 at the beginning; of the limit's 3 it is 3/5."""
     demand = plain("y", lambda x, y: y) < FIRST
     problem = problem_of(DesignSpace(SCENE, FREE), WISH, [demand])
@@ -63,7 +63,7 @@ def test_a_limit_that_is_a_quantity_moves_by_its_value():
         ("log", 1.0, 3.0, "stiffness of support 1 at most 90 N/mm", -3.0 / np.log(9.0)),
     ],
 )
-def test_bounds_that_hinder_are_told(scale, z, dual, what, multiplier):
+def test_active_bounds_are_listed(scale, z, dual, what, multiplier):
     problem = problem_of(DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4, scale)}), WISH, [])
     (limit,) = limits_of(problem, [], ended([[z, 0.5]], [[4.0]], bounds=[dual, 0.0]), np.zeros((0, 2)))
     assert limit.what == what and limit.active and limit.violation == 0.0
@@ -86,7 +86,7 @@ def test_gains_are_of_the_best_design():
     np.testing.assert_allclose(near, [[9e4, 5e4], [8.91e4, 5e4], [9e4, 4.95e4], [9.09e4, 5e4], [9e4, 5.05e4]], rtol=1e-12)
 
 
-def test_influences_are_the_objectives_changes_in_per_cent():
+def test_influences_are_changes_of_the_objective():
     problem = problem_of(DesignSpace(SCENE, FREE), WISH, [])
     first, second = influences_of(problem, np.array([-4.0, -3.0, -4.4, -5.0, -4.2]))
     assert first.what == "stiffness of support 1" and second.what == "stiffness of support 2"
@@ -94,7 +94,7 @@ def test_influences_are_the_objectives_changes_in_per_cent():
     assert influences_of(problem, np.zeros(5)) == ()
 
 
-def test_machines_are_counted_by_how_far_they_are_apart():
+def test_machines_are_distinct_beyond_a_distance():
     problem = problem_of(DesignSpace(SCENE, FREE), WISH, [])
     z = [[0.5, 0.5], [0.25, 0.5], [0.5005, 0.4995], [0.25, 0.502], [0.9, 0.9], [0.1, 0.1]]
     found = ended(z, [[3.0], [2.0], [1.0], [4.0], [0.5], [np.nan]], violation=[0.0, 0.0, 0.0, 9e-8, 0.1, np.inf])
@@ -104,7 +104,7 @@ def test_machines_are_counted_by_how_far_they_are_apart():
     assert (second.starts, second.value, third.starts, third.value) == (1, 2.0, 1, 4.0)
 
 
-def test_what_the_machine_does_not_have_is_not_met():
+def test_demand_on_a_missing_quantity_is_not_met():
     """NaN keeps no demand, and nothing that is held."""
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), WISH, [FIRST < 4.0])
     found = ended([[0.5, 0.5]], [[np.nan, np.nan, np.nan]], [0.0], [0.0])
