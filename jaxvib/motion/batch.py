@@ -31,7 +31,7 @@ _ACCELERATOR_BATCH_SIZE = 2**18
 """Number of runs in a batch on an accelerator: enough to occupy all of its units, and few enough for its memory."""
 
 PARTS_OF_RUN = 64
-"""Number of equal parts of a run before its window; the mean speeds of the loads are measured over each part."""
+"""Number of equal parts of a run before its window; the mean speed of each load is measured over each part."""
 
 
 _DOUBLINGS = 40
@@ -72,12 +72,12 @@ def divide_run(
     if not implicit:
         return packed, begins, lengths
 
-    def doubled(k: Array, packed: IntegratorState) -> IntegratorState:
+    def double_step(k: Array, packed: IntegratorState) -> IntegratorState:
         end = step * 2.0 ** (k - _DOUBLINGS)
         begin = jnp.where(k == 0, 0.0, end / 2.0)
         return advance(motion, packed, begin, end - begin, end - begin, implicit=True)[0]
 
-    packed = jax.lax.fori_loop(0, _DOUBLINGS + 1, doubled, packed)
+    packed = jax.lax.fori_loop(0, _DOUBLINGS + 1, double_step, packed)
     return packed, begins.at[0].set(step), lengths.at[0].add(-step)
 
 
@@ -91,7 +91,7 @@ def pack_batch(
 
 
 def batch_size() -> int:
-    """Return the number of runs that advance together on JAX's default device."""
+    """Return the number of runs that advance together on the default device of JAX."""
     return BATCH_SIZE if is_processor() else _ACCELERATOR_BATCH_SIZE
 
 
@@ -117,12 +117,12 @@ class BatchPlan(NamedTuple):
 
 
 class BatchRun(NamedTuple):
-    """A run with its measurements.
+    """Run of a batch with its measurements.
 
-    **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured` and `regime` of the window, the latter
-    None without loads or with several exciters; `part_speed` (PARTS_OF_RUN, count): mean speeds of the loads, or of rotors
-    without loads, rad/s, over the equal parts before the window, each `part_length` s long; `finite`: True if the motion
-    stayed finite.
+    **Attributes**: `scene`; `window`: trajectory in the measuring window; `measured`: the quantities measured in the window;
+    `regime` of the window, None without loads or with several exciters; `part_speed` (PARTS_OF_RUN, count): mean speeds of the
+    loads, or of rotors without loads, rad/s, over the equal parts before the window; `part_length` of such a part, s; `finite`:
+    True if the motion stayed finite.
     """
 
     scene: Scene
@@ -161,8 +161,10 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     packed, begins, lengths = divide_run(motion, first, *sizes, PARTS_OF_RUN, implicit=plan.implicit)
     packed, parts = jax.lax.scan(part, packed, (begins, lengths))
     _, later = jax.lax.scan(sample, packed, jnp.arange(plan.samples - 1, dtype=dtype))
-    before = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)
-    azimuth, _ = turning_angles(scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(before))
+    packed_history = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)
+    azimuth, _ = turning_angles(
+        scene, lambda: length * jnp.arange(PARTS_OF_RUN + 1, dtype=dtype), motion.unpack(packed_history)
+    )
     states = motion.unpack(jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), packed, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(model, times, states)

@@ -39,8 +39,8 @@ from jaxvib.steady.outcome import REFUSED, without_numbers
 from jaxvib.units import Number
 
 _MAX_RELATIVE_ROTATION = 0.5
-"""Largest `Ensemble.relative_rotation` of a run whose masses turn at one speed, rad. It lies between a small swing about
-constant phases and a slow drift of the phases."""
+"""Largest `Ensemble.relative_rotation` of a run whose masses turn at one speed, rad. The value lies between that of a small
+swing about constant phases and that of a slow drift of the phases."""
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """Results of `_run`, for one run or for many."""
@@ -75,7 +75,8 @@ class Ensemble(Result):
 
     - `state`: final `State` of each run, with arrays that have a leading axis over the runs; in single precision angles are
       within one turn
-    - `load_speed` (B, count), rad/s: the mean speed of each load over the last quarter of the run
+    - `load_speed` (B, count), rad/s: the mean speed of each load, or of the rotor of an exciter without loads, over the last
+      quarter of the run
     - `relative_rotation` (B,), rad: largest difference between the angles through which two masses turn, each in its
       direction, in the last quarter of the run. A mass is a load, or the rotor of an exciter without loads. The difference is 0
       for a scene with one exciter
@@ -106,16 +107,17 @@ class Ensemble(Result):
     def status(self) -> EnsembleStatus:
         """Outcome of each run, an `EnsembleStatus` for each."""
 
-        def one(allowed: Array, finite: Array, detached: Array, resolved: Array) -> EnsembleStatus:
+        def status_of_run(allowed: Array, finite: Array, detached: Array, resolved: Array) -> EnsembleStatus:
             ended = EnsembleStatus.where(jnp.any(detached), EnsembleStatus.detached, EnsembleStatus.done)
             failed = EnsembleStatus.where(resolved, EnsembleStatus.not_finite, EnsembleStatus.not_resolved)
             return EnsembleStatus.where(allowed, EnsembleStatus.where(finite, ended, failed), EnsembleStatus.refused)
 
-        return jax.vmap(one)(self.allowed, self.finite, self.detached, self.resolved)
+        return jax.vmap(status_of_run)(self.allowed, self.finite, self.detached, self.resolved)
 
     @property
     def synchronous(self) -> Array:
-        """True for runs (B,) whose exciters turn at one speed: the motion is finite, `relative_rotation` is below 0.5 rad."""
+        """True for runs (B,) whose exciters turn at one speed: the motion stayed finite and `relative_rotation` is below
+        0.5 rad."""
         return self.finite & (self.relative_rotation < _MAX_RELATIVE_ROTATION)
 
     @property
@@ -163,13 +165,13 @@ def ensemble(
 ) -> Ensemble:
     """Integrate many scenes, or one scene from many starts, from 0 to `until` with equal steps.
 
-    - Batches of `batch` runs advance together; each entry of the state is one contiguous array over the batch. Batches are
+    - The runs of a batch advance together; each entry of the state is one contiguous array over the batch. Batches are
       distributed over all cores or graphics processors; under a JAX transformation they are computed one after the other
     - Because all runs have equal steps, no run waits for another. Near the boundary between two outcomes, the outcome does not
       depend on an automatic choice of steps
     - Compiled programs are used again for other values and other numbers of runs above `batch`, if `make` is the same function
       object and the same parameters are shared by all runs. A lambda in the call is a new function in each call
-    - In single precision angles are kept within one turn during the integration, so that long runs keep their phase
+    - In single precision the integration keeps angles within one turn; therefore long runs keep their phase
 
     **Arguments**
 
@@ -186,8 +188,8 @@ def ensemble(
       estimate requires more than 4 steps
     - `batch`: number of runs that advance together; typical: the default, 64 on a processor and 262,144 on an accelerator. The
       memory is proportional to it
-    - `equations`: a function of a scene that returns its equations of motion, as `vector_field` (the default) does; another
-      function is useful to compare, for example, the equations of a paper with those of the scene
+    - `equations`: a function of a scene that returns its equations of motion, as `vector_field` (the default) does; with
+      another function, for example, the equations of a paper can be compared with those of the scene
 
     **Returns** `Ensemble`. Derivatives exist in forward mode only.
 
@@ -212,12 +214,12 @@ def ensemble(
 
     counts = np.asarray([plan.each, plan.coarse] if plan.is_compared else [plan.each], plan.end.dtype)
     ends = in_chunks(plan.batch, run_batch, plan.own, shared=(plan.common, plan.end, counts))
-    last, load_speed, apart, finite, detached, taken = ends
+    last, load_speed, difference, finite, detached, step_counts = ends
     error = np.full(plan.allowed.shape, np.inf if estimate else np.nan, plan.end.dtype)
     if plan.is_compared:
         # The error is the part (coarse/each)^3 of the difference, as for a method of order 3. This is conservative, because the
         # method has order 8.
-        error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
+        error = estimated_error(difference, (plan.coarse / plan.each) ** 3, plan.scenes)
     unknown = np.asarray(np.nan, plan.end.dtype)
     resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
     if not plan.is_allowed:
@@ -227,13 +229,15 @@ def ensemble(
     if len(plan.scenes.exciters) > 1:
         turned = load_speed * turning_directions(plan.scenes) * (plan.end / ENSEMBLE_PARTS)
         relative_rotation = jnp.max(turned, axis=1) - jnp.min(turned, axis=1)
-    found = Ensemble(
-        *on_device((last, load_speed, relative_rotation, error, plan.allowed, finite, resolved, detached, taken[0], unknown))
+    result = Ensemble(
+        *on_device(
+            (last, load_speed, relative_rotation, error, plan.allowed, finite, resolved, detached, step_counts[0], unknown)
+        )
     )
     if not plan.is_known:
-        return found
-    jax.block_until_ready(found)
-    return dataclasses.replace(found, seconds=on_device(np.asarray(time.perf_counter() - begun, plan.end.dtype)))
+        return result
+    jax.block_until_ready(result)
+    return dataclasses.replace(result, seconds=on_device(np.asarray(time.perf_counter() - begun, plan.end.dtype)))
 
 
 @cached
@@ -242,19 +246,19 @@ def _run_batch(
     common: list[Array],
     end: Array,
     counts: Array,
-    same: tuple[bool, ...],
+    is_shared_array: tuple[bool, ...],
     form: Skeleton,
     equations: Equations,
     implicit: bool,
 ) -> _Ends:
-    """Integrate a batch of runs; arrays in `own` have a leading axis over the runs, arrays in `common` are shared by all."""
+    """Integrate a batch of runs; arrays in `own` have a leading axis over the runs, arrays in `common` belong to all runs."""
 
-    def one(own: list[Array]) -> _Ends:
-        mine, ours = iter(own), iter(common)
-        scene, state = form.filled(next(ours) if shared else next(mine) for shared in same)
+    def run_of_batch(own: list[Array]) -> _Ends:
+        own_arrays, common_arrays = iter(own), iter(common)
+        scene, state = form.filled(next(common_arrays) if shared else next(own_arrays) for shared in is_shared_array)
         return _run(scene, state, end, counts, equations, implicit)
 
-    return jax.vmap(one)(own)
+    return jax.vmap(run_of_batch)(own)
 
 
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
@@ -265,44 +269,48 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     and the number of steps.
     """
     wrapped, has_common_turns = angle_wrapping(scene, state.displacement.dtype)
-    watched = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
+    has_one_sided_loads = any(exciter.loads is not None and exciter.loads.one_sided for exciter in scene.exciters)
     field, start = field_of(equations, scene), state
-    if watched:
-        pulls = [jnp.zeros_like(own.angle[0]) if own.angle else jnp.zeros(1) for own in state.exciters]
-        field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _concatenate(pulls))
+    if has_one_sided_loads:
+        missing_forces = [
+            jnp.zeros_like(exciter_state.angle[0]) if exciter_state.angle else jnp.zeros(1) for exciter_state in state.exciters
+        ]
+        field, start = _FieldWithDetachment(field, scene), _StateWithDetachment(state, _concatenate(missing_forces))
     motion = pack_batch(field, start, wrapped, has_common_turns, implicit=implicit)
     length = end / ENSEMBLE_PARTS
 
-    def part(held: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
-        held, taken = advance(motion, held, *at, step, implicit=implicit)
-        return held, (held, taken)
+    def part(packed: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
+        packed, step_counts = advance(motion, packed, *at, step, implicit=implicit)
+        return packed, (packed, step_counts)
 
-    def whole(steps: Array) -> tuple[Y, Array]:
-        held, begins, lengths = divide_run(
+    def integrate_parts(steps: Array) -> tuple[Y, Array]:
+        packed, begins, lengths = divide_run(
             motion, motion.pack(start), length, length / steps, ENSEMBLE_PARTS, implicit=implicit
         )
-        _, (helds, taken) = jax.lax.scan(lambda held, at: part(held, at, length / steps), held, (begins, lengths))
-        return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
+        _, (packed_parts, step_counts) = jax.lax.scan(
+            lambda packed, at: part(packed, at, length / steps), packed, (begins, lengths)
+        )
+        return jax.tree.map(lambda leaf: leaf[-2:], packed_parts), jnp.sum(step_counts)
 
-    helds, taken = jax.lax.map(whole, counts)
-    # `unpack` subtracts from wrapped angles the whole turns of the first state that it is given. States that are compared are
-    # therefore unpacked in one call.
-    ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
-    pair = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds))
-    last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
+    packed_parts, step_counts = jax.lax.map(integrate_parts, counts)
+    # `unpack` subtracts the whole turns of its first state from wrapped angles. Therefore states that are compared are unpacked
+    # in one call.
+    ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], packed_parts))
+    pair = motion.unpack(jax.tree.map(lambda leaf: leaf[0], packed_parts))
+    last, coarse = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
     is_watched = isinstance(last, _StateWithDetachment)
     detached = last.missing != 0.0 if is_watched else jnp.zeros(turning_directions(scene).shape, dtype=bool)
-    last, other = (State(each.displacement, each.velocity, exciters=each.exciters) for each in (last, other))
+    last, coarse = (State(either.displacement, either.velocity, exciters=either.exciters) for either in (last, coarse))
     angle, _ = turning_angles(scene, lambda: length * jnp.arange(ENSEMBLE_PARTS - 1, ENSEMBLE_PARTS + 1), pair)
-    finite, apart = is_finite(last), scaled_error(last, other, error_scale(last, natural_units(scene)))
+    finite, difference = is_finite(last), scaled_error(last, coarse, error_scale(last, natural_units(scene)))
     # The error of a run is unknown (infinite) if the coarser run did not stay finite.
-    apart = jnp.where(finite & ~is_finite(other), jnp.inf, apart)
-    return last, (angle[1] - angle[0]) / length, apart, finite, detached, taken[0]
+    difference = jnp.where(finite & ~is_finite(coarse), jnp.inf, difference)
+    return last, (angle[1] - angle[0]) / length, difference, finite, detached, step_counts[0]
 
 
 class _StateWithDetachment(State):
-    """State with the time integral (loads,), N s, of the force max(-N, 0) with which each track would have had to pull its
-    load.
+    """State with the time integral `missing` (loads,), N s, of the force max(-N, 0) with which each track would have to pull
+    its load.
 
     The integral is exactly 0 if the normal force N was never negative, for any weights of the stages of the method.
     """
@@ -322,16 +330,16 @@ class _FieldWithDetachment(eqx.Module):
 
     def __call__(self, t: Array, state: State) -> _StateWithDetachment:
         plain = State(state.displacement, state.velocity, exciters=state.exciters)
-        scene, change, pulls = self.scene, self.equations(t, plain), []
-        for exciter, own in zip(scene.exciters, state.exciters, strict=True):
+        scene, change, missing_forces = self.scene, self.equations(t, plain), []
+        for exciter, exciter_state in zip(scene.exciters, state.exciters, strict=True):
             if exciter.loads is None or not exciter.loads.one_sided:
-                pulls.append(jnp.zeros_like(own.angle[0]) if own.angle else jnp.zeros(1))
+                missing_forces.append(jnp.zeros_like(exciter_state.angle[0]) if exciter_state.angle else jnp.zeros(1))
                 continue
-            normal_force = exciter.loads.normal_force(own.angle, own.rate, total_gravity(scene.effects))
+            normal_force = exciter.loads.normal_force(exciter_state.angle, exciter_state.rate, total_gravity(scene.effects))
             assert normal_force is not None
             force = normal_force.at(scene.machine.mount(exciter.place).load_rates(change.velocity))
-            pulls.append(jnp.maximum(-force, 0.0))
-        return _StateWithDetachment(change, _concatenate(pulls))
+            missing_forces.append(jnp.maximum(-force, 0.0))
+        return _StateWithDetachment(change, _concatenate(missing_forces))
 
 
 def _concatenate(arrays: list[Array]) -> Array:

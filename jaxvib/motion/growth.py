@@ -33,7 +33,7 @@ _EXPONENTIAL_LOG_GROWTH, _LINEAR_LOG_GROWTH = math.log(1e3), math.log(2.1)
 proportional to time (a factor of 2, with a margin)."""
 
 _MAX_LOG_GROWTH_OF_ERRORS = math.log(1.01)
-"""Largest logarithm of growth over the later half of a run that integration errors can cause."""
+"""Largest logarithm of the growth over the later half of a run that integration errors alone can cause."""
 
 _MAX_GROWTH_RATIO_OF_QUARTERS = 0.85
 """Largest ratio of the growth rate in the last quarter of a run to that in the quarter before, for growth that is not
@@ -43,7 +43,7 @@ _RETURN_DISTANCE = 1e-2
 """Distance from a previous state below which a motion has returned to it, relative to the largest distance in between."""
 
 _TURNS_TO_RETURN, _SAMPLES_OF_RETURN = 3.0, 4096
-"""Number of turns of the slowest of rotor and loads within which a periodic motion must return to its state, and number of
+"""Number of turns of the slowest of all rotors and loads within which a periodic motion must return to its state, and number of
 samples in this time."""
 
 
@@ -164,26 +164,26 @@ def growth(
             raise failure(run.status)
         return run
 
-    rng, rates, other, quarters = np.random.default_rng(0), [], None, []
+    rng, rates, neighbour, quarters = np.random.default_rng(0), [], None, []
     for k in range(stretches):
-        if other is None:  # a random direction, because disturbances along the motion do not grow
+        if neighbour is None:  # a random direction, because disturbances along the motion do not grow
             scale = error_scale(jax.tree.map(lambda x: x[None], state), unit)
             noise = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state)
-            other = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, separation)
+            neighbour = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, separation)
         if k in (stretches // 2, 3 * stretches // 4):
             quarters.append(state)
-        first, second = run_on(state), run_on(other)
+        first, second = run_on(state), run_on(neighbour)
         scale = error_scale(first.window.state, unit)
-        ours, theirs = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
+        ours, neighbour_end = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
         if angle_wrapping(scene, ours.displacement.dtype)[0]:
-            theirs = with_nearest_turns(theirs, ours)
-        rates.append(math.log(max(_distance(ours, theirs, scale), 1e-300) / separation) / stretch)
-        state, gone = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, theirs)
-        other = _at_distance(state, jax.tree.map(jnp.add, state, gone), scale, separation)
+            neighbour_end = with_nearest_turns(neighbour_end, ours)
+        rates.append(math.log(max(_distance(ours, neighbour_end, scale), 1e-300) / separation) / stretch)
+        state, difference = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, neighbour_end)
+        neighbour = _at_distance(state, jax.tree.map(jnp.add, state, difference), scale, separation)
     late = np.array(rates[stretches // 2 :])
     exponent, uncertainty = float(np.mean(late)), _sum_error(late) / late.size
     name = _classify_growth(late * stretch)
-    if name == "chaotic" and all(_returns(scene, quarter, steps) for quarter in quarters):
+    if name == "chaotic" and all(_has_returned(scene, quarter, steps) for quarter in quarters):
         name = "unstable"
     fastest = {"regular": 0.0, "undecided": exponent + 3.0 * uncertainty}.get(name, exponent)
     horizon = math.log(1.0 / float(jnp.finfo(scene.top_speed.dtype).eps)) / fastest if fastest > 0.0 else math.inf
@@ -196,35 +196,41 @@ def _classify_growth(late: np.ndarray) -> str:
 
     This function does not test whether the motion is periodic: "chaotic" includes "unstable".
     """
-    grown, error = float(np.sum(late)), _sum_error(late)
+    total, error = float(np.sum(late)), _sum_error(late)
     first, last = np.split(late, [late.size // 2])
-    rising = float(np.mean(last) - np.mean(first))
-    if grown > max(3.0 * error, _EXPONENTIAL_LOG_GROWTH):
+    increase = float(np.mean(last) - np.mean(first))
+    if total > max(3.0 * error, _EXPONENTIAL_LOG_GROWTH):
         spread = math.hypot(*(_sum_error(quarter) / quarter.size for quarter in (first, last)))
-        return "chaotic" if abs(rising) < max(3.0 * spread, 0.25 * float(np.mean(late))) else "undecided"
-    decreases = grown < _LINEAR_LOG_GROWTH and float(np.mean(last)) < _MAX_GROWTH_RATIO_OF_QUARTERS * float(np.mean(first))
-    is_resolved = grown > max(2.0 * error, _MAX_LOG_GROWTH_OF_ERRORS)
-    return "regular" if grown + 3.0 * error < _EXPONENTIAL_LOG_GROWTH and (decreases or not is_resolved) else "undecided"
+        return "chaotic" if abs(increase) < max(3.0 * spread, 0.25 * float(np.mean(late))) else "undecided"
+    decreases = total < _LINEAR_LOG_GROWTH and float(np.mean(last)) < _MAX_GROWTH_RATIO_OF_QUARTERS * float(np.mean(first))
+    is_resolved = total > max(2.0 * error, _MAX_LOG_GROWTH_OF_ERRORS)
+    return "regular" if total + 3.0 * error < _EXPONENTIAL_LOG_GROWTH and (decreases or not is_resolved) else "undecided"
 
 
 def _sum_error(values: np.ndarray) -> float:
-    """Return the standard error of the sum of values (n,); only neighbouring values are correlated.
+    """Return the standard error s of the sum of values (n,), of which only neighbours are correlated.
 
         s^2 = n c_0 + 2 (n - 1) c_1
 
     with the autocovariances c_k; the result is at least the error of one value. The correlation matters: if the phase of the
     motion differs between the ends of stretches, neighbouring logarithms of growth are large and cancel each other.
     """
-    off = values - np.mean(values)
-    each = float(np.sum(off**2)) / (values.size - 1)
-    return math.sqrt(max(values.size * each + 2.0 * float(np.sum(off[1:] * off[:-1])), each))
+    deviation = values - np.mean(values)
+    variance = float(np.sum(deviation**2)) / (values.size - 1)
+    return math.sqrt(max(values.size * variance + 2.0 * float(np.sum(deviation[1:] * deviation[:-1])), variance))
 
 
-def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
+def _has_returned(scene: Scene, state: State, steps: Tolerance) -> bool:
     """Return True if the motion from `state` returns to this state within a few turns of rotor and loads."""
     speed, turning = float(scene.top_speed), []
-    for own in state.exciters:
-        turning += [*np.abs(np.ravel(own.rate[0]))] if own.rate else [] if own.rotor is None else [abs(own.rotor[1])]
+    for exciter_state in state.exciters:
+        turning += (
+            [*np.abs(np.ravel(exciter_state.rate[0]))]
+            if exciter_state.rate
+            else []
+            if exciter_state.rotor is None
+            else [abs(exciter_state.rotor[1])]
+        )
     slowest = min([speed, *(float(w) for w in turning if w > 1e-2 * speed)])
     run = simulate(
         scene, _TURNS_TO_RETURN * 2.0 * math.pi / slowest, start=state, samples=_SAMPLES_OF_RETURN, stepsize_controller=steps,
@@ -240,8 +246,8 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
     )
     distance = np.sqrt(sum(jax.tree.leaves(parts)))
     farthest = float(np.max(distance))
-    away = int(np.argmax(distance > 0.3 * farthest))
-    return float(np.min(distance[away:])) < _RETURN_DISTANCE * farthest
+    first_far = int(np.argmax(distance > 0.3 * farthest))
+    return float(np.min(distance[first_far:])) < _RETURN_DISTANCE * farthest
 
 
 def _distance(a: State, b: State, scale: State) -> float:
@@ -251,7 +257,8 @@ def _distance(a: State, b: State, scale: State) -> float:
 
 
 def _at_distance(a: State, b: State, scale: State, separation: float) -> State:
-    """Return the state at the distance `separation` from `a` towards `b`; if both are equal, displacements are changed."""
+    """Return the state at the distance `separation` from `a` in the direction of `b`; if `a` and `b` are equal, the
+    displacements of `a` are changed."""
     distance = _distance(a, b, scale)
     if distance == 0.0:
         return eqx.tree_at(lambda s: s.displacement, a, a.displacement + separation * scale.displacement)

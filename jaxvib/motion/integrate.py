@@ -35,14 +35,14 @@ WINDOW_SAMPLES = 4096
 """Number of samples in the measuring window."""
 
 MIN_SAMPLES_PER_TURN = 16
-"""Smallest number of samples in a turn of the rotor; the interpolant between samples then has an error of 1e-7."""
+"""Smallest number of samples in a turn of the rotor; the interpolant between samples then has a relative error of 1e-7."""
 
 _UNBOUNDED_FACTOR = 1e8
 """Displacement, in units of the initial displacement or of the natural unit, beyond which a motion counts as unbounded."""
 
 
 class StepControl(eqx.Module):
-    """Choice of steps: by a `tolerance` with at most `max_steps`, or `steps` equal steps (scalars)."""
+    """Choice of steps (scalars): a `tolerance` with at most `max_steps`, or a number of equal `steps`."""
 
     tolerance: Array | np.ndarray | None = None
     steps: Array | np.ndarray | None = None
@@ -52,8 +52,8 @@ class StepControl(eqx.Module):
 def repeat_per_coordinate(unit: State, state: State) -> State:
     """Return the natural units of a state, with one unit for each coordinate of the loads."""
 
-    def repeated(unit: ExciterState, own: ExciterState) -> ExciterState:
-        number, spin = len(own.angle), unit.spin
+    def repeated(unit: ExciterState, exciter_state: ExciterState) -> ExciterState:
+        number, spin = len(exciter_state.angle), unit.spin
         spin = spin if spin is None or spin.slip is None else Spin(spin.drilling, spin.slip * number)
         return ExciterState(unit.angle * number, unit.rate * number, unit.rotor, spin)
 
@@ -65,16 +65,16 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
         return diffrax.ConstantStepSize()
     assert control.tolerance is not None
     # The error of an angle is absolute: an error relative to the growing angle would let a long run lose its phase.
-    one, zero, dtype = jnp.ones(()), jnp.zeros(()), state.displacement.dtype
+    ones, zero, dtype = jnp.ones(()), jnp.zeros(()), state.displacement.dtype
 
-    def relative_of(own: ExciterState) -> ExciterState:
+    def relative_of(exciter_state: ExciterState) -> ExciterState:
         rotor, spin = (
-            None if own.rotor is None else (zero, *(one for _ in own.rotor[1:])),
-            jax.tree.map(jnp.ones_like, own.spin),
+            None if exciter_state.rotor is None else (zero, *(ones for _ in exciter_state.rotor[1:])),
+            jax.tree.map(jnp.ones_like, exciter_state.spin),
         )
-        return ExciterState((zero,) * len(own.angle), (one,) * len(own.rate), rotor, spin)
+        return ExciterState((zero,) * len(exciter_state.angle), (ones,) * len(exciter_state.rate), rotor, spin)
 
-    relative = State(one, one, exciters=tuple(map(relative_of, state.exciters)))
+    relative = State(ones, ones, exciters=tuple(map(relative_of, state.exciters)))
     unit = repeat_per_coordinate(natural, state)
 
     def spread(tree: State) -> State:
@@ -88,7 +88,8 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
 
 
 def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
-    """Return a controller that steps onto the jumps of the drive's acceleration; fixed steps are unchanged."""
+    """Return a controller whose steps end at the jumps of the drives' accelerations; a controller of equal steps is
+    unchanged."""
     jump_ts = [t for exciter in scene.exciters for t in exciter.drive.jump_ts()]
     if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
         return controller
@@ -97,12 +98,12 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
 
 def effects_rate(scene: Scene) -> Array:
     """Return the fastest rate that effects add to the motion of loads, see `Effect.fastest_rate`; 0 without such effects."""
-    found, zero = [], jnp.zeros_like(scene.exciters[0].drive.speed)
+    all_rates, zero = [], jnp.zeros_like(scene.exciters[0].drive.speed)
     for exciter in scene.exciters:
         if exciter.loads is not None:
-            rates = [each.fastest_rate(exciter.loads, exciter.drive.speed) for each in (*scene.effects, *exciter.effects)]
-            found += [jnp.max(rate) for rate in rates if rate is not None]
-    return functools.reduce(jnp.maximum, found, zero)
+            rates = [effect.fastest_rate(exciter.loads, exciter.drive.speed) for effect in (*scene.effects, *exciter.effects)]
+            all_rates += [jnp.max(rate) for rate in rates if rate is not None]
+    return functools.reduce(jnp.maximum, all_rates, zero)
 
 
 @cached
@@ -116,15 +117,15 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
     frequencies, speed = estimated_frequencies(scene), scene.top_speed
     fastest = jnp.maximum(speed, jnp.max(frequencies))
     for exciter in scene.exciters:
-        own = None if exciter.loads is None else exciter.loads.natural_frequency(exciter.drive.speed)
-        fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
+        natural_frequency = None if exciter.loads is None else exciter.loads.natural_frequency(exciter.drive.speed)
+        fastest = fastest if natural_frequency is None else jnp.maximum(fastest, jnp.max(natural_frequency))
     fastest = jnp.maximum(fastest, effects_rate(scene))
     return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 
 def angle_wrapping(scene: Scene, dtype: Any) -> tuple[bool, bool]:
-    """Return two flags: True if angles are kept within one turn (single precision); True if the same number of turns is
-    subtracted from the angles of all loads (loads in contact)."""
+    """Return two flags: True if the integration keeps angles within one turn (single precision); True if the same number of
+    turns is subtracted from the angles of all loads (loads in contact)."""
     return jnp.dtype(dtype).itemsize < 8, has_term(scene.all_effects, LoadInteraction)
 
 
@@ -182,31 +183,33 @@ def integrate(
         progress=plan.progress_meter,
     )
     assert solution.ts is not None and solution.ys is not None
-    present = partial(jax.tree.map, lambda value: jnp.where(exists, value, jnp.nan))
-    times, states = present((solution.ts[0], motion.unpack(solution.ys[0])))
+    where_start_exists = partial(jax.tree.map, lambda value: jnp.where(exists, value, jnp.nan))
+    times, states = where_start_exists((solution.ts[0], motion.unpack(solution.ys[0])))
     window = trajectory(model, times, states)
-    whole = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
+    whole_run = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
     measured = partial(measure, model, field, times, states, unit)
-    # Of a run with larger steps only the states are used.
+    # For a run with larger steps only the states are needed; it is not measured.
     numbers = measured() if is_measured is None else jax.lax.cond(is_measured, measured, partial(unmeasured, model, states))
-    numbers, whole, speeds = present((numbers, whole, window.rotor_speeds))  # speeds of ideal drives are not in the states
+    numbers, whole_run, speeds = where_start_exists(
+        (numbers, whole_run, window.rotor_speeds)
+    )  # speeds of ideal drives are not in the states
     window = dataclasses.replace(window, rotor_speeds=speeds)
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not reach its end has no window; its last state shows if it diverged.
-    ended = solution.result == diffrax.RESULTS.successful
-    bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
+    has_ended = solution.result == diffrax.RESULTS.successful
+    is_bounded = jnp.where(has_ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
-    unknown = jnp.full_like(end, jnp.nan)
+    not_computed = jnp.full_like(end, jnp.nan)
     return Run(
-        status=RunStatus.where(exists, _status(solution.result, bounded), RunStatus.no_start),
-        trajectory=whole,
+        status=RunStatus.where(exists, _status(solution.result, is_bounded), RunStatus.no_start),
+        trajectory=whole_run,
         window=window,
         **{name: getattr(numbers, name) for name in type(numbers).__dataclass_fields__},
-        error=unknown,
+        error=not_computed,
         steps=steps,
         rejected=solution.stats["num_rejected_steps"],
         evaluations=steps * _stages(solver),
-        seconds=unknown,
+        seconds=not_computed,
         scene=scene,
         coincident=_stay_coincident(model, state, states),
         engine="scalar" if motion.is_scalarized else "array",
@@ -226,14 +229,15 @@ def _saves(scene: Scene, end: Array, plan: IntegrationPlan) -> list[diffrax.SubS
 def _steps(
     motion: PackedSystem, state: State, unit: State, plan: IntegrationPlan, end: Array
 ) -> tuple[Array | None, diffrax.AbstractStepSizeController]:
-    """Return the length of the first step, s, and the controller of the others."""
+    """Return the length of the first step, s, and the controller of the further steps."""
     control, fastest = plan.control, jnp.asarray(plan.bounds[0])
     if isinstance(control, StepControl):
         first = 0.05 / fastest
         if control.steps is not None:
             first = end / jnp.asarray(control.steps)
         if control.tolerance is not None:
-            # The first step depends on the tolerance as steps of a method of order 8 do: two tolerances give different steps.
+            # The first step depends on the tolerance as the steps of a method of order 8 do; therefore different tolerances
+            # give different steps.
             first = 0.4 * jnp.asarray(control.tolerance) ** (1.0 / 9.0) / fastest
         return first, _controller(motion, state, unit, control)
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
@@ -246,40 +250,44 @@ def _stay_coincident(model: Model, start: State, states: State) -> Array:
         for mount, exciter in zip(model.mounts, model.scene.exciters, strict=True)
         if exciter.loads is not None
     ]
-    first, later = ([own.angle[0] for own in each.exciters if own.angle] for each in (start, states))
+    first, later = (
+        [exciter_state.angle[0] for exciter_state in either.exciters if exciter_state.angle] for either in (start, states)
+    )
     return _is_coincident([angle[None] for angle in first], stations) & _is_coincident(later, stations)
 
 
 def _is_coincident(angles: list[Array], stations: list[Array | None]) -> Array:
     """Return True if several loads of a track have the same angle at all times (..., count), except for rounding errors."""
 
-    def one_angle(angle: Array, stations: Array | None) -> Array:
+    def has_one_angle(angle: Array, stations: Array | None) -> Array:
         limit = jnp.finfo(angle.dtype).eps ** 0.4
         if stations is None:
             return (angle.shape[1] > 1) & (jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1)) < limit)
-        same = stations[:, None] == stations[None, :]
+        is_same_station = stations[:, None] == stations[None, :]
         spread = jnp.max(jnp.abs(angle[:, :, None] - angle[:, None, :]), axis=0)
-        return jnp.any((jnp.sum(same, axis=1) > 1) & jnp.all(~same | (spread < limit), axis=1))
+        return jnp.any((jnp.sum(is_same_station, axis=1) > 1) & jnp.all(~is_same_station | (spread < limit), axis=1))
 
-    found = list(map(one_angle, angles, stations))
-    return functools.reduce(jnp.logical_or, found) if found else jnp.zeros((), bool)
+    has_coincident = list(map(has_one_angle, angles, stations))
+    return functools.reduce(jnp.logical_or, has_coincident) if has_coincident else jnp.zeros((), bool)
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:
     """Return True if the displacement or velocity of the carrier exceeds its initial value and its natural unit by the factor
     `_UNBOUNDED_FACTOR`, or if the last state is not finite."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
-    beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED_FACTOR * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
+    beyond = [
+        jnp.max(jnp.abs(b)) > _UNBOUNDED_FACTOR * jnp.maximum(jnp.max(jnp.abs(a)), natural_unit) for a, b, natural_unit in pairs
+    ]
     return beyond[0] | beyond[1] | ~is_finite(last)
 
 
-def _status(result: diffrax.RESULTS, bounded: Array) -> RunStatus:
-    ended = RunStatus.where(bounded, RunStatus.done, RunStatus.not_finite)
+def _status(result: diffrax.RESULTS, is_bounded: Array) -> RunStatus:
+    ended_status = RunStatus.where(is_bounded, RunStatus.done, RunStatus.not_finite)
     # A step that is rejected until its length is zero contains numbers that are not finite.
-    failed = RunStatus.where(result == diffrax.RESULTS.dt_min_reached, RunStatus.not_finite, RunStatus.no_step)
-    failed = RunStatus.where(result == diffrax.RESULTS.max_steps_reached, RunStatus.max_steps_reached, failed)
-    failed = RunStatus.where(bounded, failed, RunStatus.not_finite)
-    return RunStatus.where(result == diffrax.RESULTS.successful, ended, failed)
+    failed_status = RunStatus.where(result == diffrax.RESULTS.dt_min_reached, RunStatus.not_finite, RunStatus.no_step)
+    failed_status = RunStatus.where(result == diffrax.RESULTS.max_steps_reached, RunStatus.max_steps_reached, failed_status)
+    failed_status = RunStatus.where(is_bounded, failed_status, RunStatus.not_finite)
+    return RunStatus.where(result == diffrax.RESULTS.successful, ended_status, failed_status)
 
 
 def _stages(solver: diffrax.AbstractSolver) -> int:
@@ -303,9 +311,11 @@ def whole_turns(scene: Scene, stretch: float) -> float:
     The rotors of motors are ignored, because their angles are part of the state. If there are several rotors, only those with
     an unbalance are considered. **Raises** `InputError` for rotors with an unbalance at different speeds.
     """
-    one = len(scene.exciters) == 1
+    is_single = len(scene.exciters) == 1
     counted = [
-        e for e in scene.exciters if e.drive.ideal and (one or e.carries != ("loads",) or has_term(e.effects, RotorImbalance))
+        e
+        for e in scene.exciters
+        if e.drive.ideal and (is_single or e.carries != ("loads",) or has_term(e.effects, RotorImbalance))
     ]
     speeds = sorted({float(exciter.drive.speed) for exciter in counted})
     if not speeds:

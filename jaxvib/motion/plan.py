@@ -1,4 +1,4 @@
-"""Plans of runs: choices that depend on parameters of a scene and are made on the host, before a program is traced.
+"""Plans of runs: choices that depend on the values of a scene and are made on the host, before a program is traced.
 
 Only this module tests which values are known (not traced). The method and static sizes (samples, steps, stretches) depend on
 known values; under a JAX transformation the sizes are fixed.
@@ -77,7 +77,7 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Steps with which the estimated error of the whole result is at most `error`; the run is repeated to find them.
+    """Steps with which the estimated error of the whole result is at most `error`. The run is repeated to find these steps.
 
     **Arguments**: `error`, relative; typical: 1e-3 to 1e-8. An error of 1e-8 takes about twice the time of an error of 1e-4.
 
@@ -220,7 +220,8 @@ def _solver_for_derivatives(adjoint: diffrax.AbstractAdjoint | None) -> LoopDopr
 
 
 def _stretches(scene: Scene, end: Array, state: State, fastest: Array | np.ndarray) -> int:
-    """Return the number of consecutive integrations; time loses its digits in single precision."""
+    """Return the number of consecutive integrations; in single precision it is above 1 for long runs, because time would lose
+    its digits."""
     if state.displacement.dtype.itemsize >= 8 or len(scene.exciters) != 1 or not scene.drive.constant:
         return 1
     return max(1, math.ceil(float(end * fastest) / (2.0 * math.pi * _STRETCH_TURNS)))
@@ -241,14 +242,14 @@ def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:
     run that would need too many steps.
     """
 
-    def steps_of(fastest: float, end: float) -> int:
+    def count_steps(fastest: float, end: float) -> int:
         turns = end * fastest / (2.0 * math.pi)
         steps = 4096 + 500 * turns
         if not steps <= MAX_STEPS:
             raise InputError("until", f"is {end:g} s, {turns:.2g} turns of the fastest motion; run shorter stretches")
         return min(2 ** math.ceil(math.log2(steps)), MAX_STEPS)
 
-    steps = when_known(steps_of, fastest, end)
+    steps = when_known(count_steps, fastest, end)
     return _UNKNOWN_STEPS if steps is None else steps
 
 
@@ -363,18 +364,21 @@ def plan_ensemble(
     fastest, decay = _rates(scenes)
     number_of_steps, implicit = 0 if steps is None else count(steps.number, "steps"), False
     if known:
-        # Refused runs do not influence the steps of the others.
-        most = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
-        most = most if bool(np.any(allowed)) else [1.0, 0.0]
+        # Refused runs do not influence the steps of other runs.
+        fastest_rates = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
+        fastest_rates = fastest_rates if bool(np.any(allowed)) else [1.0, 0.0]
         step, implicit = equal_step_length(
-            most[0], most[1], _EXPLICIT_STEPS_PER_RADIAN, float(end) / number_of_steps if number_of_steps else None
+            fastest_rates[0],
+            fastest_rates[1],
+            _EXPLICIT_STEPS_PER_RADIAN,
+            float(end) / number_of_steps if number_of_steps else None,
         )
         number_of_steps = number_of_steps or max(_MIN_STEPS, math.ceil(float(end) / step - 1e-9))
-    each = -(-number_of_steps // ENSEMBLE_PARTS)
-    coarse = -(-each // 2)
+    steps_per_part = -(-number_of_steps // ENSEMBLE_PARTS)
+    coarse = -(-steps_per_part // 2)
 
     leaves, structure = jax.tree.flatten((scenes, states))
-    # A value that all runs share stays a scalar. At least one value must be an array, because it defines the number of runs.
+    # A value that all runs share stays a scalar. At least one value must be an array, which defines the number of runs.
     is_shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in leaves]
     is_shared[0] = is_shared[0] and not all(is_shared)
     return EnsemblePlan(
@@ -386,9 +390,9 @@ def plan_ensemble(
         is_shared=tuple(is_shared),
         form=Skeleton.of(leaves, structure),
         end=end,
-        each=each,
+        each=steps_per_part,
         coarse=coarse,
-        is_compared=is_estimated and coarse < each,  # a run of one step in each part has no coarser one
+        is_compared=is_estimated and coarse < steps_per_part,  # a run of one step in each part has no coarser one
         decay=decay,
         implicit=implicit,
         batch=batch,
@@ -400,7 +404,7 @@ def plan_ensemble(
 def _build_scenes(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State, Array]:
     """Return the scenes, their initial states, and True for scenes with allowed values, with a leading axis over the runs."""
 
-    def one(value: PyTree[Array]) -> tuple[Scene, State, Array]:
+    def build_scene(value: PyTree[Array]) -> tuple[Scene, State, Array]:
         returned = call_user(make, "make", value)
         if isinstance(returned, Scene):
             returned = returned, initial_state(returned)
@@ -411,7 +415,7 @@ def _build_scenes(make: Callable[..., Scene | tuple[Scene, State]], values: PyTr
         allowed = allowed_unknowns(scene)
         return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed
 
-    return eqx.filter_vmap(one)(values)
+    return eqx.filter_vmap(build_scene)(values)
 
 
 @cached

@@ -39,9 +39,9 @@ from jaxvib.units.known import when_known
 
 
 @cached
-def _detached(scene: Scene, kept: Trajectory) -> Array:
-    force = jax.vmap(lambda t, state: normal_force(scene, t, state))(kept.time, kept.state)
-    first = jnp.min(jnp.where(force < 0.0, kept.time[:, None], jnp.inf), axis=0)
+def _detachment_times(scene: Scene, trajectory: Trajectory) -> Array:
+    force = jax.vmap(lambda t, state: normal_force(scene, t, state))(trajectory.time, trajectory.state)
+    first = jnp.min(jnp.where(force < 0.0, trajectory.time[:, None], jnp.inf), axis=0)
     return jnp.where(jnp.isfinite(first), first, jnp.nan)
 
 
@@ -74,14 +74,14 @@ ENDS = ("done", "beating", "creeping", "would_separate", "overlapping")
 """Statuses of runs that reached their end."""
 
 SETTLED_DRIFT = 1e-3
-"""Drift below which a motion repeats itself."""
+"""Drift below which a motion counts as settled."""
 
 _MIN_TURNS = 3
 """Smallest number of turns of the exciters to which a harmonic is fitted."""
 
 
 class Run(AbstractMeasured, PathsOfPoints, Result):
-    """Run of a scene: the quantities measured over its last turns (see `AbstractMeasured`), and the motion itself.
+    """Run of a scene: the quantities measured in its window (see `AbstractMeasured`), and the motion itself.
 
     `ellipse` and `deck` describe the motion of points by a harmonic with the frequency `omega`, fitted to the window by least
     squares.
@@ -128,7 +128,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def settled(self) -> Array:
-        """True if amplitudes and speed no longer change, slightly separated loads do not leave the motion, and none overlap."""
+        """True if the drift is below 1e-3, slightly separated loads do not leave the motion, and no loads overlap."""
         is_real = (self.status != RunStatus.would_separate) & (self.status != RunStatus.overlapping)
         return (self.drift < SETTLED_DRIFT) & is_real
 
@@ -139,13 +139,14 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def largest_displacement(self) -> Array:
-        """Largest displacement of each coordinate from rest on the way, (nd,) m (rad for tilts), among the stored states."""
+        """Largest displacement of each coordinate from rest during the run, (nd,), m (rad for tilts), among the stored
+        states."""
         return jnp.max(jnp.abs(self._whole.state.displacement), axis=0)
 
     @property
     def largest_force(self) -> Array:
-        """Largest force on the foundation on the way, N, among the stored states; for two directions the root of the sum of the
-        squares of both peaks, as `foundation_force`."""
+        """Largest force on the foundation during the run, N, among the stored states; for two directions the root of the sum of
+        the squares of both peaks, as for `foundation_force`."""
         return jnp.sqrt(jnp.sum(jnp.max(self._whole.foundation_force**2, axis=0)))
 
     @property
@@ -218,8 +219,8 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         times = np.asarray(self.detached)
         if not np.any(np.isfinite(times)):
             return []
-        left = ", ".join(f"{j + 1} at {t:.6g} s" for j, t in enumerate(times) if np.isfinite(t))
-        return [f"  detached: loads lost contact with their track (load {left}); the equations keep them on the track"]
+        load_times = ", ".join(f"{j + 1} at {t:.6g} s" for j, t in enumerate(times) if np.isfinite(t))
+        return [f"  detached: loads lost contact with their track (load {load_times}); the equations keep them on the track"]
 
     @property
     def regime(self) -> Regime:
@@ -234,18 +235,18 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         the load on its track; after this time the computed motion is therefore not that of a real load.
         """
         loads = [exciter.loads for exciter in self.scene.exciters if exciter.loads is not None]
-        is_pushed = np.repeat([each.one_sided for each in loads], [each.count for each in loads])
+        is_pushed = np.repeat([one_kind.one_sided for one_kind in loads], [one_kind.count for one_kind in loads])
         if not np.any(is_pushed):
             return jnp.asarray(np.full(is_pushed.size, np.nan), self.window.time.dtype)
-        found = _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
-        return found if np.all(is_pushed) else jnp.where(is_pushed, found, np.nan)
+        times = _detachment_times(self.scene, self.window if self.trajectory is None else self.trajectory)
+        return times if np.all(is_pushed) else jnp.where(is_pushed, times, np.nan)
 
     @validated
     def plot(self, *, unit: SpeedUnit | None = None, ax: Onto = None) -> Drawn:
         """Plot time histories: platforms, speeds of loads and rotor, foundation force.
 
-        The left column shows the whole run as bands between its peaks (or the window, if only this was kept). The right column
-        shows the last three periods, with the phases.
+        The left column shows the whole run as bands between its peaks, or the window if the run has no trajectory. The right
+        column shows the last three periods, with the phases.
 
         **Arguments**
 
@@ -258,9 +259,9 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         from jaxvib.draw.motion.histories import time_histories  # slow import
 
         structure = self.scene.machine.structure()
-        whole, end = map(_histories, (self.window if self.trajectory is None else self.trajectory, self.window))
+        history, end_history = map(_histories, (self.window if self.trajectory is None else self.trajectory, self.window))
         named = dict(names=structure.coordinates, units=structure.units, directions=structure.foundation_directions)
-        return time_histories(whole, end, **named, unit=unit, ax=ax)
+        return time_histories(history, end_history, **named, unit=unit, ax=ax)
 
     @validated
     def spectrum(self, parts: int = 1) -> Spectrum:
@@ -287,10 +288,12 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
         **Returns** `PointMotion`. **Raises** `InputError` for a place that the machine does not have, and for "all" if the run
         kept only its window.
         """
-        kept = self.window if part == "window" else self.trajectory
-        if kept is None:
+        trajectory = self.window if part == "window" else self.trajectory
+        if trajectory is None:
             raise InputError("part", "is 'all', but the run kept only its window; simulate with save='all'")
-        return motion_of_point(self.scene.machine, kept, on_body(read_place(at, "at"), self.scene.machine.require_body(body)))
+        return motion_of_point(
+            self.scene.machine, trajectory, on_body(read_place(at, "at"), self.scene.machine.require_body(body))
+        )
 
     def harmonic(self) -> Harmonic:
         """Return the harmonic with the frequency `omega` that is fitted to the window, see `fit_harmonic`.
@@ -318,7 +321,7 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
 
     @validated
     def plot_path(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the path of a rotor's axis over the last three periods, mm; the path at each station if the rotor tilts.
+        """Plot the path of the axis of a rotor over the last three periods, mm; for loads at several stations, a path for each.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a machine that moves up and down only.
         """
@@ -331,22 +334,28 @@ class Run(AbstractMeasured, PathsOfPoints, Result):
             raise InputError(
                 "machine.kind", f"is {quoted(kind)}, which moves only up and down; a path needs a rotor such as rotor(...)"
             )
-        moved = np.asarray(self.window.state.displacement)
-        moved = moved[last_periods(np.asarray(self.window.time), moved)]
+        displacement = np.asarray(self.window.state.displacement)
+        displacement = displacement[last_periods(np.asarray(self.window.time), displacement)]
         named = {"axis of the loads": mount.rows[0]}
         if not mount.at_one_point:
             stations = sorted({float(s) for s in mount.distances(self.scene.loads.count)})
             named = {f"axis at {1e3 * s:+.4g} mm": machine.rows_at(jnp.asarray(s)) for s in stations}
-        paths = {name: tuple((moved @ np.asarray(rows).T).T) for name, rows in named.items()}
+        paths = {name: tuple((displacement @ np.asarray(rows).T).T) for name, rows in named.items()}
         return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)
 
 
-def _histories(kept: Trajectory) -> list[np.ndarray]:
+def _histories(trajectory: Trajectory) -> list[np.ndarray]:
     """Return time, displacements, speeds of all loads and of all rotors, and forces."""
-    loads = [np.asarray(own.rate[0]) for own in kept.state.exciters if own.rate]
-    rotors = np.stack([np.asarray(speed) for speed in kept.rotor_speeds], axis=1)
+    loads = [np.asarray(exciter_state.rate[0]) for exciter_state in trajectory.state.exciters if exciter_state.rate]
+    rotors = np.stack([np.asarray(speed) for speed in trajectory.rotor_speeds], axis=1)
     speeds = np.concatenate(loads, axis=1) if loads else np.zeros((rotors.shape[0], 0))
-    return [np.asarray(kept.time), np.asarray(kept.state.displacement), speeds, rotors, np.asarray(kept.foundation_force)]
+    return [
+        np.asarray(trajectory.time),
+        np.asarray(trajectory.state.displacement),
+        speeds,
+        rotors,
+        np.asarray(trajectory.foundation_force),
+    ]
 
 
 def _turns(time: np.ndarray, speed: float) -> float:
@@ -362,8 +371,8 @@ def _require_turns(time: np.ndarray, speed: float) -> None:
 
 
 def with_separation_status(run: Run) -> Run:
-    """Return the run with the status `overlapping` if loads with a size are inside each other at its end, or with
-    `would_separate` if loads stay at nearly one angle although this motion is unstable."""
+    """Return the run with the status `overlapping` if loads with a size are inside each other at its end, with the status
+    `would_separate` if loads stay at nearly one angle although this motion is unstable, otherwise unchanged."""
     if status_name(run.status) not in ENDS:
         return run
     if overlap(run.scene, run.window):

@@ -1,4 +1,4 @@
-"""Time integration until the motion repeats itself."""
+"""Time integration until the motion has settled."""
 
 from __future__ import annotations
 
@@ -94,11 +94,11 @@ def settle(
     - `periods`: approximate length of a stretch, in periods of the lowest natural frequency; typical: 100 (the default)
     - `stretches`: largest number of stretches; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
     - `stepsize_controller`: as for `simulate`, except `Accuracy`; default: `Tolerance(1e-9)`, in single precision 1e-5
-    - `throw`: raise if the motion has not settled after all stretches; otherwise the `drift` of the last run shows this, or its
-      status if the run failed
+    - `throw`: True to raise `ComputationError` if the motion has not settled after all stretches; otherwise the `drift` of the
+      last run shows this, or its status if the run failed
 
-    A motion that only coincident loads can keep does not count as settled: if loads start at one angle (`separation=0`) and
-    would separate after a small disturbance, the status is `would_separate`, see `Run`.
+    A motion that is stable only as long as loads are coincident does not count as settled: if loads start at one angle
+    (`separation=0`) and would separate after a small disturbance, the status is `would_separate`, see `Run`.
 
     **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
@@ -195,10 +195,10 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
             return run, False
         drifts.append(float(run.drift))
         if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _MAX_DISTANCE_IN_DRIFTS * plan.drift:
-            judged = _with_final_status(run, "done")
-            # Loads that are not at exactly one angle go on until they have left a motion that is unstable.
-            if is_coincident or status_name(judged.status) == "done" or not would_separate(run.scene, run.window):
-                return judged, True
+            final = _with_final_status(run, "done")
+            # If the loads are not at exactly one angle and would separate, the run continues until they have left this motion.
+            if is_coincident or status_name(final.status) == "done" or not would_separate(run.scene, run.window):
+                return final, True
         if plan.mean_stretches is not None:
             measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
             if len(measured) >= plan.mean_stretches and _steady_in_the_mean(np.array(measured[-plan.mean_stretches :])):
@@ -215,7 +215,7 @@ def _integrate_until_settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bo
 
 
 def _with_final_status(run: Run, name: str) -> Run:
-    """Return the run with the status of that name, or with `would_separate`."""
+    """Return the run with the status `name`, or with `overlapping` or `would_separate` if this applies."""
     return with_separation_status(dataclasses.replace(run, status=member(RunStatus, name)))
 
 
@@ -289,12 +289,12 @@ def _require_mode(scene: Scene, run: Run, mode: int) -> None:
     """Raise `ComputationError` if the load speed is not nearest to that of the jam mode in which the loads started."""
     modes = jam_modes(scene)
     speeds = np.asarray(modes.omega)
-    away = {k: abs(float(speeds[modes.row(k)]) - float(run.omega)) for k in modes.mode_numbers()}
-    away[0] = abs(float(scene.drive.speed) - float(run.omega))
-    nearest = min(away, key=lambda k: away[k])
+    speed_differences = {k: abs(float(speeds[modes.row(k)]) - float(run.omega)) for k in modes.mode_numbers()}
+    speed_differences[0] = abs(float(scene.drive.speed) - float(run.omega))
+    nearest = min(speed_differences, key=lambda k: speed_differences[k])
     if nearest != mode:
-        now = f"jam mode {nearest}" if nearest else "turning with the rotor"
+        reached = f"jam mode {nearest}" if nearest else "turning with the rotor"
         raise ComputationError(
             "left_mode",
-            f"the motion left jam mode {mode} and settled at {speed_text(run.omega, 6)}, {now}; mode {mode} is unstable",
+            f"the motion left jam mode {mode} and settled at {speed_text(run.omega, 6)}, {reached}; mode {mode} is unstable",
         )

@@ -1,4 +1,4 @@
-"""Time integration of a scene with diffrax."""
+"""Time integration of the full equations of motion of a scene."""
 
 from __future__ import annotations
 
@@ -85,14 +85,15 @@ def simulate(
       JAX transformation of the scene. A reverse derivative stores a time for each of these steps: use a smaller value for large
       batches
     - `progress_meter` of diffrax, which shows the finished share of the time
-    - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status shows the failure
+    - `throw`: True to raise `ComputationError` if the run fails; otherwise, and under a JAX transformation, its status shows
+      the failure
 
     Choices of `stepsize_controller`:
 
     - `Tolerance(1e-8)`: the error of each step (the default; 1e-5 in single precision); typical: 1e-6 to 1e-10
-    - `Accuracy(1e-4)`: the `error` of the result; typical: 1e-3 to 1e-8. The run is repeated with smaller tolerances, at most 6
-      times, until its estimated error is below this value; otherwise the status is `not_accurate`. An error of 1e-8 takes
-      about twice the time of an error of 1e-4
+    - `Accuracy(1e-4)`: the `error` of the result; typical: 1e-3 to 1e-8. The run is repeated with smaller tolerances, in at
+      most 6 runs, until its estimated error is at most this value; otherwise the status is `not_accurate`. An error of 1e-8
+      takes about twice the time of an error of 1e-4
     - `EqualSteps(2000)`: a number of equal steps; typical: 4 for each radian of the fastest motion
     - a step size controller of diffrax
 
@@ -155,7 +156,7 @@ def run_planned(plan: RunPlan, *, throw: bool) -> Run:
 
 
 def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:
-    """Return a run with these steps, in the stretches of the plan; measured if requested."""
+    """Return a run with the steps of `control`, in the stretches of the plan; `is_measured`: True to measure its window."""
     if plan.stretches > 1:
         return _run_in_stretches(plan, control, is_measured=is_measured)
     return _run_stretch(plan, plan.end, plan.state, control, is_measured=is_measured)
@@ -184,10 +185,10 @@ def _integration(
 
 def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
     """Return the plan with its limit of steps as an array argument of the program, if the control of the steps allows this."""
-    control, most = integration.control, integration.max_steps
-    if not isinstance(control, StepControl) or (control.steps is not None and float(control.steps) > most):
+    control, max_steps = integration.control, integration.max_steps
+    if not isinstance(control, StepControl) or (control.steps is not None and float(control.steps) > max_steps):
         return integration
-    limit = None if control.tolerance is None else np.asarray(most, np.int32)
+    limit = None if control.tolerance is None else np.asarray(max_steps, np.int32)
     return integration._replace(control=StepControl(control.tolerance, control.steps, limit), max_steps=MAX_STEPS)
 
 
@@ -218,7 +219,7 @@ def _run_in_stretches(plan: RunPlan, control: Control, *, is_measured: bool) -> 
 
 
 def _sum(counts: list[Array]) -> Array:
-    return on_device(np.sum([np.asarray(each) for each in counts], dtype=counts[0].dtype))
+    return on_device(np.sum([np.asarray(step_count) for step_count in counts], dtype=counts[0].dtype))
 
 
 _COARSE_TOLERANCE_RATIO = 100.0
@@ -237,20 +238,20 @@ def _coarser(control: StepControl) -> StepControl:
 def _run_with_estimate(plan: RunPlan) -> Run:
     """Return a run with its error, estimated by a second run with larger steps.
 
-    Both are computed in parallel unless there is a progress meter.
+    Without a progress meter both runs are computed in parallel.
     """
     control = plan.integration.control
     assert isinstance(control, StepControl)
     coarser = _coarser(control)
-    both = partial(_run, plan, control), partial(_run, plan, coarser, is_measured=False)
+    runs = partial(_run, plan, control), partial(_run, plan, coarser, is_measured=False)
     if plan.integration.progress_meter is None:
-        fine, coarse = in_threads(lambda k: both[k](), 2)
+        fine, coarse = in_threads(lambda k: runs[k](), 2)
     else:
-        fine, coarse = (each() for each in both)
+        fine, coarse = (run() for run in runs)
     return _compare_runs(plan, fine, coarse, control, coarser, coarse.evaluations)
 
 
-_ATTEMPTS = 6
+_MAX_ACCURACY_RUNS = 6
 """Maximum number of runs to reach an `accuracy`."""
 
 
@@ -262,10 +263,10 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
     control, dtype = plan.integration.control, plan.scene.top_speed.dtype
     assert isinstance(control, StepControl)
     floor, coarser = 10.0 * float(jnp.finfo(dtype).eps), _coarser(control)
-    before = run = _run(plan, coarser)
-    for _ in range(_ATTEMPTS - 1):
+    previous = run = _run(plan, coarser)
+    for _ in range(_MAX_ACCURACY_RUNS - 1):
         latest = _run(plan, control)
-        run = _compare_runs(plan, latest, before, control, coarser, known(run.evaluations))
+        run = _compare_runs(plan, latest, previous, control, coarser, known(run.evaluations))
         if status_name(run.status) != "done" or float(run.error) <= accuracy:
             return run
         tolerance = float(cast(Array, control.tolerance))
@@ -275,18 +276,22 @@ def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
             break
         # The tolerance is reduced more than in proportion, because the error decreases more slowly than the tolerance.
         share = min(max(0.2 * (accuracy / float(run.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(run.error)) else 1e-2
-        before, coarser = latest, control
+        previous, coarser = latest, control
         control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), dtype))
     return eqx.tree_at(lambda r: r.status, run, RunStatus.not_accurate)
 
 
 def _compare_runs(
-    plan: RunPlan, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, before: Array | np.ndarray
+    plan: RunPlan, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, earlier_evaluations: Array | np.ndarray
 ) -> Run:
-    """Return the run with smaller steps, with its estimated error and the cost of both; `before`: evaluations of earlier
-    runs."""
-    theirs, counted = (coarse.window.state, coarse.status), (fine.evaluations, before)
-    error, evaluations = _estimate_error(plan.scene, plan.fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
+    """Return the run `fine` with its estimated error, and with the number of evaluations of all runs.
+
+    **Arguments**: `earlier_evaluations`: number of evaluations of the earlier runs.
+    """
+    coarse_states, evaluation_counts = (coarse.window.state, coarse.status), (fine.evaluations, earlier_evaluations)
+    error, evaluations = _estimate_error(
+        plan.scene, plan.fastest, fine.window, fine.steps, *coarse_states, control, coarser, evaluation_counts
+    )
     return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
 
@@ -308,7 +313,7 @@ def _estimate_error(
     fastest: Array | np.ndarray,
     window: Trajectory,
     steps: Array,
-    theirs: State,
+    coarse_states: State,
     status: RunStatus,
     control: StepControl,
     coarser: StepControl,
@@ -316,31 +321,34 @@ def _estimate_error(
 ) -> tuple[Array, Array]:
     """Return the estimated error of a run, and the sum of the `evaluations`.
 
-    **Arguments**: the `window` of the run; the states `theirs` and the `status` of a run with larger steps; `fastest`: see
+    **Arguments**: `window` of the run; `coarse_states` of the window and `status` of a run with larger steps; `fastest`: see
     `frequency_bounds`.
     """
     # The error is unknown if the second run failed, or if it has the same steps.
-    found = status == RunStatus.done
+    is_known = status == RunStatus.done
     if control.steps is not None:
-        found = found & (control.steps != coarser.steps)
-    ours = window.state
-    theirs = with_nearest_turns(theirs, ours) if angle_wrapping(scene, window.time.dtype)[0] else theirs
-    difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
+        is_known = is_known & (control.steps != coarser.steps)
+    states = window.state
+    coarse_states = with_nearest_turns(coarse_states, states) if angle_wrapping(scene, window.time.dtype)[0] else coarse_states
+    difference = scaled_error(states, coarse_states, error_scale(states, natural_units(scene)))
     error = estimated_error(difference, _error_share(control, coarser), scene, steps, fastest * window.time[-1])
-    return jnp.where(found & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
+    return jnp.where(is_known & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
 
 
 def last_state(scene: Scene, run: Run) -> State:
-    """Return the last state of a run, from which it can continue, with angles within one turn so that no digits are lost."""
+    """Return the last state of a run, from which another run can continue. Angles are within one turn, because large angles
+    would lose digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, has_common_turns = angle_wrapping(scene, last.displacement.dtype)
 
-    def inside(own: ExciterState) -> ExciterState:
-        first = np.ravel(own.angle[0])[0] if own.angle else 0.0
-        angle = tuple(x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in own.angle)
-        return ExciterState(angle, own.rate, own.rotor, own.spin)
+    def within_one_turn(exciter_state: ExciterState) -> ExciterState:
+        first = np.ravel(exciter_state.angle[0])[0] if exciter_state.angle else 0.0
+        angle = tuple(
+            x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in exciter_state.angle
+        )
+        return ExciterState(angle, exciter_state.rate, exciter_state.rotor, exciter_state.spin)
 
-    last = State(last.displacement, last.velocity, exciters=tuple(map(inside, last.exciters)))
+    last = State(last.displacement, last.velocity, exciters=tuple(map(within_one_turn, last.exciters)))
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), last)
 
 
@@ -349,15 +357,15 @@ _FAILURES = ("max_steps_reached", "not_finite", "no_step", "not_accurate", "no_s
 
 def _hint(plan: RunPlan, run: Run, name: str) -> str:
     """Return text on the time of a failure and on a change that may help."""
-    hint, kept = "", run.window if run.trajectory is None else run.trajectory
-    times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
+    hint, stored = "", run.window if run.trajectory is None else run.trajectory
+    times, finite = np.asarray(stored.time), np.all(np.isfinite(np.asarray(stored.state.displacement)), axis=1)
     if not bool(np.all(finite)) and bool(np.any(finite)):
         hint += f", after t = {times[finite][-1]:.6g} s"
     if name == "no_step":
         hint += "; give a smaller tolerance, or an explicit solver"
     if name == "max_steps_reached":
-        most = plan.integration.max_steps
-        hint += f" ({most} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
+        max_steps = plan.integration.max_steps
+        hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
     if name == "not_accurate":
         hint += f" ({float(run.error):.1e}; requested {plan.accuracy:.1e}); give a larger accuracy, or a shorter run"
     return hint

@@ -65,9 +65,10 @@ def initial_state(
       the angle at which they are side by side. Default: at rest, side by side if the `ball_radius` of the loads is known,
       otherwise 1 degree; 0 in a jam, whose theory assumes coincident loads, and for `angles` (count,). Loads with the same
       parameters that start at exactly one angle (`separation=0`) stay at one angle, even if slightly separated loads would not
-    - `throw`: raise if the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
+    - `throw`: True to raise `ComputationError` if the mode does not exist; otherwise, and under a JAX transformation, the state
+      is NaN
 
-    A motor's rotor starts at rest, at the angle 0, without currents.
+    The rotor of a motor starts at rest, at the angle 0, without currents.
 
     **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that does
     not exist at the rotor speed of the scene.
@@ -99,8 +100,8 @@ def initial_state(
             return ExciterState(rotor=rotor)
         first, *others = exciter.loads.rest()
         angle = (phases(exciter, exciter.loads, first), *others)
-        still = cast(Array, np.zeros(exciter.loads.count, mass.dtype))
-        return ExciterState(angle, (still,) * len(angle), rotor)
+        zero_rates = cast(Array, np.zeros(exciter.loads.count, mass.dtype))
+        return ExciterState(angle, (zero_rates,) * len(angle), rotor)
 
     if start != "jam":
         state = State(zero, zero, exciters=tuple(map(at_rest, scene.exciters)))
@@ -115,34 +116,36 @@ def initial_state(
     try:
         modes = jam_modes(scene)
     except InputError as error:
-        why, _, advice = error.problem.partition(";")
+        problem, _, advice = error.problem.partition(";")
         if "simulate" not in advice:  # `simulate` is the caller, so that advice would be circular
             raise
-        raise InputError("start", f"is 'jam', but {error.field} {why}; start at 'rest', or from a State") from error
+        raise InputError("start", f"is 'jam', but {error.field} {problem}; start at 'rest', or from a State") from error
     row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(scene.exciter, scene.loads, 0.0)
     require_start(scene, State(zero, zero, (angle,)))
     return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
 
 
 def _places(exciter: Exciter, loads: Loads, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:
-    """Return the angles (count,), rad, of the loads relative to their middle; `one_each`: the user gave an angle for each
-    load."""
+    """Return the angles (count,), rad, of the loads relative to their middle.
+
+    **Arguments**: `one_each`: True if the user has given an angle for each load.
+    """
     n = loads.count
-    touching = has_term(exciter.effects, LoadInteraction)
+    has_contact = has_term(exciter.effects, LoadInteraction)
     has_size = getattr(loads, "ball_radius", None) is not None
     is_default = separation is None and start != "jam"
-    side_by_side = not one_each and (touching or (is_default and has_size))
+    side_by_side = not one_each and (has_contact or (is_default and has_size))
     if separation is not None:
         gap = known_number(separation, "rad", "separation", low=0.0)
     else:
         gap = min(START_SEPARATION, math.pi / n) if is_default and not (has_size or one_each) else 0.0
-    evenly = gap * (np.arange(n) - 0.5 * (n - 1)).astype(exciter.drive.speed.dtype)
-    return evenly + known(loads.offsets()) if side_by_side else evenly
+    offsets = gap * (np.arange(n) - 0.5 * (n - 1)).astype(exciter.drive.speed.dtype)
+    return offsets + known(loads.offsets()) if side_by_side else offsets
 
 
 @cached
 def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: Array) -> State:
-    """Return the state in the jam of the given row, with the loads at the given angles."""
+    """Return the state in the jam of the given `row`, with the loads at the angles `angle` (count,), rad."""
     rotated = displacement[row] * jnp.exp(1j * jnp.mean(angle))
     return State(rotated.real, -omega[row] * rotated.imag, (angle,), (jnp.full_like(angle, omega[row]),))
 
@@ -176,9 +179,9 @@ def with_spin(scene: Scene, state: State, rotation: Rotation = "rolling") -> Sta
     if rotation not in get_args(Rotation):
         raise InputError("rotation", f"is {quoted(rotation)}; it must be 'rolling' or 'none'")
     exciters = []
-    for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
+    for k, (exciter, exciter_state) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         with within(scene.prefix_of(k)):
-            exciters.append(_exciter_with_spin(exciter, own, rotation))
+            exciters.append(_exciter_with_spin(exciter, exciter_state, rotation))
     return State(state.displacement, state.velocity, exciters=exciters)
 
 
@@ -195,9 +198,12 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
         n = (loads.count,)
         needed = (n if has_drilling else None, (n,) * len(state.angle) if has_slip else None)
         drilling, slip = state.spin.drilling, state.spin.slip
-        found = (None if drilling is None else jnp.shape(drilling), None if slip is None else tuple(map(jnp.shape, slip)))
-        if found != needed:
-            problem = f"has shapes {found} of drilling and slip; this scene needs {needed} (None if no effect allows it)"
+        shapes_found = (
+            None if drilling is None else jnp.shape(drilling),
+            None if slip is None else tuple(map(jnp.shape, slip)),
+        )
+        if shapes_found != needed:
+            problem = f"has shapes {shapes_found} of drilling and slip; this scene needs {needed} (None if no effect allows it)"
             raise InputError("start.spin", problem)
         return state
     zero = jnp.zeros_like(state.angle[0])
@@ -212,8 +218,10 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
             across, up = (x - own * y / loads.mass for x, y in zip(loads.position(*u), normal_force.normal, strict=False))
             along = jax.jvp(loads.position, u, rate)[1]
             relative = (along[0] + w * up, along[1] - w * across, *along[2:])
-            found = kinematics(loads, u, rate)
-            slip = tuple(dot(column, relative) / size for column, size in zip(found.columns, found.sizes, strict=True))
+            shapes_found = kinematics(loads, u, rate)
+            slip = tuple(
+                dot(column, relative) / size for column, size in zip(shapes_found.columns, shapes_found.sizes, strict=True)
+            )
     spin = Spin(drilling if has_drilling else None, slip if has_slip else None)
     return ExciterState(state.angle, state.rate, state.rotor, spin)
 
@@ -221,7 +229,7 @@ def _exciter_with_spin(exciter: Exciter, state: ExciterState, rotation: Rotation
 def start_state(
     scene: Scene, start: Start | State, mode: int | None, separation: Number | None = None, *, throw: bool = True
 ) -> State:
-    """Return the state of a start by name, or a user's state, validated. **Raises** `InputError`."""
+    """Return the initial state of a named start, or the validated state of the user. **Raises** `InputError`."""
     if isinstance(start, State):
         return _validate_state(scene, start, mode, separation)
     return initial_state(scene, start, mode=mode, separation=separation, throw=throw)
@@ -248,7 +256,7 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
 
 
 def _validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None) -> State:
-    """Return a user's initial state, converted to the precision of JAX and completed by `with_spin`.
+    """Return the initial state of the user, converted to the precision of JAX and completed by `with_spin`.
 
     **Raises** `InputError` if its shapes do not fit the scene, or if a `mode` or `separation` is given together with it.
     """
@@ -262,22 +270,26 @@ def _validate_state(scene: Scene, state: State, mode: int | None, separation: Nu
         raise InputError("start.exciters", f"are {len(state.exciters)}; this scene needs {len(scene.exciters)}")
     nd = scene.machine.structure().mass.shape[0]
     _require_shapes(state, displacement=nd, velocity=nd)
-    for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
+    for k, (exciter, exciter_state) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         with within(scene.prefix_of(k)):
-            if exciter.drive.ideal != (own.rotor is None):
+            if exciter.drive.ideal != (exciter_state.rotor is None):
                 motor, ideal = (
                     "(angle, speed), because the angle and speed of a motor's rotor are part of the state",
                     "None, because the drive prescribes the motion of the rotor",
                 )
-                problem = f"under the drive {quoted(exciter.drive.kind)} it must be {motor if own.rotor is None else ideal}"
-                raise InputError("start.rotor", f"is {quoted(own.rotor)}; {problem}")
+                problem = (
+                    f"under the drive {quoted(exciter.drive.kind)} it must be {motor if exciter_state.rotor is None else ideal}"
+                )
+                raise InputError("start.rotor", f"is {quoted(exciter_state.rotor)}; {problem}")
             needed = 2 + len(exciter.drive.state_units())
-            if own.rotor is not None and len(own.rotor) != needed:
-                problem = f"has {len(own.rotor)} entries; {needed} are needed: angle, speed and the states of the motor"
+            if exciter_state.rotor is not None and len(exciter_state.rotor) != needed:
+                problem = (
+                    f"has {len(exciter_state.rotor)} entries; {needed} are needed: angle, speed and the states of the motor"
+                )
                 raise InputError("start.rotor", problem)
             if exciter.loads is not None:
-                _require_shapes(own, angle=exciter.loads.count, rate=exciter.loads.count)
-            elif own.angle or own.rate:
+                _require_shapes(exciter_state, angle=exciter.loads.count, rate=exciter.loads.count)
+            elif exciter_state.angle or exciter_state.rate:
                 raise InputError("start.angle", "is given, but this exciter has no loads; leave angle and rate out")
     require_start(scene, state)
     return with_spin(scene, jax.tree.map(partial(jnp.asarray, dtype=float), state))
@@ -293,11 +305,11 @@ def _require_shapes(state: State | ExciterState, **lengths: int) -> None:
 
 def require_start(scene: Scene, state: State) -> None:
     """**Raises** `InputError` if loads with contact overlap at known initial angles (..., count)."""
-    for k, (exciter, own) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
+    for k, (exciter, exciter_state) in enumerate(zip(scene.exciters, state.exciters, strict=True)):
         for term in terms_of(exciter.effects, LoadInteraction):
             if term.validate_start is not None and exciter.loads is not None:
                 with within(scene.prefix_of(k)):
-                    _validate_places(scene, exciter, own.angle, term.validate_start)
+                    _validate_places(scene, exciter, exciter_state.angle, term.validate_start)
 
 
 def _validate_places(

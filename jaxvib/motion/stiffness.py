@@ -38,9 +38,9 @@ def fastest_decay(scene: Scene) -> Array:
 
         max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j),      the largest eigenvalue of M^-1 C
 
-    Q' is the derivative of the resistance of a load with respect to its rate, H its inertia, mu the trace of B M^-1 B^T (the
-    motion of the carrier reduces the effective inertia of the loads). Explicit steps must resolve this rate, even if the motion
-    is slow.
+    Q' is the derivative of the resistance of a load with respect to its rate, H its inertia, mu the trace of P M^-1 P^T with
+    the rows P of the mount (the motion of the carrier reduces the effective inertia of the loads). The denominator is at least
+    0.1. Explicit steps must resolve this rate, even if the motion is slow.
     """
     scene = jax.lax.stop_gradient(scene)
     linear = linear_model(scene)
@@ -54,7 +54,7 @@ def fastest_decay(scene: Scene) -> Array:
 
 
 def _load_decay(loads: Loads, speed: Array, accelerance: Array) -> Array:
-    """Return the fastest decay rate due to the drag of an exciter's loads, 1/s; `accelerance` mu of its place."""
+    """Return the fastest decay rate due to the drag of the loads of an exciter, 1/s; `accelerance`: mu of its mount, 1/kg."""
     angle = tuple(jnp.broadcast_to(jnp.asarray(x, speed.dtype), (loads.count,)) for x in loads.rest())
     turning = tuple(jnp.full_like(x, speed) if i == 0 else jnp.zeros_like(x) for i, x in enumerate(angle))
     kappa, metric = loads.inertia_factor(), kinematics(loads, angle, turning).metric
@@ -75,10 +75,10 @@ def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rod
 
 
 def equal_step_length(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
-    """Return the length of equal steps, s, and True if they have to be implicit.
+    """Return the length of equal steps, s, and True if implicit steps are necessary.
 
-    **Arguments**: `fastest` rate of the motion, rad/s; rate of the `decay`, 1/s; number of explicit steps `per_radian` of the
-    motion; the length of the `step` if it is prescribed.
+    **Arguments**: `fastest`: rate of the motion, rad/s; `decay`: fastest decay rate, 1/s; `per_radian`: number of explicit
+    steps per radian of the motion; `step`: prescribed length of the steps, s, or None.
     """
     if step is not None:
         return step, decay * step > _MAX_DECAY_PER_STEP
@@ -93,8 +93,7 @@ def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.
 
 
 def advice(scene: Scene) -> str:
-    """Return the cause of short steps as the end of a sentence; empty if no decay is more than 10 times faster than the
-    motion."""
+    """Return the cause of short steps as the end of a sentence; "" if no decay is more than 10 times as fast as the motion."""
     decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""

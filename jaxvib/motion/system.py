@@ -92,16 +92,16 @@ class PackedSystem(eqx.Module):
         leaves, self.treedef = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
-        self.args, given = field, (jnp.zeros((), leaves[0].dtype), state, field)
+        self.args, arguments = field, (jnp.zeros((), leaves[0].dtype), state, field)
         # Without a batch, arrays over the angles of many loads already fill the vector registers.
         is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG_ARRAY)
-        program = scalarized_program(_rates_of, *given) if is_small else None
+        program = scalarized_program(_rates_of, *arguments) if is_small else None
         if program is not None:
             program = with_reciprocals(program, 1 + self.size)
         self.is_scalarized = program is not None
-        self.program = arrays_program(_rates_of, *given) if program is None else program
+        self.program = arrays_program(_rates_of, *arguments) if program is None else program
         if program is not None:
-            # Arrays are split into entries here, so that the time loop contains no arrays.
+            # Arrays are split into entries here; the time loop then contains no arrays.
             self.args = scalars_of(field)
         self.is_on_scalars = self.is_scalarized and batch
         self.has_fences = self.is_scalarized and solver is None and (batch or self.size <= _MAX_UNROLLED_SIZE)
@@ -113,20 +113,20 @@ class PackedSystem(eqx.Module):
 
     def method(self, adjoint: diffrax.AbstractAdjoint | None = None) -> diffrax.AbstractSolver:
         """Return the method of order 8 in its fastest form, with derivatives by `adjoint` (default: `jaxvib.ode.replay`)."""
-        # `args` is removed, since a method must not contain traced arrays.
+        # `args` is removed, because a method must not contain traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
         if self.size <= _MAX_UNROLLED_SIZE:
             return UnrolledDopri8(wrap=wrap)
         return LoopDopri8(reuse=adjoint is None or isinstance(adjoint, diffrax.ForwardMode), wrap=wrap)
 
     def pack(self, state: State) -> IntegratorState:
-        """Convert a state (or a tree like it) to the form of the integrator."""
+        """Convert a state, or a tree with the same structure, to the state of the integrator."""
         y = tuple(scalars_of(state)) if self.is_on_scalars else ravel(state)
         return (y, jax.tree.map(jnp.zeros_like, y)) if self.wrapped else y
 
     def unpack(self, packed: IntegratorState) -> State:
-        """Return states along a leading axis from those of the integrator; angles are relative to the number of turns of the
-        first state."""
+        """Return states along a leading axis from states of the integrator. The whole turns of the first state are subtracted
+        from wrapped angles."""
         if not self.wrapped:
             return self._state(packed)
         y, turns = packed
@@ -141,8 +141,8 @@ class PackedSystem(eqx.Module):
         def whole(x: Array, is_angle: np.ndarray) -> Array:
             return jnp.where(is_angle, jnp.round(x / _TURN), 0.0)
 
-        done = jax.tree.map(whole, lead, tuple(is_angle) if self.is_on_scalars else is_angle)
-        return _add_turns(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
+        whole_turns = jax.tree.map(whole, lead, tuple(is_angle) if self.is_on_scalars else is_angle)
+        return _add_turns(y, whole_turns, -1.0), jax.tree.map(jnp.add, turns, whole_turns)
 
     def _angles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return True for entries that are angles, and for each entry the index of the angle that defines its number of
@@ -184,20 +184,20 @@ class PackedSystem(eqx.Module):
         if not self.is_scalarized:
             return ravel(run(jnp.asarray(t, y.dtype), *jax.tree.leaves(self._state(y)), *jax.tree.leaves(args)))
         numbers = y if self.is_on_scalars else entries(y, hidden_one(y[0])) if self.has_fences else jnp.unstack(y)
-        given = [jnp.asarray(t, numbers[0].dtype), *numbers, *args]
-        rates = fenced(self.program, given) if self.has_fences else run(*given)
+        arguments = [jnp.asarray(t, numbers[0].dtype), *numbers, *args]
+        rates = fenced(self.program, arguments) if self.has_fences else run(*arguments)
         return tuple(rates) if self.is_on_scalars else jnp.stack(rates)
 
 
 def _add_turns(y: IntegratorState, turns: IntegratorState, sign: float) -> IntegratorState:
     """Add whole turns to entries, with 2 pi in two parts, because the rounding error of 2 pi would accumulate."""
 
-    def turned(x: Array, n: Array) -> Array:
+    def add_to_entry(x: Array, n: Array) -> Array:
         high = np.asarray(_TURN, x.dtype)
         low = np.asarray(_TURN - float(high), x.dtype)
         return (x + sign * n * high) + sign * n * low
 
-    return jax.tree.map(turned, y, turns)
+    return jax.tree.map(add_to_entry, y, turns)
 
 
 def _rates_of(t: Array, y: State, field: Callable[[Array, State], State]) -> State:

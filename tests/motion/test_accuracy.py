@@ -70,7 +70,7 @@ def test_an_accuracy_missed_at_first_is_not_overshot():
 
 def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
     s = published(speed=5.0, eps=0.05).scene()
-    monkeypatch.setattr("jaxvib.motion.simulate._ATTEMPTS", 2)
+    monkeypatch.setattr("jaxvib.motion.simulate._MAX_ACCURACY_RUNS", 2)
     asked = dict(start=some_state(s), save="window", stepsize_controller=jv.Accuracy(1e-12), max_steps=MAX_STEPS)
     # So long that rounding alone makes more than this error.
     run = jv.simulate(s, 200.0, **asked, throw=False)

@@ -127,7 +127,7 @@ def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
         return SimpleNamespace(status=jv.RunStatus.done, window=window)
 
     monkeypatch.setattr("jaxvib.motion.growth.run_planned", run)
-    monkeypatch.setattr("jaxvib.motion.growth._returns", lambda *_: False)
+    monkeypatch.setattr("jaxvib.motion.growth._has_returned", lambda *_: False)
     with jax.enable_x64(False):
         scene, start = forced(0.0, 1.0)
         found = jv.growth(scene, 100.0, start=start, stretches=8)

@@ -1,4 +1,4 @@
-"""Quantities measured from a sampled motion: amplitudes, mean speeds, foundation force."""
+"""Measurement of a sampled motion: amplitudes, mean speeds, foundation force."""
 
 from __future__ import annotations
 
@@ -59,29 +59,31 @@ class Trajectory(eqx.Module):
 
 
 def only_exciter_value(values: tuple[Array, ...], name: str) -> Array:
-    """Return the value of the only exciter. **Raises** `InputError` if there are several; it names their values."""
+    """Return the value of the only exciter. **Raises** `InputError` for several exciters; the message states how to read the
+    values of each."""
     if len(values) != 1:
         raise InputError(name, f"are those of {len(values)} exciters; read {name}[0] and so on")
     return values[0]
 
 
 class AbstractMeasured(eqx.Module):
-    """Quantities of a motion, measured over the last turns of a run.
+    """Quantities of a motion, measured over the window at the end of a run.
 
     **Attributes**
 
     - `omega`, rad/s: mean speed of the loads over whole turns, and `load_speed` (count,), rad/s: the same for each load
     - `amplitude` (nd,), m (rad for tilts), and `foundation_force`, N: zero to peak, that is half of peak to peak; for a force
       with two directions the root of the sum of both squares; typical: 0.5 to 10 mm, 10 N to 10 kN
-    - `drift`: the largest of three relative changes from the first to the second half of these turns
+    - `drift`: the largest of three relative changes within the window
     - `settled`: True if the drift is below 1e-3
 
     The three changes are
 
-    - the change of an amplitude, relative to the largest amplitude, or to 1e-4 of the unbalance radius S/M if that is more (the
-      amplitude of a balanced rotor is almost zero)
-    - the change of the foundation force, relative to the largest force, or to 1e-4 of S n^2 (n: rotor speed) if that is more
-    - the change of a load's speed, relative to `omega`
+    - the change of an amplitude from the first to the second half of the window, relative to the largest amplitude, or to 1e-4
+      of the unbalance radius S/M if that is more (the amplitude of a balanced rotor is almost zero)
+    - the change of the foundation force from the first to the second half, relative to the largest force, or to 1e-4 of S n^2
+      (n: rotor speed) if that is more
+    - the difference between the mean speeds of a load in the second half and in the whole window, relative to `omega`
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -92,7 +94,7 @@ class AbstractMeasured(eqx.Module):
 
     @property
     def settled(self) -> Array:
-        """True if amplitudes, force and speeds no longer change."""
+        """True if the relative changes of amplitudes, force and speeds are below 1e-3."""
         return self.drift < 1e-3
 
     def amplitude_text(self, scene: Scene) -> str:
@@ -108,9 +110,12 @@ class Measured(AbstractMeasured):
 
 
 def trajectory(model: Model, times: Array, states: State) -> Trajectory:
-    """Return the trajectory of states at times, with their forces and rotor speeds."""
+    """Return the trajectory of `states` at `times`, s, with foundation forces, rotor angles and rotor speeds."""
     force = jax.vmap(model.foundation_force)(states.displacement, states.velocity)
-    pairs = [(exciter.turning_drive, own.rotor) for exciter, own in zip(model.scene.exciters, states.exciters, strict=True)]
+    pairs = [
+        (exciter.turning_drive, exciter_state.rotor)
+        for exciter, exciter_state in zip(model.scene.exciters, states.exciters, strict=True)
+    ]
     angles = tuple(jax.vmap(drive.rotor_angle)(times, rotor) for drive, rotor in pairs)
     speeds = tuple(jax.vmap(drive.rotor_speed)(times, rotor) for drive, rotor in pairs)
     return Trajectory(times, states, force, angles, speeds)
@@ -119,17 +124,20 @@ def trajectory(model: Model, times: Array, states: State) -> Trajectory:
 def turning_angles(scene: Scene, times: Callable[[], Array], states: State) -> tuple[Array, Array]:
     """Return angles (nt, n), rad, and rates, rad/s, of the turning masses of all exciters, in the order of the exciters.
 
-    They are the loads of an exciter, or, if it has no loads, its rotor.
+    The masses of an exciter are its loads or, if it has no loads, its rotor.
 
     **Arguments**: `times`: function that returns the times (nt,), s, of the states; it is called for rotors only.
     """
     columns: list[tuple[Array, Array]] = []
-    for exciter, own in zip(scene.exciters, states.exciters, strict=True):
-        if own.angle:
-            columns.append((own.angle[0], own.rate[0]))
+    for exciter, exciter_state in zip(scene.exciters, states.exciters, strict=True):
+        if exciter_state.angle:
+            columns.append((exciter_state.angle[0], exciter_state.rate[0]))
         else:
-            drive, at = exciter.turning_drive, times()
-            angle, rate = jax.vmap(drive.rotor_angle)(at, own.rotor), jax.vmap(drive.rotor_speed)(at, own.rotor)
+            drive, moments = exciter.turning_drive, times()
+            angle, rate = (
+                jax.vmap(drive.rotor_angle)(moments, exciter_state.rotor),
+                jax.vmap(drive.rotor_speed)(moments, exciter_state.rotor),
+            )
             columns.append((angle[:, None], rate[:, None]))
     if len(columns) == 1:
         return columns[0]
@@ -211,8 +219,8 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
     """Return the least and greatest values of each output, and their places, (2, 3, outputs) each, see `locate_extrema`."""
     # One output after the other fits the processor's cache.
-    found = jax.lax.map(lambda pair: locate_extrema(*pair), _sampled_outputs(model, field, times, states))
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), found)
+    values_and_places = jax.lax.map(lambda pair: locate_extrema(*pair), _sampled_outputs(model, field, times, states))
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), values_and_places)
 
 
 def _sampled_outputs(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array]:
@@ -243,15 +251,15 @@ def _outputs(model: Model, step: Array, state: State, rates: State) -> tuple[Arr
 def mean_speeds(times: Array, angle: Array, rate: Array, first: Sequence[int], last: Sequence[int] | None = None) -> Array:
     """Return mean speeds over parts of the samples.
 
-    Each is the mean over the whole turns that end at the last sample of the part, or over the whole part if it is shorter than
-    a turn.
+    The mean of a part is taken over the whole turns that end at its last sample, or over the whole part if it is shorter than a
+    turn.
 
     **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each part
     (default: the last sample of all). **Returns** (parts, m) rad/s.
     """
     ends = [len(times) - 1] * len(first) if last is None else last
-    each = jax.vmap(_mean_speed, in_axes=(None, 1, 1, None, None))
-    return jax.vmap(each, in_axes=(None, None, None, 0, 0))(times, angle, rate, jnp.asarray(first), jnp.asarray(ends))
+    speeds_of_part = jax.vmap(_mean_speed, in_axes=(None, 1, 1, None, None))
+    return jax.vmap(speeds_of_part, in_axes=(None, None, None, 0, 0))(times, angle, rate, jnp.asarray(first), jnp.asarray(ends))
 
 
 def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) -> Array:
@@ -278,7 +286,7 @@ def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) ->
 
 
 def _step(times: Array) -> Array:
-    """Return the step of even samples, averaged over all samples because each time is rounded late in a long run."""
+    """Return the step of evenly spaced samples, averaged over all samples, because late in a long run each time is rounded."""
     return (times[-1] - times[0]) / (times.shape[0] - 1)
 
 

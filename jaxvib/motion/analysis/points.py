@@ -1,4 +1,4 @@
-"""Motion of points of a machine in a run, and the fit of a harmonic to the last turns of the run."""
+"""Motion of points of a machine in a run, and the fit of a harmonic to the window of the run."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from jaxvib.steady.measures import Vibration
 from jaxvib.steady.points import rows_in_plane
 
 _HARMONICS = 3
-"""Number of fitted harmonics. The second and the third are fitted so that they do not influence the first."""
+"""Number of fitted harmonics. The second and the third are included because they would otherwise influence the first."""
 
 
 class PointMotion(eqx.Module):
-    """Motion of a point of a machine, (nt,) samples.
+    """Motion of a point of a machine at nt times.
 
     Returned by `Run.point`.
 
@@ -43,10 +43,10 @@ class PointMotion(eqx.Module):
 
 
 @cached
-def motion_of_point(machine: Machine, kept: Trajectory, place: Place) -> PointMotion:
+def motion_of_point(machine: Machine, trajectory: Trajectory, place: Place) -> PointMotion:
     """Return the motion of the point at `place` at the times of a trajectory."""
     rows = rows_in_plane(machine, place)
-    return PointMotion(kept.time, kept.state.displacement @ rows.T, kept.state.velocity @ rows.T)
+    return PointMotion(trajectory.time, trajectory.state.displacement @ rows.T, trajectory.state.velocity @ rows.T)
 
 
 @cached
@@ -65,10 +65,10 @@ def fit_harmonic(time: Array, displacement: Array, speed: Array) -> tuple[Array,
     orders = jnp.arange(1, _HARMONICS + 1, dtype=time.dtype)
     waves = jnp.outer(angle, orders)
     basis = jnp.concatenate([jnp.cos(waves), jnp.sin(waves), jnp.ones_like(angle)[:, None]], axis=1)
-    found = jnp.linalg.solve(basis.T @ (weight * basis), basis.T @ (weight * displacement))
-    own = jnp.array([0, _HARMONICS])
-    rest = displacement - found[None, -1] - basis[:, own] @ found[own]
-    return found[0] - 1j * found[_HARMONICS], rest.T @ (weight * rest) / jnp.sum(weight)
+    coefficients = jnp.linalg.solve(basis.T @ (weight * basis), basis.T @ (weight * displacement))
+    first_harmonic = jnp.array([0, _HARMONICS])
+    rest = displacement - coefficients[None, -1] - basis[:, first_harmonic] @ coefficients[first_harmonic]
+    return coefficients[0] - 1j * coefficients[_HARMONICS], rest.T @ (weight * rest) / jnp.sum(weight)
 
 
 @cached
@@ -76,27 +76,27 @@ def vibration_of(scene: Scene, window: Trajectory, measured: AbstractMeasured) -
     """Return the harmonic at the mean speed of the loads, fitted to the displacements of a window, with the measured amplitudes
     and the mean torques and powers of the drives.
 
-    The exciter's force is NaN for a rotor with an imbalance, which can turn faster than the loads, and the torque is NaN for
-    loads that spin or slide.
+    The exciter force is NaN for a rotor with an imbalance, because the rotor can turn faster than the loads. Torques and powers
+    are NaN for loads that spin or slide.
     """
     time, states, model = window.time, window.state, assemble(scene)
-    found, _ = fit_harmonic(time, states.displacement, measured.omega)
+    harmonic, _ = fit_harmonic(time, states.displacement, measured.omega)
     torques = jax.vmap(partial(drive_torques, model, dynamics_of(model)))(time, states)
     hann = _hann(time.shape[0])
     weight = jnp.asarray(hann / np.sum(hann), time.dtype)
-    torque, power = (weight @ each for each in torques)
-    slips = np.array([own.spin is not None for own in states.exciters])
+    torque, power = (weight @ torque_or_power for torque_or_power in torques)
+    has_spin = np.array([own.spin is not None for own in states.exciters])
     angles, _ = turning_angles(scene, lambda: time, states)
     phases = turning_directions(scene)[None] * angles - (measured.omega * (time - 0.5 * (time[0] + time[-1])))[:, None]
     force = peak_force(measured.omega**2 * resultant_of(linear_model(scene), weight @ jnp.exp(1j * phases)))
     return Vibration(
         speed=measured.omega,
-        displacement=found,
+        displacement=harmonic,
         amplitude=measured.amplitude,
         foundation_force=measured.foundation_force,
         exciter_force=jnp.where(has_term(scene.all_effects, RotorImbalance), jnp.nan, force),
-        torque=jnp.where(slips, jnp.nan, torque),
-        power=jnp.where(slips, jnp.nan, power),
+        torque=jnp.where(has_spin, jnp.nan, torque),
+        power=jnp.where(has_spin, jnp.nan, power),
     )
 
 

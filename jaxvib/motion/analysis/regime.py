@@ -25,9 +25,9 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phases import PhasePattern, phase_pattern
 from jaxvib.steady.whirl import whirl
 
-_SAME_SPEED = 3e-3
-"""Relative difference below which two speeds count as equal: of two loads, of a load and the rotor, or of one load in the first
-and the second half."""
+_MAX_EQUAL_SPEED_DIFFERENCE = 3e-3
+"""Relative difference below which two speeds count as equal: those of two loads, of a load and the rotor, or of a load in the
+first and the second half of the window."""
 
 _LOCKED_PHASE_CHANGE = 0.1
 """Change of the relative phases, rad, from one half of the window to the other below which they count as constant."""
@@ -65,10 +65,11 @@ class Regime(Result):
     - `name`: a `RegimeName`
     - `pattern`: a `PhasePattern` of the loads
     - `load_speed` (count,): mean speeds of the loads over whole turns, and `rotor_speed`, rad/s
-    - `ripple`: largest ripple of a load's speed (half of peak to peak), rad/s
-    - `phase` (count,), rad: mean angle of each load relative to the first one (jammed) or to the rotor (turning with it)
-    - `unbalance`: remaining unbalance of loads and rotor in the rotor's frame, relative to that of all loads; balanced below
-      0.02
+    - `ripple`: largest ripple of the speed of a load (half of peak to peak), rad/s
+    - `phase` (count,), rad: mean angle of each load relative to the rotor if all loads turn with it, otherwise relative to the
+      first load
+    - `unbalance`: residual unbalance of loads and rotor in the frame of the rotor, relative to that of all loads at one angle;
+      balanced below 0.02
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed`, rad/s
     - `mode`: estimated number of the jam mode; 0 if the loads are not jammed. Let natural frequency k be the last one below the
       mean load speed. Mode 2 k begins at this frequency; mode 2 k + 1 ends at the next one, or at the rotor speed if that is
@@ -76,7 +77,7 @@ class Regime(Result):
       to the rotor speed are therefore in mode 2 nd + 1
     - `caught`: True if the rotor itself stays at a resonance, below the no-load speed of its motor
     - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor speed; the motion
-      is steady below 0.003
+      is steady below 0.003. If all loads turn with the rotor, it is at least the largest change of their mean phases, rad
     """
 
     name: RegimeName
@@ -94,7 +95,7 @@ class Regime(Result):
 
     @property
     def status(self) -> RegimeName:
-        """Status of the result, which is its `name`: the kind of motion."""
+        """Kind of motion: `name`, which is the status of this result."""
         return self.name
 
     @property
@@ -114,10 +115,10 @@ class Regime(Result):
         evidence = [f"loads {loads}, rotor {rotor}, ripple {speed_text(self.ripple, 2)}"]
         if bool(self.name == RegimeName.jammed):
             # A mode that rises to the rotor speed lies beyond its resonance.
-            where = "beyond" if int(self.mode) == 2 * int(self.resonance) + 1 else "by"
+            relation = "beyond" if int(self.mode) == 2 * int(self.resonance) + 1 else "by"
             speed = speed_text(self.resonance_speed)
-            near = f"{where} resonance {int(self.resonance)} at {speed} (mode {int(self.mode)})"
-            evidence += [near, pattern]
+            place_text = f"{relation} resonance {int(self.resonance)} at {speed} (mode {int(self.mode)})"
+            evidence += [place_text, pattern]
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
             evidence += [self._remainder(), pattern]
         if bool(self.caught):
@@ -129,13 +130,17 @@ class Regime(Result):
         share = float(self.unbalance)
         if share < 1.005:
             return f"{100.0 * share:.3g} % of the loads' unbalance is left"
-        left = f"{share:.2g} times the loads' unbalance is left"
+        remaining_text = f"{share:.2g} times the loads' unbalance is left"
         # Loads at one angle add at most their own unbalance to that of the rotor.
-        return f"{left}: the imbalance of the rotor exceeds what the loads can balance" if share > 2.005 else left
+        return (
+            f"{remaining_text}: the imbalance of the rotor exceeds what the loads can balance"
+            if share > 2.005
+            else remaining_text
+        )
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Plot the loads on a circle, each at its mean angle relative to the first load or to the rotor.
+        """Plot the loads on a circle at their `phase`, relative to the first load or to the rotor.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -163,7 +168,7 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     **Arguments**
 
     - `scene` of the run
-    - `stretch`: a `Trajectory`, such as `run.window`; typical: 20 or more turns
+    - `stretch`: the part of the run, a `Trajectory` such as `run.window`; typical: 20 or more turns
 
     **Returns** `Regime`; `jit` and `vmap` are supported. If the motion is not steady, `name` is "unsettled" and no error is
     raised.
@@ -192,25 +197,24 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     speed, rotor = whole[:-1], whole[-1]
     reference = jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
     change = jnp.max(jnp.abs(late - early)[:-1]) / reference
-    steady = change < _SAME_SPEED
+    is_steady = change < _MAX_EQUAL_SPEED_DIFFERENCE
     swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
-    slips = [speeds[:-1] - speeds[-1] for speeds in (early, late)]
-    behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED_PHASE_CHANGE
-    behind = behind & (jnp.abs(slips[1] - slips[0]) < _STEADY_SLIP * jnp.abs(slips[1] + slips[0]) / 2.0)
-    with_rotor = (jnp.abs(speed - rotor) < _SAME_SPEED * reference) & ~behind
-    # Means of exp(i (phi_j - phi_1)), relative to the first load. If the means of both halves differ, the phase is not
-    # constant.
-    to_first, load_phase_change = _relative(phi - phi[:, :1], half)
-    to_rotor, rotor_phase_change = _relative(phi - turn[:, None], half)
-    one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (
+    lags = [speeds[:-1] - speeds[-1] for speeds in (early, late)]
+    is_behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED_PHASE_CHANGE
+    is_behind = is_behind & (jnp.abs(lags[1] - lags[0]) < _STEADY_SLIP * jnp.abs(lags[1] + lags[0]) / 2.0)
+    with_rotor = (jnp.abs(speed - rotor) < _MAX_EQUAL_SPEED_DIFFERENCE * reference) & ~is_behind
+    # Circular means of phi_j - phi_1. If the means of the two halves differ, the phase is not constant.
+    to_first, load_phase_change = _mean_phases(phi - phi[:, :1], half)
+    to_rotor, rotor_phase_change = _mean_phases(phi - turn[:, None], half)
+    has_one_speed = (jnp.max(speed) - jnp.min(speed) < _MAX_EQUAL_SPEED_DIFFERENCE * reference) & (
         jnp.max(load_phase_change) < _LOCKED_PHASE_CHANGE
     )
 
     unbalance = _unbalance(scene, to_rotor, turn)
-    name = RegimeName.where(steady, RegimeName.parted, RegimeName.unsettled)
-    name = RegimeName.where(steady & one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
+    name = RegimeName.where(is_steady, RegimeName.parted, RegimeName.unsettled)
+    name = RegimeName.where(is_steady & has_one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
     name = RegimeName.where(
-        steady & jnp.all(with_rotor),
+        is_steady & jnp.all(with_rotor),
         RegimeName.where(unbalance < _BALANCED_UNBALANCE_SHARE, RegimeName.balanced, RegimeName.unbalanced),
         name,
     )
@@ -219,33 +223,35 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     natural = _resonances(scene, rotor)
     mean = jnp.mean(speed)
     nearest = jnp.argmin(jnp.abs(natural - mean))
-    turning = jnp.all(with_rotor)
+    all_with_rotor = jnp.all(with_rotor)
     return Regime(
         name=name,
-        pattern=phase_pattern(jnp.where(turning, to_rotor, to_first)),
+        pattern=phase_pattern(jnp.where(all_with_rotor, to_rotor, to_first)),
         load_speed=speed,
         rotor_speed=rotor,
         ripple=jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0,
-        phase=jnp.where(turning, to_rotor, to_first),
+        phase=jnp.where(all_with_rotor, to_rotor, to_first),
         unbalance=unbalance,
         resonance=nearest + 1,
         resonance_speed=natural[nearest],
         mode=jnp.where(name == RegimeName.jammed, _mode(natural, mean, rotor), 0),
-        caught=_is_rotor_stuck(scene, natural, rotor),
-        change=jnp.maximum(change, jnp.where(turning, jnp.max(rotor_phase_change), 0.0)),
+        caught=_is_rotor_caught(scene, natural, rotor),
+        change=jnp.maximum(change, jnp.where(all_with_rotor, jnp.max(rotor_phase_change), 0.0)),
     )
 
 
 def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
-    """Return the estimated jam mode of loads with the speed `mean`, see `Regime`; `natural`: ascending frequencies, inf if
-    missing."""
+    """Return the estimated jam mode of loads with the mean speed `mean`, rad/s, see `mode` of `Regime`.
+
+    **Arguments**: `natural`: natural frequencies, rad/s, ascending, infinite for missing ones; `rotor`: rotor speed, rad/s.
+    """
     ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
     below = jnp.sum(natural <= mean)
     rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
     return jnp.where(rises | (below == 0), 2 * below + 1, 2 * below)
 
 
-def _is_rotor_stuck(scene: Scene, natural: Array, rotor: Array) -> Array:
+def _is_rotor_caught(scene: Scene, natural: Array, rotor: Array) -> Array:
     """Return True if the rotor of a motor is caught at a resonance.
 
     The speed of the rotor is then at most 15 % below or 2 % above the resonance, and more than 5 % below the no-load speed of
@@ -256,7 +262,7 @@ def _is_rotor_stuck(scene: Scene, natural: Array, rotor: Array) -> Array:
     return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
 
 
-def _relative(angle: Array, half: int) -> tuple[Array, Array]:
+def _mean_phases(angle: Array, half: int) -> tuple[Array, Array]:
     """Return the circular means (count,), rad, of angles (nt, count), and their changes from the first to the second half."""
     point = jnp.exp(1j * angle)
     early, late = jnp.mean(point[:half], axis=0), jnp.mean(point[half:], axis=0)
@@ -270,30 +276,37 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     radius of gyration of the rotor if the levers are 0.
     """
     mount, loads = scene.mount(), scene.loads
-    each = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
+    unbalances = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
     imbalances = [term.at(origin) for term in terms_of(scene.all_effects, RotorImbalance)]
-    own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in imbalances), jnp.zeros_like(each[0]))
-    size = jnp.sum(jnp.abs(each))
-    residual = jnp.abs(jnp.sum(each) + own) / size
+    rotor_unbalance = sum(
+        (imbalance.static[0] + 1j * imbalance.static[1] for imbalance in imbalances), jnp.zeros_like(unbalances[0])
+    )
+    size = jnp.sum(jnp.abs(unbalances))
+    residual = jnp.abs(jnp.sum(unbalances) + rotor_unbalance) / size
     if mount.tilt is None:
         return residual
-    tilting = [scaled(lever, each) for lever in mount.levers[1:]]
+    tilting = [scaled(lever, unbalances) for lever in mount.levers[1:]]
     moment = sum(
-        (imbalance.moment[0] + 1j * imbalance.moment[1] for imbalance in imbalances), jnp.sum(sum(tilting, 0.0 * each))
+        (imbalance.moment[0] + 1j * imbalance.moment[1] for imbalance in imbalances), jnp.sum(sum(tilting, 0.0 * unbalances))
     )
-    moment = sum((scaled(lever, own) for lever in mount.rotor_levers[1:]), moment)
+    moment = sum((scaled(lever, rotor_unbalance) for lever in mount.rotor_levers[1:]), moment)
     mass = scene.machine.carrier().mass
     rows = [jnp.linalg.solve(mass, row[0]) @ row[0] for row in mount.rows]
-    whole = jnp.sum(jnp.abs(sum(tilting, 0.0 * each)))
-    return jnp.maximum(residual, jnp.abs(moment) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
+    total_moment = jnp.sum(jnp.abs(sum(tilting, 0.0 * unbalances)))
+    return jnp.maximum(
+        residual, jnp.abs(moment) / jnp.where(total_moment > 0.0, total_moment, size * jnp.sqrt(rows[0] / rows[1]))
+    )
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
-    """Return the natural frequencies that turning loads excite, ascending, rad/s; for a gyroscopic rotor, the frequencies of
-    the forward whirls at the rotor speed, or of all whirls if horizontal and vertical values of its supports differ."""
+    """Return the natural frequencies that turning loads excite, rad/s, ascending.
+
+    For a gyroscopic rotor these are the frequencies of the forward whirls at the rotor speed, or of all whirls if the
+    horizontal and the vertical values of its supports differ. Missing frequencies are infinite.
+    """
     if scene.mounting.gyroscopic is None:
         return estimated_frequencies(scene)
-    found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
-    excited = jnp.isfinite(found.speed[0]) if scene.machine.is_split else found.forward[0] & jnp.isfinite(found.speed[0])
-    return jnp.sort(jnp.where(excited, found.speed[0], jnp.inf))
+    whirls = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
+    excited = jnp.isfinite(whirls.speed[0]) if scene.machine.is_split else whirls.forward[0] & jnp.isfinite(whirls.speed[0])
+    return jnp.sort(jnp.where(excited, whirls.speed[0], jnp.inf))

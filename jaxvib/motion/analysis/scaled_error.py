@@ -26,7 +26,7 @@ def natural_units(scene: Scene) -> State:
     the unbalance of the loads, or that of the rotor if it is larger.
     """
     carrier, pairs = scene.machine.carrier(), [_exciter_units(exciter) for exciter in scene.exciters]
-    unbalances = [unbalance for each, _ in pairs for unbalance in each]
+    unbalances = [unbalance for unbalances_of_exciter, _ in pairs for unbalance in unbalances_of_exciter]
     length = functools.reduce(jnp.maximum, unbalances) / jnp.mean(jnp.diagonal(carrier.mass))
     exciters = tuple(unit for _, unit in pairs)
     return jax.lax.stop_gradient(State(length, length * scene.top_speed, exciters=exciters))
@@ -43,21 +43,21 @@ def _exciter_units(exciter: Exciter) -> tuple[list[Array], ExciterState]:
         unbalances.append(loads.count * (jnp.mean(loads.mass) * arm))
     for term in terms_of(effects, RotorImbalance):
         unbalances.append(jnp.sqrt(sum(x**2 for x in term.at(jnp.zeros_like(arm)).static)))
-    one = jnp.ones_like(speed)
-    rotor = None if exciter.drive.ideal else (one, speed, *exciter.drive.state_units())
+    ones = jnp.ones_like(speed)
+    rotor = None if exciter.drive.ideal else (ones, speed, *exciter.drive.state_units())
     if loads is None:
         return unbalances, ExciterState(rotor=rotor)
     drilling = speed if has_term(effects, DrillingSpinRelease) else None
     slip = (speed * arm,) if has_term(effects, SlipRelease) else None
     spin = None if drilling is None and slip is None else Spin(drilling, slip)
-    return unbalances, ExciterState((one,), (speed,), rotor, spin)
+    return unbalances, ExciterState((ones,), (speed,), rotor, spin)
 
 
 def error_scale(state: State, unit: State) -> State:
     """Return the scales by which differences between states are divided, one for each part of the state.
 
-    The scale of displacements and of velocities is the largest value, but at least the natural unit, because a machine at rest
-    has no scale. The scale of angles and of their rates is the natural unit, 1 rad and the rotor speed.
+    The scale of displacements and of velocities is their largest modulus, but at least the natural unit, because these values
+    of a machine at rest are 0. The scale of angles and of their rates is the natural unit: 1 rad, and the rotor speed.
 
     **Arguments**: `state`: a `State`, or several states whose arrays have a leading axis; `unit`: its `natural_units`.
 
@@ -69,16 +69,21 @@ def error_scale(state: State, unit: State) -> State:
     def largest(x: Array, least: Array) -> Array:
         return xp.maximum(xp.max(xp.abs(xp.asarray(x))), xp.asarray(least))
 
-    def scale(own: ExciterState, unit: ExciterState) -> ExciterState:
+    def scale(exciter_state: ExciterState, unit: ExciterState) -> ExciterState:
         spin = None
-        if unit.spin is not None and own.spin is not None:
+        if unit.spin is not None and exciter_state.spin is not None:
             drilling, slip = unit.spin.drilling, unit.spin.slip
-            slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in own.angle)
+            slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in exciter_state.angle)
             # A spin can grow without bound.
-            spin = Spin(None if drilling is None or own.spin.drilling is None else largest(own.spin.drilling, drilling), slip)
+            spin = Spin(
+                None
+                if drilling is None or exciter_state.spin.drilling is None
+                else largest(exciter_state.spin.drilling, drilling),
+                slip,
+            )
         return ExciterState(
-            tuple(xp.asarray(unit.angle[0]) for _ in own.angle),
-            tuple(xp.asarray(unit.rate[0]) for _ in own.rate),
+            tuple(xp.asarray(unit.angle[0]) for _ in exciter_state.angle),
+            tuple(xp.asarray(unit.rate[0]) for _ in exciter_state.rate),
             None if unit.rotor is None else tuple(map(xp.asarray, unit.rotor)),
             spin,
         )
@@ -106,11 +111,11 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
     """
     xp = numpy_of((a, b, scale))
 
-    def apart(x: Array, y: Array, unit: Array) -> Array:
+    def relative_difference(x: Array, y: Array, unit: Array) -> Array:
         with np.errstate(invalid="ignore"):  # the states of a run that did not finish are NaN
             return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / xp.asarray(unit)
 
-    return xp.max(xp.stack(jax.tree.leaves(jax.tree.map(apart, a, b, scale))))
+    return xp.max(xp.stack(jax.tree.leaves(jax.tree.map(relative_difference, a, b, scale))))
 
 
 def estimated_error(
@@ -122,26 +127,26 @@ def estimated_error(
 ) -> Array:
     """Estimate the error of a run from its `difference` to a run with larger steps.
 
-        difference x share + 2 eps (steps + radians)
+        difference * share + 2 eps (steps + radians)
 
-    The `share` of a smooth motion is used if all effects are smooth. Otherwise the error depends on the positions of the steps
-    relative to the kinks of the effects, and both runs may have the same error; therefore the share is 2. Rounding adds 2 eps
-    for each step and for each radian of the fastest motion, whose phase depends on rounded times. `ensemble` omits this term,
-    because equal steps cause much smaller rounding errors.
+    If an effect is not smooth, the share is 2: the error then depends on the positions of the steps relative to the kinks of
+    the effects, and both runs may have the same error. Rounding adds 2 eps for each step and for each radian of the fastest
+    motion, whose phase depends on rounded times. `ensemble` omits this term, because equal steps cause much smaller rounding
+    errors.
 
-    **Arguments**: `difference`: see `scaled_error`; `share`: error of a smooth motion, relative to the difference; `steps` of
-    the run; `radians`: phase of the fastest motion over the run.
+    **Arguments**: `difference`: see `scaled_error`; `share`: error of a smooth motion, relative to the difference; `steps`:
+    number of steps of the run; `radians`: phase of the fastest motion over the run, rad.
 
     **Returns** a scalar, or an array with one value for each run.
     """
-    kept = share if all(term.is_smooth for effect in scene.all_effects for term in effect.terms()) else 2.0
-    return difference * kept + 2.0 * float(np.finfo(scene.top_speed.dtype).eps) * (steps + radians)
+    factor = share if all(term.is_smooth for effect in scene.all_effects for term in effect.terms()) else 2.0
+    return difference * factor + 2.0 * float(np.finfo(scene.top_speed.dtype).eps) * (steps + radians)
 
 
 def with_nearest_turns(state: State, to: State) -> State:
     """Return a state (or several states) with angles shifted by whole turns so that they are nearest to the angles of `to`.
 
-    In single precision angles are kept within one turn, and one of two close runs may have one turn more than the other.
+    In single precision the integration keeps angles within one turn; one of two nearly equal runs may then have one turn more.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.zeros(1), np.zeros(1), (np.array([phi]),), (np.array([50.0]),)) for phi in (3.1, -3.1))
@@ -153,10 +158,10 @@ def with_nearest_turns(state: State, to: State) -> State:
     def near(x: Array, y: Array) -> Array:
         return x + 2.0 * np.pi * xp.round((y - x) / (2.0 * np.pi))
 
-    def moved(own: ExciterState, to: ExciterState) -> ExciterState:
+    def shifted(exciter_state: ExciterState, to: ExciterState) -> ExciterState:
         rotor = None
-        if own.rotor is not None and to.rotor is not None:
-            rotor = (near(own.rotor[0], to.rotor[0]), *own.rotor[1:])
-        return ExciterState(tuple(map(near, own.angle, to.angle)), own.rate, rotor, own.spin)
+        if exciter_state.rotor is not None and to.rotor is not None:
+            rotor = (near(exciter_state.rotor[0], to.rotor[0]), *exciter_state.rotor[1:])
+        return ExciterState(tuple(map(near, exciter_state.angle, to.angle)), exciter_state.rate, rotor, exciter_state.spin)
 
-    return State(state.displacement, state.velocity, exciters=tuple(map(moved, state.exciters, to.exciters)))
+    return State(state.displacement, state.velocity, exciters=tuple(map(shifted, state.exciters, to.exciters)))

@@ -1,13 +1,14 @@
 """Stability of coincident loads: growth of small differences between the angles of loads at nearly one angle.
 
 Loads that have equal parameters and start at one angle stay at one angle in exact arithmetic, even if the motion is unstable. A
-run alone therefore does not show that they would separate. The linearized equations along the run show this:
+run alone therefore does not show whether slightly separated loads would separate further. The linearized equations along the
+run show this:
 
     x' = A(t) x,    growth = ln(spectral radius of the transition matrix over whole turns of the loads) / duration
 
-If the loads have equal parameters, x is the difference of two loads of one track. Such a difference does not move the carrier,
-and all differences obey the same equations. Otherwise x is the whole state. The transition matrix is a product of exponentials
-(a Magnus method of order 4 on the samples of the run), so that strong drag needs no smaller steps.
+If the loads have equal parameters, x is the difference of the states of two loads of one track. Such a difference does not move
+the carrier, and all differences obey the same equations. Otherwise x is the whole state. The transition matrix is a product of
+exponentials (a Magnus method of order 4 on the samples of the run); therefore strong drag needs no smaller steps.
 """
 
 from __future__ import annotations
@@ -53,49 +54,56 @@ def tracks(scene: Scene, k: int) -> list[np.ndarray]:
     return [np.flatnonzero(stations == station) for station in np.unique(stations)]
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
+def _wrap_angle(angle: np.ndarray) -> np.ndarray:
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
 def nearly_coincident_pairs(scene: Scene, k: int, angle: np.ndarray) -> list[tuple[int, int]]:
-    """Return two loads of each group of loads of exciter `k` that stay at nearly one angle on one track.
+    """Return the numbers of two loads of each group of loads of exciter `k` that stay at nearly one angle on one track.
 
-    A group is all loads of a track within `NEARLY_ONE_ANGLE`, or neighbours within `CLUSTER_ANGLE`.
+    All loads of a track form a group if they stay within `NEARLY_ONE_ANGLE`; otherwise neighbours within `CLUSTER_ANGLE` do.
 
     **Arguments**: `angle` (nt, count) of the loads, rad.
     """
-    found = []
+    pairs = []
     for track in tracks(scene, k):
-        own = angle[:, track]
+        track_angle = angle[:, track]
         if len(track) < 2:
             continue
-        if np.max(np.ptp(_wrapped(own - own[:, :1]), axis=1)) < NEARLY_ONE_ANGLE:
-            found.append((int(track[0]), int(track[1])))
+        if np.max(np.ptp(_wrap_angle(track_angle - track_angle[:, :1]), axis=1)) < NEARLY_ONE_ANGLE:
+            pairs.append((int(track[0]), int(track[1])))
             continue
-        order = np.argsort(np.mod(own[-1], 2.0 * np.pi))
-        close = np.max(np.abs(_wrapped(own[:, np.roll(order, -1)] - own[:, order])), axis=0) < CLUSTER_ANGLE
+        order = np.argsort(np.mod(track_angle[-1], 2.0 * np.pi))
+        close = np.max(np.abs(_wrap_angle(track_angle[:, np.roll(order, -1)] - track_angle[:, order])), axis=0) < CLUSTER_ANGLE
         first = np.flatnonzero(close & ~np.roll(close, 1))
-        found += [(int(track[order[j]]), int(track[order[(j + 1) % len(order)]])) for j in first]
-    return found
+        pairs += [(int(track[order[j]]), int(track[order[(j + 1) % len(order)]])) for j in first]
+    return pairs
 
 
 def would_separate(scene: Scene, stretch: Trajectory) -> bool:
     """Return True if several loads of a track have nearly one angle, and small differences of their angles grow."""
     duration = float(np.ptp(np.asarray(stretch.time)))
-    angles = [None if not own.angle else np.asarray(own.angle[0]) for own in stretch.state.exciters]
-    pairs = [(k, pair) for k, own in enumerate(angles) if own is not None for pair in nearly_coincident_pairs(scene, k, own)]
+    angles = [
+        None if not exciter_angle.angle else np.asarray(exciter_angle.angle[0]) for exciter_angle in stretch.state.exciters
+    ]
+    pairs = [
+        (k, pair)
+        for k, exciter_angle in enumerate(angles)
+        if exciter_angle is not None
+        for pair in nearly_coincident_pairs(scene, k, exciter_angle)
+    ]
     return any(separation_rate(scene, stretch, k, pair) * duration > MIN_SEPARATION_GROWTH for k, pair in pairs)
 
 
-def smallest_distance(scene: Scene, kept: Trajectory) -> float:
-    """Return the smallest distance of the centres of two loads on one track, in diameters; inf for loads without a size.
+def smallest_distance(scene: Scene, stretch: Trajectory) -> float:
+    """Return the smallest distance of the centres of two loads on one track, in diameters; infinite for loads without a size.
 
-    Loads nearest to each other are neighbours by angle.
+    Only neighbours by angle are compared, because the nearest loads are neighbours.
     """
-    found = [math.inf]
-    for k, (exciter, state) in enumerate(zip(scene.exciters, kept.state.exciters, strict=True)):
-        own = getattr(exciter.loads, "ball_radius", None)
-        if exciter.loads is None or own is None:
+    distances = [math.inf]
+    for k, (exciter, state) in enumerate(zip(scene.exciters, stretch.state.exciters, strict=True)):
+        ball_radius = getattr(exciter.loads, "ball_radius", None)
+        if exciter.loads is None or ball_radius is None:
             continue
         order = np.argsort(np.mod(np.asarray(state.angle[0]), 2.0 * np.pi), axis=1)
         place = [np.asarray(x) for x in exciter.loads.position(*state.angle)]
@@ -104,13 +112,13 @@ def smallest_distance(scene: Scene, kept: Trajectory) -> float:
                 nearby = order[np.isin(order, track)].reshape(len(order), len(track))
                 points = [np.take_along_axis(x, nearby, axis=1) for x in place]
                 squares = sum(((x - np.roll(x, 1, axis=1)) ** 2 for x in points), np.zeros(nearby.shape))
-                found.append(float(np.sqrt(np.min(squares)) / (2.0 * own)))
-    return min(found)
+                distances.append(float(np.sqrt(np.min(squares)) / (2.0 * ball_radius)))
+    return min(distances)
 
 
-def overlap(scene: Scene, kept: Trajectory) -> bool:
-    """Return True if loads with a size overlap, which the effect `LoadContact` would prevent."""
-    return not has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, kept) < MIN_DISTANCE
+def overlap(scene: Scene, stretch: Trajectory) -> bool:
+    """Return True if loads with a size overlap at some time; the effect `LoadContact` would prevent this."""
+    return not has_term(scene.all_effects, LoadInteraction) and smallest_distance(scene, stretch) < MIN_DISTANCE
 
 
 def separation_rate(scene: Scene, stretch: Trajectory, k: int = 0, pair: tuple[int, int] = (0, 1)) -> float:
@@ -137,26 +145,26 @@ def prepare_separation(scene: Scene, state: State, samples: int) -> None:
 
 @cached
 def _transition(
-    scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray, pair: Array | np.ndarray, which: int
+    scene: Scene, times: Array | np.ndarray, states: State, first: Array | np.ndarray, pair: Array | np.ndarray, k_exciter: int
 ) -> tuple[Array, Array, Array]:
-    """Return A, b and t: the transition matrix from sample `first` to the last sample is A exp(b), and t is the time between
-    them, s."""
+    """Return A, b and t: the transition matrix from sample `first` to the last sample is A exp(b); t is the time between these
+    samples, s."""
     field = vector_field(scene)
     step = (times[-1] - times[0]) / (times.shape[0] - 1)
     begin = jax.tree.map(lambda leaf: leaf[0], states)
-    inserted, extracted, size = _basis(scene, begin, which, jnp.asarray(pair))
+    to_tangent, to_unknowns, size = _basis(scene, begin, k_exciter, jnp.asarray(pair))
 
     def matrix(k: Array) -> Array:
         state = jax.tree.map(lambda leaf: leaf[k], states)
 
         def rates(x: Array) -> Array:
-            return extracted(jax.jvp(lambda s: field(times[k], s), (state,), (inserted(x),))[1])
+            return to_unknowns(jax.jvp(lambda s: field(times[k], s), (state,), (to_tangent(x),))[1])
 
         return jax.vmap(rates, out_axes=1)(jnp.eye(size, dtype=times.dtype))
 
-    def moved(carry: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
+    def advance(carry: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
         transition, log_scale = carry
-        # Pairs of steps are counted from the end, so that they end at the last sample.
+        # Pairs of steps are counted from the end; the first pair ends at the last sample.
         end = times.shape[0] - 1 - 2 * pair
         a, b, c = (matrix(jnp.maximum(end - 2 + k, 0)) for k in range(3))
         span = jnp.where(end - 2 >= first, 2.0 * step, 0.0)
@@ -165,36 +173,36 @@ def _transition(
         return (transition / largest, log_scale + jnp.log(largest)), None
 
     start = (jnp.eye(size, dtype=times.dtype), jnp.zeros((), times.dtype))
-    (transition, log_scale), _ = jax.lax.scan(moved, start, jnp.arange((times.shape[0] - 1) // 2))
+    (transition, log_scale), _ = jax.lax.scan(advance, start, jnp.arange((times.shape[0] - 1) // 2))
     return transition, log_scale, times[-1] - times[first]
 
 
 def _basis(
-    scene: Scene, state: State, which: int, pair: Array
+    scene: Scene, state: State, k_exciter: int, pair: Array
 ) -> tuple[Callable[[Array], State], Callable[[State], Array], int]:
     """Return the function from the unknowns x to a tangent of the state, its inverse, and the number of unknowns."""
-    exciter = scene.exciters[which]
-    touching = has_term(exciter.effects, LoadInteraction)
-    shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(exciter.loads))
-    if touching or not shared:
+    exciter = scene.exciters[k_exciter]
+    has_contact = has_term(exciter.effects, LoadInteraction)
+    has_equal_loads = all(leaf.ndim == 0 for leaf in jax.tree.leaves(exciter.loads))
+    if has_contact or not has_equal_loads:
         flat, restored = ravel_pytree(state)
         return restored, lambda tangent: ravel_pytree(tangent)[0], flat.size
     zero = jax.tree.map(jnp.zeros_like, state)
 
-    def own_of(state: State) -> tuple:
-        return state.exciters[which].angle, state.exciters[which].rate, state.exciters[which].spin
+    def coordinates_of(state: State) -> tuple:
+        return state.exciters[k_exciter].angle, state.exciters[k_exciter].rate, state.exciters[k_exciter].spin
 
-    own = own_of(state)
-    treedef, size = jax.tree.structure(own), len(jax.tree.leaves(own))
-    difference = jnp.zeros_like(state.exciters[which].angle[0]).at[pair[0]].set(1.0).at[pair[1]].set(-1.0)
+    coordinates = coordinates_of(state)
+    treedef, size = jax.tree.structure(coordinates), len(jax.tree.leaves(coordinates))
+    difference = jnp.zeros_like(state.exciters[k_exciter].angle[0]).at[pair[0]].set(1.0).at[pair[1]].set(-1.0)
 
-    def inserted(x: Array) -> State:
+    def to_tangent(x: Array) -> State:
         angle, rate, spin = jax.tree.unflatten(treedef, [x[k] * difference for k in range(size)])
         exciters = list(zero.exciters)
-        exciters[which] = ExciterState(angle, rate, exciters[which].rotor, spin)
+        exciters[k_exciter] = ExciterState(angle, rate, exciters[k_exciter].rotor, spin)
         return State(zero.displacement, zero.velocity, exciters=exciters)
 
-    def extracted(tangent: State) -> Array:
-        return jnp.stack([leaf[pair[0]] for leaf in jax.tree.leaves(own_of(tangent))])
+    def to_unknowns(tangent: State) -> Array:
+        return jnp.stack([leaf[pair[0]] for leaf in jax.tree.leaves(coordinates_of(tangent))])
 
-    return inserted, extracted, size
+    return to_tangent, to_unknowns, size

@@ -86,7 +86,8 @@ class Spectrum(Result):
         **Arguments**
 
         - `show`: displacements or the force on the foundation
-        - `coordinate` by name; default in a waterfall diagram: the one with the largest amplitude
+        - `coordinate`: name of the coordinate that is shown; default: all coordinates, in a waterfall diagram the coordinate
+          with the largest amplitude
         - `unit` of frequencies, "rad/s", "rpm" or "Hz"
         - `ax`: axes to draw onto
 
@@ -98,15 +99,17 @@ class Spectrum(Result):
         if show not in ("displacement", "force"):
             raise InputError("show", f"is {quoted(show)}; it must be 'displacement' or 'force'")
         if coordinate is not None and (show == "force" or coordinate not in self.coordinates):
-            known = "a force has no coordinate; leave it out" if show == "force" else f"there are {', '.join(self.coordinates)}"
-            raise InputError("coordinate", f"is {quoted(coordinate)}; {known}")
+            advice = (
+                "a force has no coordinate; leave it out" if show == "force" else f"there are {', '.join(self.coordinates)}"
+            )
+            raise InputError("coordinate", f"is {quoted(coordinate)}; {advice}")
         series: dict[str, np.ndarray]
         if show == "force":
             names = ["force, N"] if self.force.shape[2] == 1 else ["horizontal force, N", "vertical force, N"]
             series = {name: self.force[:, :, k] for k, name in enumerate(names)}
         else:
-            wanted = [k for k, name in enumerate(self.coordinates) if coordinate in (None, name)]
-            series = {f"{self.coordinates[k]}, m{self.units[k]}": 1e3 * self.amplitude[:, :, k] for k in wanted}
+            shown = [k for k, name in enumerate(self.coordinates) if coordinate in (None, name)]
+            series = {f"{self.coordinates[k]}, m{self.units[k]}": 1e3 * self.amplitude[:, :, k] for k in shown}
         marks = (self.rotor_speeds, self.load_speeds, self.resonances)
         if self.time.size == 1:
             return spectrum_chart(self.frequency, {k: v[0] for k, v in series.items()}, *marks, unit=unit, ax=ax)
@@ -120,9 +123,9 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     count(parts, "parts")
     if parts > 1 and trajectory is None:
         raise InputError("parts", f"is {parts}, but the run saved only its end; simulate with save='all', or give 1")
-    kept = window if parts == 1 or trajectory is None else trajectory
-    time = np.asarray(kept.time, float)
-    # Neighbouring segments overlap by one half, since the Hann window suppresses the ends of each segment.
+    stretch = window if parts == 1 or trajectory is None else trajectory
+    time = np.asarray(stretch.time, float)
+    # Neighbouring segments overlap by one half, because the Hann window suppresses the ends of each segment.
     size = time.size if parts == 1 else 2 * time.size // (parts + 1)
     if size < 64:
         raise InputError(
@@ -132,15 +135,15 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     step = float(time[1] - time[0])
     points = _ZERO_PADDING_FACTOR * 2 ** int(np.ceil(np.log2(size)))
     frequency = 2.0 * np.pi * np.fft.rfftfreq(points, step)
-    speeds = np.stack([np.asarray(each, float) for each in kept.rotor_speeds], axis=1)
-    rates = [np.mean(np.asarray(each.rate[0], float), axis=1) for each in kept.state.exciters if each.rate]
-    keep = frequency <= _MAX_FREQUENCY_RATIO * max(float(np.max(np.abs(speeds))), 1e-300)
+    speeds = np.stack([np.asarray(item, float) for item in stretch.rotor_speeds], axis=1)
+    rates = [np.mean(np.asarray(item.rate[0], float), axis=1) for item in stretch.state.exciters if item.rate]
+    is_shown = frequency <= _MAX_FREQUENCY_RATIO * max(float(np.max(np.abs(speeds))), 1e-300)
     weight = np.hanning(size)
 
     def amplitudes(values: np.ndarray) -> np.ndarray:
         pieces = np.stack([values[s : s + size] for s in starts])
         pieces = (pieces - np.mean(pieces, axis=1, keepdims=True)) * weight[:, None]
-        return 2.0 / np.sum(weight) * np.abs(np.fft.rfft(pieces, points, axis=1))[:, keep]
+        return 2.0 / np.sum(weight) * np.abs(np.fft.rfft(pieces, points, axis=1))[:, is_shown]
 
     def means(values: np.ndarray) -> np.ndarray:
         return np.array([np.mean(values[s : s + size], axis=0) for s in starts])
@@ -148,9 +151,9 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
     structure = scene.machine.structure()
     return Spectrum(
         time=np.array([0.5 * (time[s] + time[s + size - 1]) for s in starts]),
-        frequency=frequency[keep],
-        amplitude=amplitudes(np.asarray(kept.state.displacement, float)),
-        force=amplitudes(np.asarray(kept.foundation_force, float)),
+        frequency=frequency[is_shown],
+        amplitude=amplitudes(np.asarray(stretch.state.displacement, float)),
+        force=amplitudes(np.asarray(stretch.foundation_force, float)),
         rotor_speeds=means(speeds),
         load_speeds=means(np.stack(rates, axis=1) if rates else np.zeros((time.size, 0))),
         resonances=np.asarray(estimated_frequencies(scene), float),

@@ -158,8 +158,8 @@ def envelope(
     synchronise, or turn at different speeds; steps are then as short as the beats. Each mass that turns, a load or the
     unbalance of a rotor, counts as a load here. The result is the limit of light loads:
 
-    - its relative error is of first order in the loads' share of the mass, multiplied by the dynamic magnification, and about
-      as large as the `ripple` of the result; typical: 1e-3 to 0.1
+    - its relative error is proportional to the share of the loads in the mass of the machine, multiplied by the dynamic
+      magnification, and about as large as the `ripple` of the result; typical: 1e-3 to 0.1
     - its equilibria are the jams of `jam_modes` and the regimes of `synchronous_regimes`
     - near the boundary between jamming and passing, small differences decide the outcome: use `simulate` there
 
@@ -319,7 +319,7 @@ def _run(
 
 
 def _saves(speed: Array, frequencies: Array, end: Array, samples: int, window_periods: int) -> list[diffrax.SubSaveAt]:
-    """Return the saved times: those of the measuring window at the end, and those of the whole run if `samples` is not 0."""
+    """Return the stored times: those of the measuring window at the end, and those of the whole run if `samples` is not 0."""
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
     window = 2.0 * jnp.pi * jnp.minimum(window_periods / slowest, _MAX_WINDOW_TURNS / speed)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW_SAMPLES))]
@@ -382,7 +382,8 @@ def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
 
 
 def _anticlockwise(scene: Scene, rates: Array) -> Array:
-    """Return speeds (..., count), positive anticlockwise, from speeds positive in each exciter's direction, or the reverse."""
+    """Convert speeds (..., count) that are positive in the direction of each exciter to speeds that are positive anticlockwise,
+    or the reverse."""
     directions = turning_directions(scene)
     return rates if np.all(directions == 1) else jnp.asarray(directions) * rates
 
@@ -410,9 +411,9 @@ def _measure(model: Model, window: Envelopes) -> Measured:
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
     """Return True if every rotating mass can make full turns in the potential of gravity.
 
-    At the end it must have the energy to pass the top from the mean height, where it has its averaged speed w:
-    I w^2/2 > (max V - min V)/2. If it did not have this energy at the start, its drag or its motor must have been able to lift
-    it, D n or T(0) > max |dV/dphi|.
+    At the end of the run a mass must have the energy to pass the top from the mean height, where it has its averaged speed w:
+    I w^2/2 > (max V - min V)/2. If it does not have this energy at the start, its drag or its motor must be able to lift it:
+    D n or T(0) > max |dV/dphi|.
     """
     starts, gravity = can_start(scene), total_gravity(scene.all_effects).get(1)
     each, begins = [], np.cumsum([0, *(max(count, 1) for count in field.counts)])

@@ -51,7 +51,7 @@ class EnvelopeStatus(eqx.Enumeration):
 
 
 class Envelopes(eqx.Module):
-    """Averaged motion at some times. The loads are all masses that turn: loads, and rotors with an unbalance but no loads.
+    """Averaged motion at some times. All masses that turn count as loads: loads, and rotors with an unbalance but no loads.
 
     **Attributes** (nt times, nd coordinates, nb directions of the force)
 
@@ -107,7 +107,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
 
     @property
     def settled(self) -> Array:
-        """True if amplitudes and speed no longer change, and slightly disturbed loads do not leave the motion."""
+        """True if the drift is below 1e-3, and slightly disturbed loads do not leave the motion."""
         is_stable = (self.status != EnvelopeStatus.would_separate) & (self.status != EnvelopeStatus.unstable)
         return (self.drift < SETTLED_DRIFT) & is_stable
 
@@ -121,8 +121,8 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
     def vibration(self) -> Vibration:
         """Return the mean vibration over the window, for `vibration_measures`.
 
-        The torque of a motor is that of its speed. The torque of a prescribed drive is the drag of its loads, NaN for loads
-        with dry friction and for unbalances.
+        The torque of a motor is its torque at the averaged speed. The torque of an ideal drive is that of the drag of its
+        loads, NaN for loads with dry friction and for unbalances.
         """
         scene, window = self.scene, self.window
         turn = jnp.mean(jnp.exp(1j * window.phase), axis=0)
@@ -179,7 +179,7 @@ class Envelope(AbstractMeasured, PathsOfPoints, Result):
 
 
 def _split(scene: Scene, speeds: Array) -> list[Array]:
-    """Return the speeds (nt, mass) of all masses that turn as one array for each exciter."""
+    """Divide the speeds (nt, masses) of all masses that turn into an array for each exciter."""
     counts = [1 if each.loads is None else each.loads.count for each in scene.exciters]
     return jnp.split(speeds, np.cumsum(counts)[:-1], axis=1)
 

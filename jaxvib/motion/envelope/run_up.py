@@ -27,10 +27,11 @@ from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import Number, number
 
 _BELOW_RESONANCE = 1.05
-"""Speed relative to a natural frequency up to which an exciter has not passed it; exciters are caught slightly below."""
+"""Speed, relative to a natural frequency, up to which an exciter counts as not having passed the resonance. Exciters are caught
+slightly below the natural frequency."""
 
 _WORKING_SHARE = 0.95
-"""Largest natural frequency relative to the working speed of a motor that counts as a resonance on the way."""
+"""Largest natural frequency, relative to the no-load speed of a motor, that counts as a resonance of its run-up."""
 
 _SAMPLES = 4096
 """Number of stored times of a run-up, from which peaks are read."""
@@ -66,8 +67,8 @@ class MotorRunUp(Result):
     - `status`: a `MotorRunUpStatus`
     - `resonances` (nd,), rad/s: natural frequencies, ascending
     - `speed` (exciter,), rad/s: mean speed at the end, in the direction of rotation
-    - `caught_at` (exciter,): number of the resonance, from 1, that the exciter does not pass; 0 if it passes all below its
-      working speed
+    - `caught_at` (exciter,): number, from 1, of the lowest resonance that the exciter does not pass; 0 if it passes all
+      resonances below 0.95 of the no-load speed of its motor
     - `peak_amplitude` (nd,), m, zero to peak, and `peak_force`, N: largest values on the way, of all initial angles between the
       exciters that were computed
     - `least_torque`: the smallest factor by which the torques of all motors can be multiplied such that all exciters still pass
@@ -111,12 +112,12 @@ class MotorRunUp(Result):
 
 
 def _lifting_factor(scene: Scene) -> float:
-    """Return the factor of the motors' torques with which all of them lift their unbalances; 0 without gravity."""
+    """Return the factor of the torques of all motors with which each motor just lifts its unbalance; 0 without gravity."""
     return max((float(weight / start) for weight, start in filter(None, lifting_torques(scene))), default=0.0)
 
 
 class _Scaled(MotorWrapper):
-    """Motor whose torque is that of another one times a factor."""
+    """Motor whose torque is that of another motor multiplied by a factor."""
 
     motor: Motor
     factor: Array
@@ -137,7 +138,7 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
     """Run the motors of a scene up from rest by the averaged equations, and name the resonances that catch exciters.
 
     An exciter has passed a natural frequency if its speed at the end is at least 5 % higher. An exciter is caught by the lowest
-    natural frequency that it has not passed, if this frequency is below 0.95 of its working speed.
+    natural frequency that it has not passed, if this frequency is below 0.95 of the no-load speed of its motor.
 
     **Arguments**
 
@@ -196,7 +197,7 @@ def run_up(scene: Scene, until: Number, *, least: bool = False) -> MotorRunUp:
 
 
 def _runs(scene: Scene, end: Array) -> list[Envelope]:
-    """Return the run from rest, and those with other initial angles of `_turned_motors`."""
+    """Return the run from rest, and the runs with other initial angles of the motors of `_turned_motors`."""
     runs = [envelope(scene, end, samples=_SAMPLES, throw=False)]
     turned = _turned_motors(scene)
     rest, count = initial_state(scene), _START_ANGLES * len(turned)
@@ -208,7 +209,8 @@ def _runs(scene: Scene, end: Array) -> list[Envelope]:
 
 
 def _turned_motors(scene: Scene) -> list[int]:
-    """Return the numbers of the motors whose initial angles change the run: those with an unbalance, without the first mass."""
+    """Return the numbers of the motors whose initial angles are varied. If all rotating masses belong to motors, the first
+    motor is not varied, because only differences of the angles matter."""
     masses = [k for k, each in enumerate(scene.exciters) if each.unbalance is not None or each.loads is not None]
     motors = [k for k in masses if not scene.exciters[k].drive.ideal]
     return motors if len(motors) < len(masses) else motors[1:]

@@ -11,7 +11,7 @@ from scenes import published
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import Trajectory
-from jaxvib.motion.analysis.regime import _is_rotor_stuck
+from jaxvib.motion.analysis.regime import _is_rotor_caught
 
 TIME = jnp.linspace(0.0, 1.0, 801)
 
@@ -215,8 +215,8 @@ def test_a_motor_is_caught_below_a_resonance_and_its_speed(rotor, caught):
     """Resonances at 1, 2 and 3; the motor without a load turns at 3, so that from 2.85 on it is at its own speed."""
     drive = jv.DCMotor(3.0, stall_torque=2.0, inertia=0.05)
     natural = jnp.asarray([1.0, 2.0, 3.0])
-    assert bool(_is_rotor_stuck(with_motor(drive), natural, jnp.asarray(rotor))) == caught
-    assert not bool(_is_rotor_stuck(with_motor(jv.ConstantSpeed(3.0)), natural, jnp.asarray(rotor)))
+    assert bool(_is_rotor_caught(with_motor(drive), natural, jnp.asarray(rotor))) == caught
+    assert not bool(_is_rotor_caught(with_motor(jv.ConstantSpeed(3.0)), natural, jnp.asarray(rotor)))
 
 
 @pytest.mark.parametrize(("tilts", "label"), [(1.0, "balanced"), (0.0, "unbalanced"), (-1.0, "unbalanced")])
