@@ -190,9 +190,8 @@ def integrate(
     measured = partial(measure, model, field, times, states, unit)
     # For a run with larger steps only the states are needed; it is not measured.
     numbers = measured() if is_measured is None else jax.lax.cond(is_measured, measured, partial(unmeasured, model, states))
-    numbers, whole_run, speeds = where_start_exists(
-        (numbers, whole_run, window.rotor_speeds)
-    )  # speeds of ideal drives are not in the states
+    # The speeds of ideal drives are not in the states.
+    numbers, whole_run, speeds = where_start_exists((numbers, whole_run, window.rotor_speeds))
     window = dataclasses.replace(window, rotor_speeds=speeds)
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not reach its end has no window; its last state shows if it diverged.

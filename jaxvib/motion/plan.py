@@ -365,13 +365,10 @@ def plan_ensemble(
     number_of_steps, implicit = 0 if steps is None else count(steps.number, "steps"), False
     if known:
         # Refused runs do not influence the steps of other runs.
-        fastest_rates = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
-        fastest_rates = fastest_rates if bool(np.any(allowed)) else [1.0, 0.0]
+        rates = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
+        rates = rates if bool(np.any(allowed)) else [1.0, 0.0]
         step, implicit = equal_step_length(
-            fastest_rates[0],
-            fastest_rates[1],
-            _EXPLICIT_STEPS_PER_RADIAN,
-            float(end) / number_of_steps if number_of_steps else None,
+            rates[0], rates[1], _EXPLICIT_STEPS_PER_RADIAN, float(end) / number_of_steps if number_of_steps else None
         )
         number_of_steps = number_of_steps or max(_MIN_STEPS, math.ceil(float(end) / step - 1e-9))
     steps_per_part = -(-number_of_steps // ENSEMBLE_PARTS)

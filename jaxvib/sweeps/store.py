@@ -316,21 +316,16 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
     group = zarr.create_group(path, zarr_format=3, attributes=attributes)
 
     def add(
-        name: str,
-        dims: tuple[str, ...],
-        shape: tuple[int, ...],
-        chunks: tuple[int, ...],
-        kind: object,
-        **attributes_of_measure: Plain,
+        name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...], kind: object, **more: Plain
     ) -> Any:
-        array_attributes = {key: value for key, value in attributes_of_measure.items() if key != "fill" and value}
+        array_attributes = {key: value for key, value in more.items() if key != "fill" and value}
         return group.create_array(
             name,
             shape=shape,
             chunks=chunks,
             dtype=kind,
             dimension_names=dims,
-            fill_value=attributes_of_measure["fill"],
+            fill_value=more["fill"],
             attributes=array_attributes,
             compressors=ZstdCodec(level=1, checksum=True),
         )
@@ -345,22 +340,11 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
     for name, measure, form in zip(study.names, study.measures, study.forms, strict=True):
         extra = (measure.axis,) if isinstance(measure, RunMeasure) and measure.axis else ()
         real = np.issubdtype(form.dtype, np.inexact)
-        attributes_of_measure: dict[str, Plain] = {"units": measure.unit, "long_name": measure.words}
+        more: dict[str, Plain] = {"units": measure.unit, "long_name": measure.words}
         if isinstance(measure, RunMeasure) and measure.meanings:
-            attributes_of_measure |= {
-                "flag_values": list(range(len(measure.meanings))),
-                "flag_meanings": " ".join(measure.meanings),
-            }
+            more |= {"flag_values": list(range(len(measure.meanings))), "flag_meanings": " ".join(measure.meanings)}
         kind, fill = (form.dtype, np.nan) if real else (np.dtype("i2"), -1)
-        add(
-            name,
-            (*grid.dims, *extra),
-            (*grid.shape, *form.shape),
-            (*grid.tile, *form.shape),
-            kind,
-            fill=fill,
-            **attributes_of_measure,
-        )
+        add(name, (*grid.dims, *extra), (*grid.shape, *form.shape), (*grid.tile, *form.shape), kind, fill=fill, **more)
         for dim, size in zip(extra, form.shape, strict=True):
             if dim not in group and len(extra_names.get(dim, ())) == size:
                 add(dim, (dim,), (size,), (size,), str, fill="")[:] = np.asarray(extra_names[dim], dtype=object)

@@ -38,9 +38,9 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
                 "status": regime.message,
                 **fields_of(regime, "speed", "phases", "stable", "growth", "quasi_static", "margin"),
                 **fields_of(regime, "torque", "vibrational_torque", "power", "can_start", "amplitude", "foundation_force"),
-                **({} if measures_of_regime is None else {"measures": measures_of_regime.document()}),
+                **({} if figures is None else {"measures": figures.document()}),
             }
-            for regime, measures_of_regime in zip(selected, measures, strict=True)
+            for regime, figures in zip(selected, measures, strict=True)
         ],
     }
 
@@ -63,27 +63,15 @@ def regimes(scene: Path, without: tuple[str, ...], csv: Path | None, output: Out
         if not rows:
             return result.summary()
         head = [unit, "", " ", "phases, degrees", "margin", "power, W", "foundation force, N"]
-        drawn_table = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
-        stable = [
-            (regime, measures_of_regime)
-            for regime, measures_of_regime in zip(selected, measures, strict=True)
-            if measures_of_regime is not None
-        ]
+        drawing = table("synchronous regimes; phases in the direction of rotation, force zero to peak", head, rows)
+        stable = [(regime, figures) for regime, figures in zip(selected, measures, strict=True) if figures is not None]
         directions = ("anticlockwise" if exciter.direction == 1 else "clockwise" for exciter in loaded.exciters)
         notes = [
             f"rotation: {', '.join(f'exciter {k} {direction}' for k, direction in enumerate(directions))}",
             "margin: factor by which the differences of the motors' torques can grow; inf for",
             "equal motors",
         ]
-        return "\n".join(
-            [
-                drawn_table,
-                *notes,
-                *(
-                    indented(f"at {speed_text(regime.speed)}, stable:", measures_of_regime)
-                    for regime, measures_of_regime in stable
-                ),
-            ]
-        )
+        blocks = (indented(f"at {speed_text(regime.speed)}, stable:", figures) for regime, figures in stable)
+        return "\n".join([drawing, *notes, *blocks])
 
     output.done(document, text, "regimes", result)

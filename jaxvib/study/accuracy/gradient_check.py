@@ -234,9 +234,7 @@ def check_gradients(
     gradient = _gradients(quantity_at, no_change, requested, only_supported=routes is None)
     if implicit is not None:
         gradient["implicit"] = np.asarray(_implicit(implicit, put, no_change), float)
-    sweep = np.asarray(
-        [[_central_difference(quantity_at, len(numbers), i, h) for h in _DIFFERENCE_STEPS] for i in range(len(numbers))]
-    )
+    sweep = np.asarray([[_central_difference(quantity_at, at.size, i, h) for h in _DIFFERENCE_STEPS] for i in range(at.size)])
     difference, noise, best = (np.asarray(x) for x in zip(*(_extrapolate(row, float(value)) for row in sweep), strict=True))
     scale, by_route = _scale(difference), np.stack(list(gradient.values()))
     deviation = np.abs(by_route - difference)

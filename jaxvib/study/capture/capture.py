@@ -255,10 +255,8 @@ def capture(
 
     # A threshold close to one of the speeds may be in the interval below or above it, depending on the steps.
     tolerance = 1.001 * max(np.max(np.diff(first_speeds), initial=0.0) if resolution is None else resolution, 1e-12)
-    refined = refine(
-        scan, lambda result: np.array([result.border]), 1, tolerance, largest_doublings if controller is None else 0
-    )
-    (result,), last_change = refined.results, float(refined.last_change[0, 0])
+    scans = refine(scan, lambda result: np.array([result.border]), 1, tolerance, largest_doublings if controller is None else 0)
+    (result,), last_change = scans.results, float(scans.last_change[0, 0])
     uncertainty = jnp.fmax(result.uncertainty, last_change) if np.isfinite(result.threshold) else result.uncertainty
     status = CaptureStatus.not_converged if last_change > tolerance else result.status
     return dataclasses.replace(result, last_change=jnp.asarray(last_change), uncertainty=uncertainty, status=status)
