@@ -19,8 +19,8 @@ that turn with theta. The averaged equation keeps the slow part of this product 
 Only a_j, the forward circular part of the acceleration at the load, drives the load; the backward part averages to zero. All
 loads at one point have the same a. For loads at different stations s_j, B_j = B + s_j T and a_j = a_1 + s_j a_2. A contains
 w_j' (the reaction of the loads); therefore a, or (a_1, a_2), is the solution of a linear system. With the levers g_j = 1 or
-(1, s_j), P = e^H B M^-1 B^T e (with stations a 2 x 2 matrix, from B and T), h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j,
-the system is
+(1, s_j), P = e^H B M^-1 B^T e (with stations a 2 x 2 matrix, from B and T), h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j
+(the load's angular acceleration without vibration), the system is
 
     (1 - P sum_j h_j g_j g_j^T) a + P sum_j h_j e^{2 i psi_j} g_j g_j^T conj(a)
         = - e^H B M^-1 ((C + n G) V + K Y) + P sum_j g_j S_j e^{i psi_j} (w_j^2 - i f_j)
@@ -134,8 +134,8 @@ class Averaged(eqx.Module):
     @property
     def is_prescribed(self) -> np.ndarray:
         """True for the unbalances under ideal drives, whose speed is prescribed, (count,)."""
-        each = [[count == 0 and drive.ideal] * max(count, 1) for count, drive in zip(self.counts, self.drives, strict=True)]
-        return np.concatenate(each)
+        flags = [[count == 0 and drive.ideal] * max(count, 1) for count, drive in zip(self.counts, self.drives, strict=True)]
+        return np.concatenate(flags)
 
     @property
     def free_shifts(self) -> int:
@@ -415,7 +415,7 @@ def rotating_angles(scene: Scene, state: State) -> tuple[Array, Array]:
 
 
 def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
-    """Return amplitudes of a state of the full equations: Re Y e^{i theta} = q, Re V e^{i theta} = q'.
+    """Return the amplitudes of a state of the full equations: Re Y e^{i theta} = q, Re V e^{i theta} = q'.
 
     The state determines only these real parts. The imaginary parts follow from the assumption that the carrier vibrates at the
     loads' mean speed. If the loads turn at less than half the lowest natural frequency, they cannot have caused the vibration,
@@ -425,15 +425,17 @@ def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
     model = linear_model(scene)
     frequencies, shapes = model.modes()
     omega, theta = jnp.mean(rate), jnp.mean(angle)
-    there = frequencies > 0.0
-    slow = jnp.abs(omega) < 0.5 * jnp.min(jnp.where(there, frequencies, jnp.inf))
-    own = jnp.where(there, 1.0 / jnp.where(there, frequencies, 1.0), 0.0)
+    is_elastic = frequencies > 0.0
+    is_slow = jnp.abs(omega) < 0.5 * jnp.min(jnp.where(is_elastic, frequencies, jnp.inf))
+    periods = jnp.where(is_elastic, 1.0 / jnp.where(is_elastic, frequencies, 1.0), 0.0)
     to_modal = shapes.T @ model.mass
-    turning = jnp.where(slow, 1.0, omega)
-    late = jnp.where(slow, shapes @ (own * (to_modal @ state.velocity)), state.velocity / turning)
-    soon = jnp.where(slow, shapes @ (frequencies * (to_modal @ state.displacement)), turning * state.displacement)
+    turning = jnp.where(is_slow, 1.0, omega)
+    # A quarter of a period later, the displacement is q'/w, and the velocity is -w q.
+    later_displacement = jnp.where(is_slow, shapes @ (periods * (to_modal @ state.velocity)), state.velocity / turning)
+    w_times_q = jnp.where(is_slow, shapes @ (frequencies * (to_modal @ state.displacement)), turning * state.displacement)
     back = jnp.exp(-1j * theta)
-    return Amplitudes(back * (state.displacement - 1j * late), back * (state.velocity + 1j * soon), rate, angle - theta)
+    displacement, velocity = state.displacement - 1j * later_displacement, state.velocity + 1j * w_times_q
+    return Amplitudes(back * displacement, back * velocity, rate, angle - theta)
 
 
 def _product(a: Array, b: Array) -> Array:

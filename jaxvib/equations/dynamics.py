@@ -35,7 +35,7 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, solve_definite, times
 from jaxvib.runtime.structure import leaf_key
 
-_LEAST_GROUP = 8
+_MIN_GROUP_SIZE = 8
 """Smallest number of exciters of equal structure that are computed as one group."""
 
 
@@ -53,25 +53,28 @@ class _Group(eqx.Module):
         return (function if len(self.members) == 1 else eqx.filter_vmap(function))(self.exciter, *values)
 
 
-def _joined(members: Sequence[int], trees: Sequence[Any]) -> Any:
-    """Return some of many trees as one, with a leading axis over them if there are several."""
+def _stack_members(members: Sequence[int], trees: Sequence[Any]) -> Any:
+    """Return the trees of the `members` as one tree, with a leading axis over the members if there are several."""
     if len(members) == 1:
         return trees[members[0]]
     return jax.tree.map(lambda *x: jnp.stack(x), *(trees[k] for k in members))
 
 
-def _apart(groups: Iterable[_Group], trees: Iterable[Any]) -> list[Any]:
-    """Return the trees of all exciters in order from those of their groups."""
-    found = {}
+def _ungroup(groups: Iterable[_Group], trees: Iterable[Any]) -> list[Any]:
+    """Return the trees of all exciters in the order of the exciters, from the trees of their groups."""
+    of_exciter = {}
     for group, tree in zip(groups, trees, strict=True):
         for i, k in enumerate(group.members):
-            found[k] = tree if len(group.members) == 1 else jax.tree.map(lambda x, i=i: x[i], tree)
-    return [found[k] for k in range(len(found))]
+            of_exciter[k] = tree if len(group.members) == 1 else jax.tree.map(lambda x, i=i: x[i], tree)
+    return [of_exciter[k] for k in range(len(of_exciter))]
 
 
 class _Support(eqx.Module):
-    """Place of a `SupportForce`: `rows` (k, nd), rows q are its k displacements; `input_matrix` (nd, k), accelerations per
-    force at this place."""
+    """Place of a `SupportForce`.
+
+    **Attributes**: `rows` (k, nd): its k displacements are `rows` q; `input_matrix` (nd, k): accelerations of the carrier per
+    force at this place, 1/kg.
+    """
 
     rows: Array
     input_matrix: Array
@@ -103,7 +106,7 @@ class Dynamics(eqx.Module):
     @property
     def exciters(self) -> list[RotorDynamics]:
         """The exciters of the scene, in order."""
-        return _apart(self.groups, (group.exciter for group in self.groups))
+        return _ungroup(self.groups, (group.exciter for group in self.groups))
 
     def __call__(self, t: Array, state: State) -> State:
         """Return the time derivative of `state` at time `t`.
@@ -113,7 +116,7 @@ class Dynamics(eqx.Module):
         equation per row, for any number of platforms and loads. If there are more rows than coordinates, q'' follows from
         (M + P^T W P) q'' = M q''_free - P^T g instead.
         """
-        states = [_joined(group.members, state.exciters) for group in self.groups]
+        states = [_stack_members(group.members, state.exciters) for group in self.groups]
         speeds = self._each(lambda exciter, own: exciter.drive.rotor_speed(t, own.rotor), states)
         unforced = self._unforced(state, speeds)
         housings = self._each(lambda exciter: exciter.housing_speed(state.velocity))
@@ -127,15 +130,17 @@ class Dynamics(eqx.Module):
         contacts = [motion.rolling for motion in motions]
         if any(map(depends_on_acceleration, contacts)):
             # The sign of a normal force that depends on the accelerations is taken from the motion without its friction.
-            plain, _ = solve([without_coupling(contact) for contact in contacts])
-            contacts = self._each(lambda exciter, contact, part: signed(contact, exciter.at_loads(part[1])), contacts, plain)
+            uncoupled, _ = solve([without_coupling(contact) for contact in contacts])
+            contacts = self._each(
+                lambda exciter, contact, part: signed(contact, exciter.at_loads(part[1])), contacts, uncoupled
+            )
         solved, carrier = solve(contacts)
         rolling = contacts
         if any(group.exciter.can_slide for group in self.groups):
             sliding = self._each(lambda exciter, *given: exciter.slide(*given[:2], *given[2]), motions, contacts, solved)
             solved, carrier = solve(sliding)
         rates = self._each(lambda exciter, *given: exciter.rates(*given[:2], *given[2]), motions, rolling, solved)
-        return State(state.velocity, carrier, exciters=_apart(self.groups, rates))
+        return State(state.velocity, carrier, exciters=_ungroup(self.groups, rates))
 
     def _each(self, function: Callable[..., Any], *values: Sequence[Any]) -> list[Any]:
         """Return function(exciter, *values) of each exciter, by group."""
@@ -144,7 +149,7 @@ class Dynamics(eqx.Module):
     def at_rows(self, rows: Array) -> Dynamics:
         """Return the equations with the accelerations of P's rows and of further `rows` (k, nd) in place of the carrier's q''.
 
-        The cost is then proportional to nd, and not to its square. There must be fewer rows P than coordinates.
+        The cost is then proportional to nd, and not to its square. P must not have more rows than there are coordinates.
         """
         every = jnp.concatenate([self.rows, rows])
         supports = tuple(_Support(support.rows, every @ support.input_matrix) for support in self.supports)
@@ -162,7 +167,7 @@ class Dynamics(eqx.Module):
         """Return the accelerations of the carrier without exciters."""
         flow = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
-            each = _apart(self.groups, speeds)
+            each = _ungroup(self.groups, speeds)
             speed = each[0] if len(each) == 1 else sum(each[1:], each[0]) / len(each)
             flow = flow - speed * times(self.gyroscopic, state.velocity)
         effects = self.exciters[0].effects if self.supports else ()
@@ -194,14 +199,15 @@ class Dynamics(eqx.Module):
         matrix = [[(1.0 if i == k else 0.0) + row_coupling(i, k) for k in range(n)] for i in range(n)]
         right = tuple(free[i] - sum(self.accelerance[i, j] * reaction[j] for j in range(n)) for i in range(n))
         a = small_inverse(matrix)(right)
-        push = [-sum(w * a[k] for k, w in weights[i].items()) - reaction[i] for i in range(n)]
-        carrier = unforced + sum(self.input_matrix[:, i] * push[i] for i in range(n))
+        force = [-sum(w * a[k] for k, w in weights[i].items()) - reaction[i] for i in range(n)]
+        carrier = unforced + sum(self.input_matrix[:, i] * force[i] for i in range(n))
         return [[a[k] for k in block] for block in blocks], carrier
 
     def _solve_rows_of_groups(self, parts: Sequence[Eliminated], unforced: Array) -> tuple[list[list[Array]], Array]:
         """Return the same as `_solve_rows`, from arrays over all rows.
 
-        In the second case the unknowns are the forces f = W a + g: (1 + W accelerance) f = W a_free + g.
+        If P has at most as many rows as there are coordinates, the unknowns are the forces f = W a + g:
+        (1 + W accelerance) f = W a_free + g.
         """
         arrays = self._each(lambda _, part: (jnp.asarray(part.added_mass), jnp.asarray(part.reaction)), parts)
         weights = [added.reshape(-1, *added.shape[-2:]) for added, _ in arrays]
@@ -256,7 +262,7 @@ def vector_field(scene: Scene) -> Dynamics:
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
     >>> rest = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
-    >>> round(float(jv.vector_field(scene)(0.0, rest).rate[0][0]), 4)     # b_W n / (kappa m R), more as the platform moves
+    >>> round(float(jv.vector_field(scene)(0.0, rest).rate[0][0]), 4)     # b_W n / (kappa m) = 142.86 on a fixed platform
     143.8746
 
     Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,
@@ -294,13 +300,13 @@ def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_sol
 
 
 def _groups(exciters: Sequence[RotorDynamics]) -> tuple[_Group, ...]:
-    """Return exciters in groups of equal structure. A group of fewer than `_LEAST_GROUP` is divided into single exciters."""
+    """Return exciters in groups of equal structure. A group of fewer than `_MIN_GROUP_SIZE` is divided into single exciters."""
     kinds: dict[Hashable, list[int]] = {}
     for k, exciter in enumerate(exciters):
         leaves, structure = jax.tree.flatten(exciter)
         kinds.setdefault((structure, *map(leaf_key, leaves)), []).append(k)
-    groups = [group for kind in kinds.values() for group in ([kind] if len(kind) >= _LEAST_GROUP else [[k] for k in kind])]
-    return tuple(_Group(_joined(members, exciters), tuple(members)) for members in sorted(groups))
+    groups = [group for kind in kinds.values() for group in ([kind] if len(kind) >= _MIN_GROUP_SIZE else [[k] for k in kind])]
+    return tuple(_Group(_stack_members(members, exciters), tuple(members)) for members in sorted(groups))
 
 
 def _exciter_dynamics(exciter: Exciter, mount: Mount, shared: tuple[Effect, ...]) -> RotorDynamics:

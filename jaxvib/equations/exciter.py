@@ -52,11 +52,11 @@ Axes = dict[int, Array]
 
 
 class Motion(NamedTuple):
-    """State of an exciter, and quantities that follow from it without knowing the accelerations.
+    """State of an exciter, and quantities that do not depend on the accelerations.
 
     **Attributes**
 
-    - `state`, and the rotor's `speed`
+    - `state`; `speed` of the rotor, rad/s
     - `imbalance_derivatives` of the rotor, see `RotorDynamics._imbalance_derivatives`
     - `kinematics` of the loads
     - `drag` (count,): torque of the rotor on the loads
@@ -210,16 +210,16 @@ class RotorDynamics(eqx.Module):
 
         c has an entry for each of the first rows of the mount; the torque does not depend on the other rows.
         """
-        taken = self._total(drag)
-        taken = taken if motion.weight_torque is None else taken + motion.weight_torque
+        torque = self._total(drag)
+        torque = torque if motion.weight_torque is None else torque + motion.weight_torque
         by_loads = [self._total(coupling[i], lever) for lever in self.levers for i in self.axes] if coupling else []
         if motion.imbalance_derivatives is None:
-            return taken, by_loads
-        along = motion.imbalance_derivatives[0]
-        return taken, [f + d for f, d in zip(by_loads, along, strict=False)] + along[len(by_loads) :]
+            return torque, by_loads
+        first = motion.imbalance_derivatives[0]
+        return torque, [f + d for f, d in zip(by_loads, first, strict=False)] + first[len(by_loads) :]
 
     def _add_housing(self, motion: Motion, part: Eliminated, drag: Array, coupling: Axes) -> Eliminated:
-        """Add the row of the housing's rotation, which takes the reaction torque of the drive."""
+        """Add the row of the housing's rotation, on which the reaction torque of the drive acts."""
         if motion.housing is None:
             return part
         motor, n = self._motor(motion), len(part.reaction)
@@ -235,8 +235,8 @@ class RotorDynamics(eqx.Module):
     def _imbalance_derivatives(self, t: Array, state: ExciterState) -> tuple[list[Array], list[Array]] | None:
         """Return two derivatives of d(theta), the unbalance and the imbalances of the effects on each row of the mount.
 
-        They are None if there are none. The first is d'. The second is d'' theta'^2 under a motor, and the second time
-        derivative of d under an ideal drive.
+        The first is d'. The second is d'' theta'^2 under a motor, and the second time derivative of d under an ideal drive. The
+        result is None for a rotor without unbalance and imbalances.
         """
         terms = terms_of(self.effects, RotorImbalance)
         if not terms and self.unbalance is None:
@@ -244,15 +244,15 @@ class RotorDynamics(eqx.Module):
         turn, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
 
         def imbalance(angle: Array) -> tuple[Array, ...]:
-            found = [term.at(angle) for term in terms]
+            of_effects = [term.at(angle) for term in terms]
             own = [] if self.unbalance is None else [(self.unbalance * jnp.cos(angle), self.unbalance * jnp.sin(angle))]
-            static = tuple(total(each[axis] for each in [*(each.static for each in found), *own]) for axis in self.axes)
+            static = tuple(total(each[axis] for each in [*(each.static for each in of_effects), *own]) for axis in self.axes)
             if self.row_count == 1:
                 return static
-            moments = [[each.moment[axis] for each in found] for axis in self.axes]
+            moments = [[each.moment[axis] for each in of_effects] for axis in self.axes]
             for lever in self.rotor_levers[1:]:
                 for each, axis in zip(moments, self.axes, strict=True):
-                    each.append(scaled(lever, total(imbalance.static[axis] for imbalance in found)))
+                    each.append(scaled(lever, total(imbalance.static[axis] for imbalance in of_effects)))
             return (*static, *(total(each) if each else jnp.zeros_like(angle) for each in moments))
 
         def slope(angle: Array) -> tuple[Array, ...]:
@@ -276,7 +276,7 @@ class RotorDynamics(eqx.Module):
         return self.unbalance * g[1] * jnp.cos(self.drive.rotor_angle(t, state.rotor))
 
     def _total(self, values: Array, *levers: Array | None) -> Array:
-        """Return the sum over all loads."""
+        """Return the sum over all loads; a rotor without loads has none, and `values` are returned unchanged."""
         return values
 
 
@@ -293,32 +293,32 @@ class ExciterDynamics(RotorDynamics):
     def motion(self, t: Array, state: ExciterState, speed: Array, housing: Array | None) -> Motion:
         """Return the quantities that do not depend on the accelerations, for a rotor that turns at `speed`."""
         imbalance_derivatives = self._imbalance_derivatives(t, state)
-        found = kinematics(self.loads, state.angle, state.rate)
+        of_loads = kinematics(self.loads, state.angle, state.rate)
         drag, force = self._forces(state, speed)
         g = total_gravity(self.effects)
         terms = terms_of(self.effects, ContactFriction)
-        rubbing = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
-        friction = [each.signed({}) if each.normal is None else each for each in rubbing]
+        unsigned = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
+        friction = [each.signed({}) if each.normal is None else each for each in unsigned]
         contact = ContactSolution(self.loads.inertia_factor(), force, friction)
-        return Motion(state, speed, imbalance_derivatives, found, drag, self.weight_torque(t, state), contact, housing, t)
+        return Motion(state, speed, imbalance_derivatives, of_loads, drag, self.weight_torque(t, state), contact, housing, t)
 
     def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
         """Express the accelerations of loads and rotor in terms of the accelerations of the mount's rows.
 
         The friction of `contact` must be linear in the accelerations, see `signed`.
         """
-        loads, axes, found = self.loads, self.axes, motion.kinematics
+        loads, axes, of_loads = self.loads, self.axes, motion.kinematics
         drag, force, coupling = self._add_friction(motion.drag, contact)
         m = loads.mass
         inertia = contact.kappa * m
-        solve = small_inverse([[inertia * g for g in row] for row in found.metric])
-        if found.curvature_along is not None:
-            force = [f - inertia * along for f, along in zip(force, found.curvature_along, strict=True)]
+        solve = small_inverse([[inertia * g for g in row] for row in of_loads.metric])
+        if of_loads.curvature_along is not None:
+            force = [f - inertia * along for f, along in zip(force, of_loads.curvature_along, strict=True)]
         free = solve(tuple(force))
-        rows = {axis: [m * column[axis] for column in found.columns] for axis in axes}
+        rows = {axis: [m * column[axis] for column in of_loads.columns] for axis in axes}
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, coupling, strict=True)] for axis, row in rows.items()}
         response_to_carrier = {axis: solve(tuple(row)) for axis, row in rows.items()}
-        added_mass, reaction = self._reaction_of_loads(found, free, response_to_carrier)
+        added_mass, reaction = self._reaction_of_loads(of_loads, free, response_to_carrier)
         added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag, coupling[0])
         part = Eliminated(free, response_to_carrier, added_mass, reaction, rotor)
         return self._add_housing(motion, part, drag, coupling[0])
@@ -389,23 +389,23 @@ class ExciterDynamics(RotorDynamics):
         """
         force, coupling = list(contact.force), [dict[int, Array]() for _ in contact.force]
         for each in contact.friction:
-            rubs = [lever * each.reaction for lever in (each.lever, *each.others)]
-            drag = drag + rubs[0]
-            for i, (rub, lever) in enumerate(zip(rubs, (each.lever, *each.others), strict=True)):
-                force[i] = force[i] + rub
+            frictions = [lever * each.reaction for lever in (each.lever, *each.others)]
+            drag = drag + frictions[0]
+            for i, (friction, lever) in enumerate(zip(frictions, (each.lever, *each.others), strict=True)):
+                force[i] = force[i] + friction
                 if each.normal is not None:
                     coupling[i] = {axis: lever * each.normal[axis] + coupling[i].get(axis, 0.0) for axis in self.axes}
         return drag, force, coupling
 
     def _reaction_of_loads(
-        self, found: Kinematics, free: tuple[Array, ...], response_to_carrier: Mapping[int, tuple[Array, ...]]
+        self, of_loads: Kinematics, free: tuple[Array, ...], response_to_carrier: Mapping[int, tuple[Array, ...]]
     ) -> tuple[list[list[Array | float]], list[Array | float]]:
         """Return added mass and reaction of the loads.
 
         Each load acts on a row of the mount with its lever on this row. Rows that move no load have zeros.
         """
         m, axes, levers = self.loads.mass, self.axes, self.levers
-        columns = {axis: [column[axis] for column in found.columns] for axis in axes}
+        columns = {axis: [column[axis] for column in of_loads.columns] for axis in axes}
         own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(columns[i], response_to_carrier[k]) for i in axes for k in axes}
         moments = {
             (i, k, low, high): self._total(own[i, k], levers[low], levers[high])
@@ -414,8 +414,8 @@ class ExciterDynamics(RotorDynamics):
             for high in range(low, len(levers))
         }
         rows = [(row, axis) for row in range(self.row_count) for axis in axes]
-        added_mass = [[moments.get((i, k, min(one, two), max(one, two)), 0.0) for two, k in rows] for one, i in rows]
-        load_reaction = {i: m * (dot(columns[i], free) + found.curvature[i]) for i in axes}
+        added_mass = [[moments.get((i, k, min(a, b), max(a, b)), 0.0) for b, k in rows] for a, i in rows]
+        load_reaction = {i: m * (dot(columns[i], free) + of_loads.curvature[i]) for i in axes}
         return added_mass, [self._total(load_reaction[i], levers[row]) if row < len(levers) else 0.0 for row, i in rows]
 
     def _slip_change(
@@ -474,5 +474,5 @@ def signed(contact: ContactSolution, at_loads: Axes) -> ContactSolution:
 
     Each normal force keeps the sign that it has at the accelerations `at_loads`.
     """
-    found: list[Friction] = [each if each.normal is None else each.signed(at_loads) for each in contact.friction]
-    return contact._replace(friction=found)
+    friction: list[Friction] = [each if each.normal is None else each.signed(at_loads) for each in contact.friction]
+    return contact._replace(friction=friction)

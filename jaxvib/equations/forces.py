@@ -43,7 +43,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
     - `scene`: supports of the machine and effects that are supports (`CubicSupport`, `Stop`) are included
     - `state` of the scene; typical: displacements of 0.1 to 10 mm
 
-    **Returns** an array, N: one entry (up) for platforms, two (horizontal, up) for rotors.
+    **Returns** an array, N: one entry (up) for platforms, two (horizontal, up) for rotors and bodies in a plane.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -92,11 +92,13 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     """Return the kinetic and potential energy of a state, J.
 
         E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B_j q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ] + V(q)
-            + theta' d'(theta).P q' + J_r theta'^2/2
+            + theta' d'(theta).P q' + J_r theta'^2/2 + S g sin(theta)
             + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + I_j s_j^2/2 ]
 
-    - d is the imbalance of the rotor
-    - J_r is the inertia of a motor's rotor (an ideal drive has none)
+    - V_j and V are the potentials of the effects on the loads and on the supports
+    - d is the unbalance S of the rotor, with its imbalances
+    - J_r is the inertia of a motor's rotor (an ideal drive has none); g is the gravity in the plane of the rotor
+    - the terms of the loads and of the rotor are added over all exciters
     - c is the sliding velocity of a load's contact point and s its spin about the contact normal; each is 0 unless an effect
       permits it
     - I_j is the moment of inertia of a load about the contact normal
@@ -104,8 +106,8 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     **Arguments**
 
     - `scene` and a `state` of it
-    - `t`, s: the time, which determines the angle of an ideal drive's rotor. It matters only for a rotor with an imbalance;
-      typical: 0 (the default) without an imbalance
+    - `t`, s: the time, which determines the angle of an ideal drive's rotor. The energy depends on it only if such a rotor has
+      an unbalance or an imbalance; typical: 0 (the default)
 
     **Returns** a scalar, J. `jit`, `vmap` and `grad` apply to the function.
 
@@ -179,18 +181,20 @@ def _load_energies(
 def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     """Return the power input by the rotor, and the power that dampers, drag and friction dissipate, W.
 
-        P_in = speed T,    T = sum_j M_j + d'(theta).P q''  (ideal drive),    the motor's torque otherwise
+        P_in = speed T,    T = sum_j M_j + d'(theta).P q'' + S g cos(theta)  (ideal drive),    the motor's torque otherwise
         P_diss = q'.C q' + sum_j M_j (speed - phi_j') + power of supports and contacts
         M_j = b_W R^2 (speed - phi_j') + friction
 
-    T is the torque with which an ideal drive turns its rotor against loads, their spin and the imbalance d. Loads that slide
-    dissipate in addition the power -F_t.c of the contact force F_t at the sliding velocity c. The rate of the energy is the
-    difference, dE/dt = P_in - P_diss.
+    T is the torque with which an ideal drive turns its rotor against the loads, the unbalance S with its imbalances (d, see
+    `energy`) and the weight of the unbalance. `speed` is the speed of the rotor, in P_in relative to a housing that turns with
+    the machine. The drive also supplies the power that the spin of the loads needs. Loads that slide dissipate in addition the
+    power -F_t.c of the contact force F_t at the sliding velocity c. The powers of all exciters are added. The rate of the
+    energy is the difference, dE/dt = P_in - P_diss.
 
     **Arguments**
 
     - `scene` and a `state` of it
-    - `t`, s: the time, which determines the angle of an ideal drive's rotor; typical: 0 without an imbalance
+    - `t`, s: the time, which determines the angle of an ideal drive's rotor; typical: 0 without an unbalance
 
     **Returns** two scalars, W: the power input and the dissipated power; typical: 10 to 5000 W.
 
@@ -211,7 +215,7 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     model = assemble(scene)
     field = dynamics_of(model)
     change = field(t, state)
-    given, lost = [], [state.velocity @ model.carrier.damping @ state.velocity]
+    supplied, dissipated = [], [state.velocity @ model.carrier.damping @ state.velocity]
     for exciter, dynamics, mount, own, own_change in zip(
         scene.exciters, field.exciters, model.mounts, state.exciters, change.exciters, strict=True
     ):
@@ -219,15 +223,15 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
         braking = jnp.zeros_like(speed)
         if isinstance(dynamics, ExciterDynamics):
             braking, spun, losses = _load_power(dynamics, own, own_change, mount.load_rates(change.velocity), speed)
-            given.append(spun)
-            lost += losses
+            supplied.append(spun)
+            dissipated += losses
         driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
-        given.append(driven * _drive_torque(t, exciter, dynamics, mount, own, change.velocity, (turn, driven, braking)))
+        supplied.append(driven * _drive_torque(t, exciter, dynamics, mount, own, change.velocity, (turn, driven, braking)))
     for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         x, v = rows @ state.displacement, rows @ state.velocity
         if term.resistance is not None:
-            lost.append(term.resistance(x, v) @ v)
-    return sum(given[1:], given[0]), sum(lost[1:], lost[0])
+            dissipated.append(term.resistance(x, v) @ v)
+    return sum(supplied[1:], supplied[0]), sum(dissipated[1:], dissipated[0])
 
 
 def _drive_torque(
@@ -256,7 +260,8 @@ def _drive_torque(
 def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tuple[Array, Array]:
     """Return the torque of each drive in the direction of its rotation, N m, and its power, W, (N,) each.
 
-    `field`: `dynamics_of` the model. Loads that spin or slide are not included.
+    **Arguments**: `field`: `dynamics_of(model)`; `t`, s. The torque with which the rotor changes the spin of loads that spin or
+    slide is not included.
     """
     change, torques, powers = field(t, state), [], []
     for exciter, dynamics, mount, own in zip(model.scene.exciters, field.exciters, model.mounts, state.exciters, strict=True):
@@ -266,8 +271,8 @@ def drive_torques(model: Model, field: Dynamics, t: Array, state: State) -> tupl
             loads = dynamics.loads
             braking = jnp.sum(loads.resistance(own.angle, own.rate, speed)[0])
             for term in terms_of(dynamics.effects, ContactFriction):
-                rubbing = term.friction(loads, own.angle, own.rate, speed, total_gravity(dynamics.effects))
-                braking = braking + jnp.sum(rubbing.forces(mount.load_rates(change.velocity))[0])
+                friction = term.friction(loads, own.angle, own.rate, speed, total_gravity(dynamics.effects))
+                braking = braking + jnp.sum(friction.forces(mount.load_rates(change.velocity))[0])
         driven = speed if mount.turn is None else speed - mount.turn @ state.velocity
         torque = _drive_torque(t, exciter, dynamics, mount, own, change.velocity, (turn, driven, braking))
         torques.append(exciter.direction * torque)
@@ -281,20 +286,20 @@ def _load_power(
     """Return the torque of the rotor on the loads, N m, its power to spinning and sliding loads, W, and the dissipated powers,
     W."""
     loads, g = exciter.loads, total_gravity(exciter.effects)
-    taken = loads.resistance(state.angle, state.rate, speed)
+    of_rotor = loads.resistance(state.angle, state.rate, speed)
     sliding, (supplied, lost_in_contact) = _spin_power(exciter, state, change, at_load, speed)
-    lost = [lost_in_contact]
+    dissipated = [lost_in_contact]
     for term in terms_of(exciter.effects, ContactFriction):
-        rubbing = term.friction(loads, state.angle, state.rate, speed, g).forces(at_load)
-        taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
-        lost += [jnp.sum(f * w) for f, w in zip(rubbing, sliding, strict=False)]
+        friction = term.friction(loads, state.angle, state.rate, speed, g).forces(at_load)
+        of_rotor = (*(f + r for f, r in zip(of_rotor, friction, strict=False)), *of_rotor[len(friction) :])
+        dissipated += [jnp.sum(f * w) for f, w in zip(friction, sliding, strict=False)]
     for term in terms_of(exciter.effects, LoadResistance, LoadInteraction):
         if term.resistance is not None:
             resistance = term.resistance(loads, state.angle, state.rate)
-            lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
-    braking = jnp.sum(taken[0])
-    lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(taken, state.rate, strict=True))]
-    return braking, supplied, lost
+            dissipated += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
+    braking = jnp.sum(of_rotor[0])
+    dissipated += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(of_rotor, state.rate, strict=True))]
+    return braking, supplied, dissipated
 
 
 def _spin_power(
@@ -332,8 +337,8 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
         N = m (centrifugal acceleration of u' - n . (a + g e)),    see `Loads.normal_force`
 
     n is the direction in which the load presses, a the acceleration of the point that carries the load, g that of gravity, and
-    e the unit vector against gravity. If N is negative, the
-    equations keep the load on its track, and friction that is proportional to N is 0.
+    e the unit vector against gravity. If N is negative, the equations keep the load on its track, and friction that is
+    proportional to N is 0.
 
     **Arguments**
 

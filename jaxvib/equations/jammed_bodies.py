@@ -67,9 +67,9 @@ class JammedBodies(eqx.Module):
         loads, u, rates = self.loads, (jnp.asarray(phi),), (rate,)
         at = dict(zip(self.linear.mount.axes, a, strict=True))
         gravity = total_gravity(self.effects)
-        found = (term.friction(loads, u, rates, speed, gravity) for term in terms_of(self.effects, ContactFriction))
+        frictions = (term.friction(loads, u, rates, speed, gravity) for term in terms_of(self.effects, ContactFriction))
         torque = loads.resistance(u, rates, speed)[0]
-        return sum((friction.torque(at) for friction in found), torque)
+        return sum((friction.torque(at) for friction in frictions), torque)
 
     def torque_of_each(self, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
         """Return the torque of the rotor and of effects on loads at the angles `phi`, N m; `a` as in `rotor_torque`."""
@@ -135,11 +135,11 @@ def _require_balance(effects: tuple[Effect, ...]) -> None:
 
 
 def friction_on_light_loads(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
-    """Return the sum of the torques of dry friction on light loads that turn at `omega`, N m.
+    """Return the sum of the torques of dry friction on light loads that turn at `omega` in a rotor of this `speed`, N m.
 
     The motion of the carrier is too small to change the normal force on the loads, and the mean contribution of the weight over
     a turn is 0.
     """
     phi, rate = (jnp.zeros((loads.count,)),), (jnp.full((loads.count,), omega),)
-    found = (term.friction(loads, phi, rate, speed, {}) for term in terms_of(effects, ContactFriction))
-    return sum((jnp.sum(friction.torque({})) for friction in found), jnp.zeros_like(omega))
+    frictions = (term.friction(loads, phi, rate, speed, {}) for term in terms_of(effects, ContactFriction))
+    return sum((jnp.sum(friction.torque({})) for friction in frictions), jnp.zeros_like(omega))

@@ -98,7 +98,10 @@ class LinearModel(Model):
         return jnp.vdot(velocity, self.carrier.damping @ velocity).real / 2.0
 
     def peak_matrices(self) -> tuple[Array, Array, Array]:
-        """Return M, C and K (nd, nd) at the working speed: peaks of the response are at the poles s of s^2 M + s C + K."""
+        """Return M, C and K (nd, nd) at the working speed.
+
+        Peaks of the response are near the imaginary parts of the poles s, the roots of det(s^2 M + s C + K) = 0.
+        """
         return self.mass, self.damping(self.scene.drive.speed), self.carrier.stiffness
 
     @property
@@ -116,10 +119,12 @@ class LinearModel(Model):
         return root_or_zero(values), inverse.T @ vectors
 
     def decomposed(self, direction: Array | None = None) -> Self:
-        """Return this model with its modal form, which is faster for many load speeds; `direction` (count, nd) of the forces
-        of several masses, default: `direction` of the model.
+        """Return this model with its modal form, which is faster for many load speeds.
 
-        Models of up to 3 coordinates are returned without it, because a direct solution takes no longer.
+        Models of up to 3 coordinates are returned without it, because a direct solution takes no longer, and so are models with
+        gyroscopic coupling, which the modal form does not include.
+
+        **Arguments**: `direction` (count, nd) of the forces of several masses, default: `direction` of the model.
         """
         if self.mass.shape[0] <= _MAX_DIRECT_SIZE or self.mounts[0].gyroscopic is not None:
             return self
@@ -305,15 +310,15 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
 def rotating_direction(mount: Mount, direction: int = 1) -> Array:
     """Return the rotating direction e, one entry for each direction of the mount.
 
-    A point on a unit circle with angle w t, clockwise -w t, moves by Re(e exp(i w t)).
+    A point on the unit circle at the angle w t (clockwise: -w t) has the position Re(e exp(i w t)).
 
-    `direction` is +1 anticlockwise, -1 clockwise.
+    **Arguments**: `direction`: +1 anticlockwise, -1 clockwise.
     """
     return jnp.asarray([(1.0, -1.0j if direction == 1 else 1.0j)[axis] for axis in mount.axes])
 
 
 def peak_force(force: Array) -> Array:
-    """Return the root of the sum of the squared peaks in all directions, N, of a force with complex amplitudes, N."""
+    """Return the root of the sum of the squared peaks in all directions, N, of a force with complex amplitudes (np,), N."""
     return magnitude(force[0]) if force.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(force) ** 2))
 
 
@@ -355,7 +360,10 @@ def turning_loads(
 
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
-    """**Raises** `InputError` if no load has drag or, with `each`, if any load has none. Traced values are not checked."""
+    """Require that at least one load has drag or, with `each`, that all loads have drag. Traced values are not checked.
+
+    **Raises** `InputError` for other loads.
+    """
 
     def check(drag: np.ndarray | float) -> None:
         if not (np.all if each else np.any)(np.asarray(drag) > 0.0):
@@ -365,7 +373,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 
 def require_one_point(scene: Scene) -> None:
-    """**Raises** `InputError` if the loads have different stations along the machine's axis."""
+    """Require one station of all loads along the machine's axis. **Raises** `InputError` for different stations."""
     if not scene.mounting.at_one_point:
         raise _stations_differ()
 
@@ -379,7 +387,10 @@ def _stations_differ() -> InputError:
 
 
 def require_circular(loads: Loads, drive: Drive) -> None:
-    """**Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`."""
+    """Require loads on circles in a rotor of prescribed speed.
+
+    **Raises** `InputError` for loads that are not `circular` and for a drive that is not `ideal`.
+    """
     if not loads.circular:
         needed = "this function needs loads on a circle (property circular): ball, roller, pendulum"
         raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {needed}; use simulate for others")
@@ -409,11 +420,11 @@ def require_terms(
         return
     kinds, terms = (list(dict.fromkeys(names)) for names in zip(*others, strict=True))
     verbs, rest = problem.split(" ", 1)
-    one, several = verbs.split("|")
+    singular, plural = verbs.split("|")
     rest = f"{rest} (term{'s' * (len(terms) > 1)} {_list_words(terms)})"
     if len(kinds) == 1:
-        raise InputError(f"effects.{kinds[0]}", f"{one} {rest}; leave it out {advice}")
-    raise InputError("effects", f"{_list_words(kinds)} {several} {rest}; leave them out {advice}")
+        raise InputError(f"effects.{kinds[0]}", f"{singular} {rest}; leave it out {advice}")
+    raise InputError("effects", f"{_list_words(kinds)} {plural} {rest}; leave them out {advice}")
 
 
 def _list_words(words: Sequence[str]) -> str:

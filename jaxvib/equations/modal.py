@@ -16,8 +16,9 @@ class ModalResponse(eqx.Module):
 
         D(w)^-1 = Z diag(1 / (i w - s)) W,      e^H B D(w)^-1 B^T e = sum_k r_k / (i w - s_k)
 
-    For each frequency, a vector costs two products with matrices, and each receptance costs O(nd). There are no derivatives
-    with respect to parameters of the scene, because eigenvectors of equal frequencies have none.
+    At each frequency, the solution for one force vector costs two products of a matrix and a vector, and each receptance costs
+    O(nd). There are no derivatives with respect to parameters of the scene, because the eigenvectors of equal eigenvalues have
+    no derivatives.
 
     **Attributes**
 
@@ -42,10 +43,10 @@ class ModalResponse(eqx.Module):
         13 times as fast. The sum uses real numbers because the imaginary part of an undamped carrier is then exactly 0.
         """
         poles = jnp.broadcast_to(self.poles, self.residues.shape)
-        decay, apart = -poles.real, omega - poles.imag
-        weight = factor / (decay**2 + apart**2)
+        decay, detuning = -poles.real, omega - poles.imag
+        weight = factor / (decay**2 + detuning**2)
         real, imag = self.residues.real, self.residues.imag
-        parts = (real * decay + imag * apart) * weight, (imag * decay - real * apart) * weight
+        parts = (real * decay + imag * detuning) * weight, (imag * decay - real * detuning) * weight
         return jax.lax.complex(*(jnp.sum(part, axis=-1) for part in parts))
 
     def solve(self, omega: Array, force: Array) -> Array:
@@ -64,8 +65,9 @@ def modal_response(
 
         (Omega q)' = Omega v,      v' = -Omega (Omega q) - Gamma v + X^T f,      Gamma = X^T C X
 
-    q are the coordinates of the undamped modes X with the frequencies Omega. Proportional damping does not couple the modes:
-    each mode is then a separate block, which is solved to rounding, and needs no separate case.
+    q are the coordinates of the undamped modes X with the frequencies Omega, and v = q'. Proportional damping does not couple
+    the modes. Each mode is then a separate block, whose eigenvalues are accurate to rounding, and this damping needs no
+    separate case.
 
     **Arguments**: undamped `frequencies` (nd,) rad/s and mass-normalised `shapes` (nd, nd); `stiffness` K, `damping` C
     and `mass` M (nd, nd); `direction` B^T e (nd,), or those of several masses (count, nd).
@@ -88,7 +90,7 @@ def modal_response(
     unit = np.eye(2 * n, dtype=coupling.dtype)[:, 1::2]
     inverse = solve_in_turn(vectors, unit.astype(vectors.dtype))
     outputs, inputs = (shapes / stiff[None, :]) @ vectors[0::2], inverse @ shapes.T
-    spread = jnp.linalg.norm(vectors) * jnp.linalg.norm(inverse)
+    condition = jnp.linalg.norm(vectors) * jnp.linalg.norm(inverse)
     left, right = direction.conj() @ outputs, direction @ inputs.T
     return ModalResponse(
         poles=poles,
@@ -96,5 +98,5 @@ def modal_response(
         inputs=inputs,
         residues=left * right if direction.ndim == 1 else left[:, None] * right[None],
         norms=jnp.stack([jnp.max(jnp.sum(jnp.abs(a), axis=1)) for a in (stiffness, damping, mass)]),
-        is_rough=(spread > 100.0 * n) | jnp.any(frequencies <= 0.0),
+        is_rough=(condition > 100.0 * n) | jnp.any(frequencies <= 0.0),
     )

@@ -45,7 +45,10 @@ class Model(eqx.Module):
         return force
 
     def natural_force(self, unit: State) -> Array:
-        """Return S n^2, N: force of the loads' unbalance at the rotor speed n. `unit` contains the scene's natural units."""
+        """Return S n^2, N: the centrifugal force of the unbalance S at the rotor speed n.
+
+        **Arguments**: `unit`: a state that contains the natural units of the scene, such as the unbalance radius.
+        """
         speeds = [each.rate[0] for each in unit.exciters if each.rate] or [unit.velocity / unit.displacement]
         speed = functools.reduce(jnp.maximum, speeds)
         return jnp.mean(jnp.diagonal(self.carrier.mass)) * unit.displacement * speed**2

@@ -28,21 +28,21 @@ class Kinematics(NamedTuple):
 
     @property
     def sizes(self) -> list[Array]:
-        """|dp/du_i|, m."""
+        """Lengths |dp/du_i| of the columns of J, m."""
         if self.lengths is not None:
             return list(self.lengths)
         return [jnp.sqrt(dot(column, column)) for column in self.columns]
 
     @property
     def metric(self) -> list[list[Array | float]]:
-        """J^T J, m^2."""
+        """Matrix J^T J, m^2."""
         if self.lengths is not None:
             return [[length**2 if i == k else 0.0 for k in range(len(self.columns))] for i, length in enumerate(self.lengths)]
         return [[dot(a, b) for b in self.columns] for a in self.columns]
 
     @property
     def curvature_along(self) -> list[Array] | None:
-        """J^T c, m^2/s^2; None if it is 0 for every motion."""
+        """Components J^T c of the curvature along the coordinates, m^2/s^2; None if they are 0 for every motion."""
         return None if self.lengths is not None else [dot(column, self.curvature) for column in self.columns]
 
 
@@ -106,6 +106,7 @@ def resolve_contact(
 
     **Arguments**
 
+    - `slip` of the loads, m/s; `limit`: Coulomb's law of the contact; `normal_force` of the loads
     - `needed`: force along the track in the motion in which all loads roll, N
     - `a`: acceleration in that motion of the points that carry the loads, by axis
     - `rolling`: generalised forces on loads that roll
@@ -137,7 +138,10 @@ def resolve_contact(
 
 
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:
-    """Return the rate of the slip along each coordinate: `change` (c')_t, and the part due to the rotation of the tangents."""
+    """Return the rate of the slip along each coordinate, m/s^2.
+
+    It is the tangential part `change` of c', minus a part due to the rotation of the tangents.
+    """
 
     def tangents(*v: Array) -> list[list[Array]]:
         columns = [jax.jvp(loads.position, v, _unit(v, i))[1] for i in range(len(v))]

@@ -47,9 +47,13 @@ _COMMON_SPEEDS = 513
 class TorqueBalance(eqx.Module):
     """Balance of the mean torques on the rotating masses of a scene.
 
-    **Attributes**: the linear `model`; the `averaged` equations at the working speed of ideal drives; `direction` (count, nd),
-    complex: generalized force of each mass per unit of its centrifugal force; `motor_torque` (count,) N m, the
-    largest torque of the motor of an unbalance from rest to its working speed; 1 if the motor has no torque, 0 for a load.
+    **Attributes**
+
+    - `model`: the linear model
+    - `averaged`: the averaged equations at the working speed of ideal drives
+    - `direction` B_k^T e_k (count, nd), complex: generalized force of each mass per unit of its centrifugal force
+    - `motor_torque` (count,) N m: largest torque of the motor of an unbalance from rest to its working speed; 1 if the motor
+      has no torque, 0 for a load
     """
 
     model: LinearModel
@@ -185,7 +189,10 @@ class UnbalancedModel(ExcitedModel):
         return jnp.where(total > least, total, least)
 
     def required_torque(self, omega: Array, displacement: Array) -> Array:
-        """Return the mean torque that each rotor needs, (count,) N m, at the speed `omega` and the amplitudes (nd,)."""
+        """Return the mean torque -V that each rotor needs against the vibration, (count,) N m.
+
+        **Arguments**: `omega`: speed of the rotors, rad/s; `displacement` (nd,): complex amplitudes.
+        """
         forward = omega**2 * (self.balance.direction.conj() @ displacement)
         return mean_torque(self.balance.unbalance, jnp.conj(self.turn) * forward)
 
@@ -435,6 +442,6 @@ def balance_residuals(x: Array, balance: TorqueBalance, factor: Array | None = N
 
 
 def can_start(scene: Scene) -> Array:
-    """Return True for each exciter whose motor lifts its unbalance from rest against gravity, or that has none to lift."""
+    """Return True for each exciter whose motor lifts its unbalance from rest against gravity, or that has nothing to lift."""
     each = lifting_torques(scene)
     return jnp.stack([jnp.asarray(True) if torques is None else torques[1] > torques[0] for torques in each])

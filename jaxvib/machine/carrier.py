@@ -20,8 +20,11 @@ from jaxvib.units import Number, count, number, numbers
 
 
 class BodyPoint(eqx.Module):
-    """Point (x, y) of one of several bodies, m from its centre of mass (None: the centre itself); `body` is the number of the
-    body, from 0."""
+    """Point of one of several bodies.
+
+    **Attributes**: `at` (2,): the point (x, y), m from the body's centre of mass, None for the centre itself; `body`: number of
+    the body, from 0.
+    """
 
     at: Array | None
     body: int = eqx.field(static=True)
@@ -62,14 +65,14 @@ class Mount(eqx.Module):
 
     **Attributes**
 
-    - `rows`: arrays (np, nd), which times q give a displacement. The first is that of a point of the rotor's axis. The second
-      is the tilt of the axis, in 1/m times the unit of a displacement. Machines that do not tilt have the first only
+    - `rows`: one or two matrices (np, nd). The first times q is the displacement of a point of the rotor's axis, m. The second
+      times q is the tilt of the axis, rad. Machines that do not tilt have the first only
     - `axes` (np,): the direction of each row in the plane of the loads (0 horizontal, 1 up)
     - `levers`: a lever (count,) for each entry of `rows`; None stands for 1, an absent entry for 0. `levers` is (None,) if all
       loads run at the first point, and (None, distances from this point in m) if each load has its own station
     - `rotor_levers`: the same for the rotor's centre of mass, scalars
-    - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one.
-      typical: 0.01 to 0.5 kg m^2, the polar inertia of the rotor
+    - `gyroscopic` G (nd, nd), kg m^2, for the term (speed G) q' of the equations, see `Carrier`; typical entries: 0.01 to
+      0.5 kg m^2, the polar inertia of the rotor; None for a machine without gyroscopic coupling
     - `turn` c (nd,): the exciter's housing turns by c q, and the reaction torque of the drive acts on it; None if it does not
       turn
 
@@ -120,8 +123,8 @@ class Mount(eqx.Module):
         if self.at_one_point:
             return dict(zip(self.axes, self.rows[0] @ rate, strict=True))
         levers = [None if lever is None else lever[None, :] for lever in self.levers]
-        moved = [(row @ rate)[:, None] for row in self.rows[: len(levers)]]
-        return dict(zip(self.axes, _combine(levers, moved), strict=True))
+        of_rows = [(row @ rate)[:, None] for row in self.rows[: len(levers)]]
+        return dict(zip(self.axes, _combine(levers, of_rows), strict=True))
 
     def rotor_rows(self) -> Array:
         """Return the matrix (directions, nd) that gives the displacement of the rotor's centre of mass from q."""
@@ -150,9 +153,9 @@ def _combine(levers: Sequence[Array | None], values: Sequence[Array]) -> Array:
 class Carrier(eqx.Module):
     """Linear structure of a machine.
 
-        M q'' + C q' + K q = forces,        force on the foundation = T_K q + T_C q'
+        M q'' + (C + speed G) q' + K q = forces,        force on the foundation = T_K q + T_C q'
 
-    `mass` does not include the loads: each load adds its mass at its own place, see `Mount`.
+    `mass` does not include the loads: each load adds its mass at its own place. The gyroscopic matrix G is that of the `Mount`.
 
     **Attributes** (nd coordinates, nb directions of the force on the foundation)
 
@@ -208,7 +211,7 @@ class Carrier(eqx.Module):
 
 
 class Machine(Part):
-    """Machine, described by the designer's own parameters. A new kind of machine is a subclass that defines its matrices and
+    """Machine with the parameters that a designer chooses. A new kind of machine is a subclass that defines its matrices and
     the mount of an exciter.
 
     `kind` is its name in scene files. `places` states how effects and drawings name a place on the machine:
@@ -217,7 +220,7 @@ class Machine(Part):
     - "shaft": by the distance along a rotor's axis from its centre of mass, m
     - "number": by the number of a place in a list
     - "plane": by the point (x, y) of a body, m from its centre of mass
-    - "point": not at all, because the exciter's place is the only one
+    - "point": the exciter's place is the only one, and is not named
 
     >>> import equinox as eqx, jax, jax.numpy as jnp, jaxvib as jv
     >>> class Table(jv.Machine):
@@ -259,7 +262,8 @@ class Machine(Part):
 
         **Arguments**
 
-        - `place`: the number of a platform, or a distance along the axis, m; None for the default place
+        - `place`: the number of a platform, a distance along the axis, m, or a point of a body, see `Place`; None for the
+          default place
         - `name` of the place in error messages
 
         **Raises** `InputError` for a place that the machine does not have.
@@ -294,7 +298,7 @@ class Machine(Part):
         return carrier.foundation_stiffness[None], carrier.foundation_damping[None]
 
     def upward(self) -> np.ndarray | None:
-        """Return the coordinates (nd,) of a translation upward by 1 m; None if they are unknown."""
+        """Return the coordinates (nd,) of a translation of the whole machine upward by 1 m; None if they are unknown."""
         return None
 
     @property
@@ -344,8 +348,8 @@ def shapes_of(machine: Machine, at: Place = None) -> tuple[Carrier, Mount]:
 
 def _shape_and_dtype(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
     """Return the shape and the dtype of an array, or those of the array that JAX makes of a Python number."""
-    known = leaf if isinstance(leaf, (jax.Array, np.ndarray)) else jnp.asarray(leaf)
-    return known.shape, known.dtype
+    array = leaf if isinstance(leaf, (jax.Array, np.ndarray)) else jnp.asarray(leaf)
+    return array.shape, array.dtype
 
 
 @functools.lru_cache(maxsize=128)

@@ -150,8 +150,8 @@ class Dimensionless(eqx.Module):
         return self.mass_scale * self.frequency_scale**2 * self.length_unit
 
     def _by_platform(self, others: Array | np.ndarray, exciter: float) -> Array:
-        where = min(1, others.shape[0])
-        return numpy_of(others).concatenate([others[:where], np.full(1, exciter, dtype=others.dtype), others[where:]])
+        index = min(1, others.shape[0])
+        return numpy_of(others).concatenate([others[:index], np.full(1, exciter, dtype=others.dtype), others[index:]])
 
     def scene(self) -> Scene:
         """Return the `Scene` in SI units, with the chosen size."""
@@ -186,7 +186,7 @@ class Dimensionless(eqx.Module):
     def convert_results(
         self, *, omega: Array | None = None, amplitude: Array | complex | None = None, force: Array | None = None
     ) -> dict[str, Array]:
-        """Convert results in SI to the dimensionless quantities of the paper.
+        """Convert results in SI to the dimensionless quantities of the paper of this `form`.
 
         **Arguments**
 

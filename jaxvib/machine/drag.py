@@ -14,6 +14,7 @@ from jaxvib.units import Number, number
 from jaxvib.units.known import require_if_known
 
 Cause = Literal["oil", "rolling", "bearing"]
+"""Cause of the drag."""
 
 _NEEDED = {
     "oil": {"ball_radius": "m", "viscosity": "Pa s", "density": "kg/m^3"},
@@ -41,7 +42,8 @@ def drag_of(
     friction: Number | None = None,
     diameter: Number | None = None,
 ) -> Array:
-    """Return the drag b_W of a load, N s/m, from its cause: the viscous drag with the same force at the given two speeds.
+    """Return the drag b_W of a load, N s/m, from its cause: the viscous drag that has the same force at the given speeds of
+    load and rotor.
 
         b_W = F / v,    v = R (n - Omega)
         "oil":      F = C_D rho pi r^2 v^2 / 2,    C_D = 24/Re (1 + 0.15 Re^0.687) + 0.42 / (1 + 42500 Re^-1.16)
@@ -68,7 +70,7 @@ def drag_of(
 
     **Raises** `InputError` for a missing argument, for one that the cause does not use, and outside the range of validity:
 
-    - oil: Re up to 3e5. The ball is far from walls: in a channel narrower than about five balls the drag is larger
+    - oil: Re up to 3e5. The ball must be far from walls: in a channel narrower than about five balls the drag is larger
     - rolling: f up to r/10
     - bearing: open rolling bearings with good lubrication, at about a tenth of their dynamic load rating; d up to R. Seals add
       their own friction

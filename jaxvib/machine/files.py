@@ -89,9 +89,9 @@ Tables: TypeAlias = dict[str, Any]
 
 def suggest_name(name: str, allowed: list[str]) -> str:
     """Return the end of an error message about an unknown name: the most similar allowed name, and all allowed names."""
-    near = difflib.get_close_matches(name, allowed, n=1)
-    meant = f"did you mean {near[0]!r}? " if near else ""
-    return f"{meant}allowed: {', '.join(allowed)}"
+    similar = difflib.get_close_matches(name, allowed, n=1)
+    question = f"did you mean {similar[0]!r}? " if similar else ""
+    return f"{question}allowed: {', '.join(allowed)}"
 
 
 def read_toml(path: str | Path) -> Tables:
@@ -260,32 +260,32 @@ def scene_from_tables(tables: Tables) -> Scene:
     for name in ("machine",) if several else SECTIONS:
         if name not in tables:
             raise InputError(name, f"is missing; a scene file needs the table [{name}]")
-        parts[name] = _built(tables[name], name, SECTIONS[name])
+        parts[name] = _build_kind(tables[name], name, SECTIONS[name])
     for name in ("loads", "drive") if several else ():
         if name in tables:
             raise InputError(name, f"is given as well as [[exciters]]; write [exciters.{name}] below each [[exciters]]")
-    effects = _built_effects(tables.get("effects", {}))
+    effects = _build_effects(tables.get("effects", {}))
     if not several:
         return Scene(**parts, effects=effects)
     exciters = tables["exciters"]
     if not isinstance(exciters, list) or not exciters:
         raise InputError("exciters", "is not a list of tables; write [[exciters]] for each")
-    return Scene(**parts, effects=effects, exciters=[_built_exciter(table, k) for k, table in enumerate(exciters)])
+    return Scene(**parts, effects=effects, exciters=[_build_exciter(table, k) for k, table in enumerate(exciters)])
 
 
-def _built_exciter(table: object, k: int) -> Exciter:
+def _build_exciter(table: object, k: int) -> Exciter:
     if not isinstance(table, Mapping):
         raise InputError(f"exciters[{k}]", f"is {quoted(table)}; it must be a table, write [[exciters]]")
     with within(f"exciters[{k}]."):
         values = {name: value for name, value in table.items() if name not in ("loads", "drive", "effects")}
-        parts = {name: _built(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
+        parts = {name: _build_kind(table[name], name, SECTIONS[name]) for name in ("loads", "drive") if name in table}
         if isinstance(values.get("unbalance"), Mapping):
             values["unbalance"] = build_part(unbalance, values["unbalance"], "unbalance")
-        effects = _built_effects(table.get("effects", {}))
+        effects = _build_effects(table.get("effects", {}))
         return build_part(Exciter, {**values, **parts, "effects": effects}, "")
 
 
-def _built_effects(chosen: object) -> tuple[Effect, ...]:
+def _build_effects(chosen: object) -> tuple[Effect, ...]:
     if not isinstance(chosen, Mapping):
         raise InputError("effects", "is not a table; write [effects] and below it, for example, gravity = true")
     effects = []
@@ -303,7 +303,7 @@ def _built_effects(chosen: object) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
-def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
+def _build_kind(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
     if not isinstance(table, Mapping):
         raise InputError(section, f"is {quoted(table)}; it must be a table, write [{section}]")
     if "kind" not in table:
@@ -316,7 +316,7 @@ def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -
 
 def build_drive(table: object, section: str) -> Drive:
     """Return the drive of a table with its `kind`. **Raises** `InputError` for an unknown or missing name."""
-    return _built(table, section, DRIVES)
+    return _build_kind(table, section, DRIVES)
 
 
 def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
@@ -329,7 +329,7 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
             raise InputError(prefix + name, f"is missing; needed here: {', '.join(_needed(parameters))}")
-    entries = {name: _built_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
+    entries = {name: _build_entries(_ENTRIES[name], values[name], prefix + name) for name in _ENTRIES if name in values}
     if isinstance(drag := values.get("drag"), Mapping):
         with within(f"{prefix}drag."):
             entries["drag"] = build_part(drag_of, drag, "")
@@ -339,11 +339,11 @@ def build_part(build: Callable[..., T], values: Mapping[str, object], section: s
             entries["mass"] = build_part(ball_mass, {**size, **mass}, "")
     for name in ("motor", "reference"):  # drives within a drive
         if isinstance(values.get(name), Mapping):
-            entries[name] = _built(values[name], prefix + name, DRIVES)
+            entries[name] = _build_kind(values[name], prefix + name, DRIVES)
     return build(**{**values, **entries})
 
 
-def _built_entries(build: Callable[..., object], tables: object, section: str) -> object:
+def _build_entries(build: Callable[..., object], tables: object, section: str) -> object:
     """Return the parts of a list of tables. Other values are returned unchanged; the constructor validates them."""
     if not isinstance(tables, list) or not all(isinstance(each, Mapping) for each in tables):
         return tables

@@ -1,4 +1,4 @@
-"""Scene files with other numbers, in which comments and units stay."""
+"""Changes of the numbers in the text of a scene file, which keep its comments and units."""
 
 from __future__ import annotations
 
@@ -78,11 +78,11 @@ def _added_lines(read: Any, old: Any, new: Any) -> list[str]:
 
 def _whole_entries(text: str) -> list[str]:
     """Return the lines of a text; the lines of a list are one entry."""
-    found: list[str] = []
+    entries: list[str] = []
     for line in text.splitlines():
-        is_open = bool(found) and re.search(r"=\s*\[", found[-1]) and found[-1].count("[") > found[-1].count("]")
-        found[-1:] = [f"{found[-1]}\n{line}"] if is_open else [*found[-1:], line]
-    return found
+        is_open = bool(entries) and re.search(r"=\s*\[", entries[-1]) and entries[-1].count("[") > entries[-1].count("]")
+        entries[-1:] = [f"{entries[-1]}\n{line}"] if is_open else [*entries[-1:], line]
+    return entries
 
 
 def _section_of(names: Sequence[str], is_array: bool, counts: dict[_Path, int]) -> _Path:

@@ -30,7 +30,7 @@ class Exciter(Part):
 
     **Arguments**
 
-    - `loads` from `balls`, `rollers`, `pendulums`; None without loads
+    - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; None for an exciter without loads
     - `drive`, a `Motor` or an `IdealDrive`; the inertia of a motor includes the unbalance
     - `unbalance` S, kg m: static moment m r about the exciter's axis of a mass that turns with the rotor, greater than 0;
       typical: 0.1 to 10 kg m. The function `unbalance` computes it from the force that catalogues state
@@ -102,7 +102,7 @@ class Exciter(Part):
 
     @property
     def is_plain(self) -> bool:
-        """True for loads on a balanced rotor that turns anticlockwise."""
+        """True for an exciter with loads and without an `unbalance` that turns anticlockwise."""
         return self.carries == ("loads",) and self.direction == 1
 
     @property
@@ -154,10 +154,10 @@ def read_unbalance(drive: Drive, unbalance: Number | None, unbalance_mass: Numbe
     given = {name: value for name, value in (("unbalance", unbalance), ("unbalance_mass", unbalance_mass)) if value is not None}
     if "unbalance_mass" in given and "unbalance" not in given:
         raise InputError("unbalance_mass", f"is {quoted(unbalance_mass)} without an unbalance; give unbalance=..., in kg m")
-    found = read_numbers(Exciter, "", **given)
-    if len(found) == 2 and not drive.ideal:
-        when_known(_require_inertia, *found.values(), drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
-    return found.get("unbalance"), found.get("unbalance_mass")
+    values = read_numbers(Exciter, "", **given)
+    if len(values) == 2 and not drive.ideal:
+        when_known(_require_inertia, *values.values(), drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
+    return values.get("unbalance"), values.get("unbalance_mass")
 
 
 def _require_inertia(unbalance: float, mass: float, inertia: float) -> None:
@@ -174,7 +174,8 @@ class Scene(Part):
 
     **Arguments**
 
-    - `machine` from `one_mass`, `two_mass`, `three_mass`, `network`, `planar_rotor` or `rotor`
+    - `machine` from `one_mass`, `two_mass`, `three_mass`, `network`, `planar_rotor`, `rotor`, `plane_body`, `plane_network` or
+      `from_matrices`
     - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; typical: 0.1 % to 5 % of the machine's mass
     - `drive` such as `ConstantSpeed`; typical: 600 to 3000 rpm
     - `effects` such as `Gravity`, each at most once, except `CubicSupport` and `Stop`: one for each such support; typical: none
@@ -256,7 +257,7 @@ class Scene(Part):
 
     @property
     def is_plain(self) -> bool:
-        """True for one exciter with loads on a balanced rotor that turns anticlockwise. All analyses include such scenes."""
+        """True for one exciter with loads and without an `unbalance` that turns anticlockwise."""
         return len(self.exciters) == 1 and self.exciters[0].is_plain
 
     @property
@@ -295,10 +296,10 @@ class Scene(Part):
         >>> scene.replace(effects=(jv.Gravity(),)).all_effects[0].kind
         'gravity'
         """
-        one = self.exciter
-        known = {"machine": self.machine, "loads": one.loads, "drive": one.drive, "effects": self.all_effects} | parts
-        exciter = one.with_parts(known.pop("loads"), known.pop("drive"))
-        return Scene(**known, exciters=[exciter])
+        own = self.exciter
+        all_parts = {"machine": self.machine, "loads": own.loads, "drive": own.drive, "effects": self.all_effects} | parts
+        exciter = own.with_parts(all_parts.pop("loads"), all_parts.pop("drive"))
+        return Scene(**all_parts, exciters=[exciter])
 
     def prefix_of(self, k: int) -> str:
         """Return the prefix of the names of the parts of exciter `k`: "exciters[1].", or "" if there is one exciter."""

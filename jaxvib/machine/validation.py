@@ -138,7 +138,7 @@ def implausible_numbers(scene: Scene) -> list[str]:
 def lifting_torques(scene: Scene) -> list[tuple[Array, Array] | None]:
     """Return S g, the largest torque of the weight of the unbalance, and L(0), the torque of the motor at rest, N m.
 
-    The list has an entry for each exciter; it is None if there is no motor, no unbalance or no gravity.
+    The list has an entry for each exciter, which is None if the exciter has no motor or no unbalance, or without gravity.
     """
     gravity = total_gravity(scene.all_effects)
     found: list[tuple[Array, Array] | None] = []

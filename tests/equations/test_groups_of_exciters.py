@@ -88,7 +88,7 @@ def test_groups_have_the_rates_of_single_exciters(name, monkeypatch):
     state = state_of(scene)
     assert max(len(group.members) for group in jv.vector_field(scene).groups) >= 8
     found = jax.jit(lambda y: rate(scene, y))(state)
-    monkeypatch.setattr(dynamics, "_LEAST_GROUP", 1000)
+    monkeypatch.setattr(dynamics, "_MIN_GROUP_SIZE", 1000)
     assert all(len(group.members) == 1 for group in jv.vector_field(scene).groups)
     close(found, jax.jit(lambda y: rate(scene, y))(state))
 
@@ -108,6 +108,6 @@ def test_groups_have_the_derivatives_of_single_exciters(name, monkeypatch):
         return jax.jvp(rate, (scene, state), ones)[1], back(jax.tree.map(jnp.ones_like, value))
 
     found = slopes(scene, state)
-    monkeypatch.setattr(dynamics, "_LEAST_GROUP", 1000)
+    monkeypatch.setattr(dynamics, "_MIN_GROUP_SIZE", 1000)
     jax.clear_caches()
     close(found, slopes(scene, state), 1e-12)

@@ -24,10 +24,10 @@ class TorqueTable(Motor):
     **Arguments** (SI, or strings with a unit)
 
     - `speeds` of the points, rad/s, in ascending order, at least 2; typical: ["0 rpm", "1000 rpm", "1500 rpm"]
-    - `torques` at these speeds, N m: the first positive, the last 0 or negative; typical: -10 to 200
+    - `torques` at these speeds, N m: the first must be positive, the last 0 or negative; typical: -10 to 200
     - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
-    Its no-load `speed` is the last speed at which the torque falls to 0.
+    **Attributes**: the arguments; the no-load `speed`, the largest speed at which the torque falls to 0.
 
     **Raises** `InputError` for a wrong unit, speeds that do not ascend, and torques that do not fall to 0.
 
@@ -67,7 +67,10 @@ class TorqueTable(Motor):
 
 
 def _points(part: type[eqx.Module], **lists: Numbers) -> list[Array]:
-    """Return the lists of a table of points. **Raises** `InputError` unless the first ascends and all are of one length."""
+    """Return the lists of a table of points as arrays.
+
+    **Raises** `InputError` if the first list does not ascend or has fewer than 2 values, and for lists of another length.
+    """
     (first, *others), (name, *names) = (found := read_numbers(part, "drive", **lists)).values(), found
     n = np.size(first)
     if np.ndim(first) != 1 or n < 2:
@@ -97,7 +100,7 @@ class SpeedProfile(IdealDrive):
     - `times` of the points, s, in ascending order, at least 2; typical: [0, 5, 60, 70]
     - `speeds` at these times, rad/s, at least 0; typical: ["0 rpm", "1500 rpm", "1500 rpm", "0 rpm"]
 
-    Its working speed `speed` is the last one, or the largest if the rotor comes to rest.
+    **Attributes**: the arguments; the working speed `speed`, which is the last one, or the largest if the rotor comes to rest.
 
     **Raises** `InputError` for a wrong unit, times that do not ascend, and a rotor that never turns.
 
@@ -160,9 +163,9 @@ class Converter(MotorWrapper):
 
         T(t, theta') = T_motor(theta' + n_motor - n(t))
 
-    n_motor is the motor's own no-load speed (`motor.speed`). With the converter the torque depends on theta' - n(t) as
-    without it on theta' - n_motor. This is exact for a `DCMotor` whose voltage is changed, and for Kloss's formula at constant
-    flux (voltage in proportion to the frequency).
+    n_motor is the motor's own no-load speed (`motor.speed`). With the converter, the torque is the same function of
+    theta' - n(t) as it is of theta' - n_motor without it. This is exact for a `DCMotor` whose voltage is changed, and for
+    Kloss's formula at constant flux (voltage in proportion to the frequency).
 
     **Arguments**
 
@@ -214,12 +217,12 @@ class Converter(MotorWrapper):
 class SpeedControl(Motor):
     """Motor whose torque is controlled so that its speed follows a reference (proportional and integral, with a limit).
 
-        T_u = gain (n(t) - theta') + z,    T = T_u between -torque_limit and torque_limit
+        T_u = gain (n(t) - theta') + z,    T = T_u, limited to the range -torque_limit to torque_limit
         z' = integral_gain (n(t) - theta' + (T - T_u) / gain)
 
-    The integral z is a state of the motor (`state.rotor[2]`, N m). The last term keeps it from growing while the torque is at
-    its limit. Theories of steady motions need the torque as a function of the speed, which this drive does not have: use
-    `ConstantSpeed` there.
+    The integral z is a state of the motor (`state.rotor[2]`, N m). The last term prevents z from growing while the torque is at
+    its limit. Theories of steady motions need the torque as a function of the speed, which this drive does not have; use
+    `ConstantSpeed` for them.
 
     **Arguments** (SI, or strings with a unit; all greater than 0)
 

@@ -131,8 +131,9 @@ class DCMotorElectrical(Motor):
         self, voltage: Number, resistance: Number, torque_constant: Number, inertia: Number, inductance: Number | None = None
     ):
         given = {"voltage": voltage, "resistance": resistance, "torque_constant": torque_constant, "inertia": inertia}
-        found = read_numbers(DCMotorElectrical, "drive", **given)
-        self.voltage, self.resistance, self.torque_constant, self.inertia = found.values()
+        self.voltage, self.resistance, self.torque_constant, self.inertia = read_numbers(
+            DCMotorElectrical, "drive", **given
+        ).values()
         self.inductance = None
         if inductance is not None:
             self.inductance = read_numbers(DCMotorElectrical, "drive", inductance=inductance)["inductance"]
@@ -245,11 +246,11 @@ class InductionMotorCircuit(Motor):
         """Return the steady torque at the rotor's `speed`."""
         w, slip, mutual = self.frequency, self.frequency - self.pole_pairs * speed, self.magnetizing_inductance
         rotor = self.rotor_resistance**2 + (slip * (mutual + self.rotor_leakage)) ** 2
-        felt = slip * mutual**2 / rotor
-        resistance = self.stator_resistance + w * felt * self.rotor_resistance
-        reactance = w * (mutual + self.stator_leakage) - w * felt * slip * (mutual + self.rotor_leakage)
-        current = self._voltage_amplitude**2 / (resistance**2 + reactance**2)
-        return 1.5 * self.pole_pairs * felt * self.rotor_resistance * current
+        coupling = slip * mutual**2 / rotor
+        resistance = self.stator_resistance + w * coupling * self.rotor_resistance
+        reactance = w * (mutual + self.stator_leakage) - w * coupling * slip * (mutual + self.rotor_leakage)
+        current_squared = self._voltage_amplitude**2 / (resistance**2 + reactance**2)
+        return 1.5 * self.pole_pairs * coupling * self.rotor_resistance * current_squared
 
 
 class InductionMotorElectrical(InductionMotorCircuit):

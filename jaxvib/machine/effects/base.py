@@ -60,9 +60,10 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
 
 
 def has_half_turn_symmetry(effects: Iterable[Effect]) -> bool:
-    """True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged; the deviation of the load angle in
-    a jam then has even harmonics only. Some friction laws keep this symmetry. Gravity on the loads, an imbalance and forces
-    between loads break it.
+    """True if phi -> phi + pi, q -> -q leaves the equations with these `effects` unchanged.
+
+    The deviation of the load angle in a jam then has even harmonics only. Some friction laws keep this symmetry. Gravity on the
+    loads, an imbalance and forces between loads break it. For every effect other than friction the result is False.
     """
     terms = [term for effect in effects for term in effect.terms()]
     return all(isinstance(term, ContactFriction) and term.is_half_turn_symmetric for term in terms)
@@ -120,13 +121,15 @@ class Effect(Part):
         """**Raises** `InputError` if the effect cannot act on this `machine` or these `loads`."""
 
     def prepare(self, loads: Loads, mount: Mount) -> Effect:
-        """Return the effect with everything precomputed that depends on the parameters of the `loads` and on their `mount`, but
-        not on time."""
+        """Return the effect with the quantities that depend on the parameters of the `loads` and on their `mount`, but not on
+        time."""
         return self
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array | None:
-        """Return the fastest rate of the motion that the effect adds, rad/s or 1/s, which steps must resolve; None if it is
-        not faster than the motion of the `loads` without the effect. `speed` is the rotor speed, rad/s.
+        """Return the fastest rate of the motion that the effect adds, rad/s or 1/s, which steps must resolve.
+
+        The result is None if the effect adds no motion that is faster than that of the `loads` without it. `speed` is the rotor
+        speed, rad/s.
         """
         return None
 
@@ -274,11 +277,11 @@ class MomentImbalance(Effect):
 
 
 def _moved_inertia(machine: Machine) -> tuple[Array, Array | None]:
-    """Return the mass (kg) that a force on the exciter moves, and the inertia (kg m^2) that a moment moves (None if the
-    machine cannot tilt)."""
+    """Return the mass (kg) that a force on the exciter accelerates, and the inertia (kg m^2) that a moment accelerates (None
+    if the machine cannot tilt)."""
     mass, mount = machine.carrier().mass, machine.mount()
 
-    def moved(rows: Array) -> Array:
+    def inertia(rows: Array) -> Array:
         return 1.0 / (rows @ jnp.linalg.solve(mass, rows.T))[0, 0]
 
-    return moved(mount.rows[0]), None if mount.tilt is None else moved(mount.tilt)
+    return inertia(mount.rows[0]), None if mount.tilt is None else inertia(mount.tilt)

@@ -32,7 +32,8 @@ class LoadContact(Effect):
       follows the last one a turn later, so there are N pairs. The angles of a start must be in this order, within one turn;
       starts by name, such as "rest", place coincident loads side by side
     - Only loads at one station of a rotor can touch. The attribute `tracks` contains the stations while a motion is computed
-    - With several coordinates each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 times 2 r
+    - If loads have several coordinates, as in a torus, each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start
+      nearer than 0.9 times 2 r
 
     Two loads that collide on a track at rest separate at e times the speed at which they approached. The restitution e is
 
@@ -119,14 +120,14 @@ class LoadContact(Effect):
     def _require_distances(self, loads: Loads, u: tuple[Array, ...], stations: np.ndarray | None) -> None:
         place = loads.position(*u) if np.ndim(u[0]) == 1 else jax.vmap(lambda each, v: each.position(*v))(loads, u)
         points = np.stack([np.asarray(x) for x in place], axis=-1).reshape(-1, loads.count, len(place))
-        wide = 2.0 * np.asarray(ball_radius(loads)).reshape(-1, 1, 1)
-        apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
-        others = np.eye(loads.count, dtype=bool) | (False if stations is None else stations[:, None] != stations)
-        apart = np.where(others, np.inf, apart)
-        if np.min(apart) < MIN_DISTANCE:
-            run, i, j = np.unravel_index(np.argmin(apart), apart.shape)
-            size = float(np.broadcast_to(wide, (apart.shape[0], 1, 1))[run, 0, 0])
-            problem = f"puts loads {i + 1} and {j + 1} inside each other, {round(apart[run, i, j], 6) * size:.4g} m apart"
+        diameter = 2.0 * np.asarray(ball_radius(loads)).reshape(-1, 1, 1)
+        distance = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / diameter
+        cannot_touch = np.eye(loads.count, dtype=bool) | (False if stations is None else stations[:, None] != stations)
+        distance = np.where(cannot_touch, np.inf, distance)
+        if np.min(distance) < MIN_DISTANCE:
+            run, i, j = np.unravel_index(np.argmin(distance), distance.shape)
+            size = float(np.broadcast_to(diameter, (distance.shape[0], 1, 1))[run, 0, 0])
+            problem = f"puts loads {i + 1} and {j + 1} inside each other, {round(distance[run, i, j], 6) * size:.4g} m apart"
             raise InputError("start.angle", f"{problem}; start them {size:.4g} m apart, their diameter")
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array:
@@ -151,9 +152,9 @@ class LoadContact(Effect):
         return sum(parts[1:], parts[0])
 
     def resistance(self, loads: Loads, u: Coordinates, rate: Coordinates) -> Coordinates:
-        """Return the forces -c s' of the pairs of `loads` that overlap at the coordinates `u` with rates `rate`.
+        """Return the generalised forces of the damping forces -c s' between `loads` that overlap, (count,) each.
 
-        A contact never pulls.
+        They are limited so that a contact never pulls. **Arguments**: coordinates `u` and their rates `rate`.
         """
         damping = self._damping(loads)
 
@@ -161,11 +162,11 @@ class LoadContact(Effect):
             return tuple(_clearances(loads, v, self.tracks))
 
         clearances, back = jax.vjp(gaps, *u)
-        _, partings = jax.jvp(gaps, u, rate)
+        _, opening_speeds = jax.jvp(gaps, u, rate)
         return back(
             tuple(
-                jnp.where(gap < 0.0, jnp.maximum(-damping * parting, self.stiffness * gap), 0.0)
-                for gap, parting in zip(clearances, partings, strict=True)
+                jnp.where(gap < 0.0, jnp.maximum(-damping * opening, self.stiffness * gap), 0.0)
+                for gap, opening in zip(clearances, opening_speeds, strict=True)
             )
         )
 
@@ -264,7 +265,7 @@ def _clearances(loads: Loads, u: tuple[Array, ...], tracks: Tracks | None) -> li
             ahead = phi[tracks.follower] + 2.0 * jnp.pi * tracks.turns
         return [2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own]
     n, place = loads.count, loads.position(*u)
-    found = []
+    clearances = []
     for k in range(1, n // 2 + 1):
         pairs = n // 2 if 2 * k == n else n
         square = sum((jnp.concatenate([x[k:], x[:k]])[:pairs] - x[:pairs]) ** 2 for x in place)
@@ -273,5 +274,5 @@ def _clearances(loads: Loads, u: tuple[Array, ...], tracks: Tracks | None) -> li
         if tracks is not None:
             is_same = jnp.roll(tracks.stations, -k)[:pairs] == tracks.stations[:pairs]
             distance = jnp.where(is_same, distance, jnp.inf)
-        found.append(distance - 2.0 * own)
-    return found or [jnp.ones_like(u[0])]
+        clearances.append(distance - 2.0 * own)
+    return clearances or [jnp.ones_like(u[0])]

@@ -23,7 +23,10 @@ Coordinates: TypeAlias = tuple[Array, ...]
 """Arrays (count,), one for each coordinate of a load."""
 
 Energy: TypeAlias = Callable[[Loads, Coordinates], Array]
+"""Function of the loads and their coordinates that returns energies, (count,) J."""
+
 Resistance: TypeAlias = Callable[[Loads, Coordinates, Coordinates], Coordinates]
+"""Function of the loads, their coordinates and the rates of these that returns generalised forces."""
 
 
 @final
@@ -86,8 +89,8 @@ class LoadInteraction:
 
     - `energy` of the pairs, J, (count,)
     - `resistance`: generalised forces that dissipate energy of the relative motion, or None
-    - `validate_start`: function of the loads, `u` (..., count) and the stations (count,) of the loads, m, None for a
-      single track; it raises `InputError` if loads cannot start there. Or None
+    - `validate_start`: function of the loads, of `u` (..., count), and of the stations (count,) of the loads, m (None for a
+      single track). It raises `InputError` if the loads cannot start there. None: every start is allowed
     """
 
     energy: Energy
@@ -158,21 +161,21 @@ class Friction(NamedTuple):
 
     def forces(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
         """Return the torque of the friction, and its generalised forces on the further coordinates of a load."""
-        reaction = self._reaction(a)
+        reaction = self._normal_force(a)
         size = jnp.maximum(reaction, 0.0) if self.one_sided else jnp.abs(reaction)
         return tuple(lever * size for lever in (self.lever, *self.others))
 
     def signed(self, a: Mapping[int, Array]) -> Friction:
         """Return friction that is linear in the accelerations: N keeps the sign that it has at `a`."""
-        sign = jnp.where(self._reaction(a) < 0.0, 0.0 if self.one_sided else -1.0, 1.0)
+        sign = jnp.where(self._normal_force(a) < 0.0, 0.0 if self.one_sided else -1.0, 1.0)
         return self._replace(lever=self.lever * sign, others=tuple(lever * sign for lever in self.others))
 
     def linear(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
         """Return the `forces` of a friction returned by `signed`."""
-        reaction = self._reaction(a)
+        reaction = self._normal_force(a)
         return tuple(lever * reaction for lever in (self.lever, *self.others))
 
-    def _reaction(self, a: Mapping[int, Array]) -> Array:
+    def _normal_force(self, a: Mapping[int, Array]) -> Array:
         if self.normal is None:
             return self.reaction
         return NormalForce(self.reaction, self.normal).at(a)

@@ -61,10 +61,10 @@ class NamedNumber(NamedTuple):
 
     def leaf(self, scene: Scene) -> Array:
         """Return the array that contains the parameter."""
-        found: Any = scene
+        part: Any = scene
         for step in self.path:
-            found = found[step] if isinstance(step, int) else getattr(found, step)
-        return found
+            part = part[step] if isinstance(step, int) else getattr(part, step)
+        return part
 
     def read(self, scene: Scene) -> Array:
         """Return the values (size,), SI."""
@@ -156,9 +156,9 @@ def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
 
 
 def _is_continuous(value: object) -> bool:
-    """True for a floating-point number or an array of them, also if it is traced."""
-    known = isinstance(value, (float, np.generic, np.ndarray, jax.Array))
-    return known and jnp.issubdtype(jnp.result_type(value), jnp.floating)
+    """True for a floating-point number or an array of such numbers, also if it is traced."""
+    is_numeric = isinstance(value, (float, np.generic, np.ndarray, jax.Array))
+    return is_numeric and jnp.issubdtype(jnp.result_type(value), jnp.floating)
 
 
 def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
@@ -200,18 +200,18 @@ def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
     **Raises** `InputError` that names `field`, for a name that the scene does not have, and for the name of a discrete value,
     such as a count.
     """
-    there, field = numbers_of(scene), f"{field}.{name}"
+    named, field = numbers_of(scene), f"{field}.{name}"
     if not isinstance(name, str):
-        raise InputError(field, f"is not the name of a parameter; {suggest_name(str(name), list(there))}")
-    if name in there:
-        return there[name]
+        raise InputError(field, f"is not the name of a parameter; {suggest_name(str(name), list(named))}")
+    if name in named:
+        return named[name]
     array, index = m.groups() if (m := re.fullmatch(r"(.+)\[(\d+)\]", name)) else (name, None)
-    if array in there and index is not None:
-        entries = there[array].single(scene)
+    if array in named and index is not None:
+        entries = named[array].single(scene)
         if entries[0].entry is None or int(index) >= len(entries):
-            raise InputError(field, f"does not exist; {array} has {there[array].size} entries, counted from 0")
+            raise InputError(field, f"does not exist; {array} has {named[array].size} entries, counted from 0")
         return entries[int(index)]
-    raise InputError(field, f"{_why_unnamed(scene, name)}; {suggest_name(name, list(there))}")
+    raise InputError(field, f"{_why_unnamed(scene, name)}; {suggest_name(name, list(named))}")
 
 
 def _why_unnamed(scene: Scene, name: str) -> str:
@@ -233,38 +233,39 @@ def _row_by_row(leaf: Array) -> Array:
     return leaf if leaf.ndim < 2 else jnp.ravel(leaf)
 
 
-def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array | np.ndarray) -> Scene:
-    """Return the scene with `values` (sum of the sizes,), SI, for the parameters `found` in their order."""
+def put_numbers(scene: Scene, parameters: Sequence[NamedNumber], values: Array | np.ndarray) -> Scene:
+    """Return the scene with `values` (sum of the sizes,), SI, for the `parameters` in their order."""
     leaves: dict[_Path, Array] = {}
     start = 0
-    for each in found:
+    for each in parameters:
         leaf, new = jnp.asarray(leaves.get(each.path, each.leaf(scene))), values[start : start + each.size]
         changed = new if each.entry is None else _row_by_row(leaf).at[each.entry].set(new[0])
         leaves[each.path] = jnp.reshape(changed, leaf.shape)
         start += each.size
-    where = {each.path: each for each in found}
-    return eqx.tree_at(lambda s: [each.leaf(s) for each in where.values()], scene, list(leaves.values()))
+    by_path = {each.path: each for each in parameters}
+    return eqx.tree_at(lambda s: [each.leaf(s) for each in by_path.values()], scene, list(leaves.values()))
 
 
-def present_numbers(scene: Scene, found: NamedNumber, field: str) -> tuple[NamedNumber, ...]:
+def present_numbers(scene: Scene, array: NamedNumber, field: str) -> tuple[NamedNumber, ...]:
     """Return the array, or only its entries other than 0 if the array keeps its zeros.
 
     An absent spring or damper is added only if the user names its entry. **Raises** `InputError` that names `field`, for an
     array that keeps its zeros and is 0 in every entry.
     """
-    values = np.asarray(found.leaf(scene))
-    if not found.keeps_zeros(scene) or np.all(values != 0.0):
-        return (found,)
+    values = np.asarray(array.leaf(scene))
+    if not array.keeps_zeros(scene) or np.all(values != 0.0):
+        return (array,)
     if not np.any(values):
-        advice = f"name the entry to add, for example {found.name}[0]"
-        raise InputError(f"{field}.{found.name}", f"is 0 in every entry, and zeros are not changed; {advice}")
-    return tuple(each for each, value in zip(found.single(scene), values, strict=True) if value != 0.0)
+        advice = f"name the entry to add, for example {array.name}[0]"
+        raise InputError(f"{field}.{array.name}", f"is 0 in every entry, and zeros are not changed; {advice}")
+    return tuple(each for each, value in zip(array.single(scene), values, strict=True) if value != 0.0)
 
 
-def put_present(scene: Scene, found: NamedNumber, value: float) -> Scene:
-    """Return the scene with `value` in every entry. Absent springs and dampers stay absent, see `present_numbers`."""
-    now, new = found.read(scene), jnp.full(found.size, value)
-    return put_numbers(scene, (found,), jnp.where(now != 0.0, new, now) if found.keeps_zeros(scene) else new)
+def put_present(scene: Scene, array: NamedNumber, value: float) -> Scene:
+    """Return the scene with `value` in every entry of an array. Absent springs and dampers stay absent, see
+    `present_numbers`."""
+    old, new = array.read(scene), jnp.full(array.size, value)
+    return put_numbers(scene, (array,), jnp.where(old != 0.0, new, old) if array.keeps_zeros(scene) else new)
 
 
 def read_value(name: str, value: Number) -> float:

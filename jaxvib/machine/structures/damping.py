@@ -64,16 +64,16 @@ def _constant(value: Number, field: str, stiffness: Array, mass: Array | None) -
         raise InputError(field, f"is {quoted(value)}; a damping must be at least 0")
     when_known(lambda k: _require_spring(k, field, value), stiffness)
     if loss is not None:
-        found = size * stiffness / number(loss[2], "rad/s", field, low=0.0, open_low=True)
+        constant = size * stiffness / number(loss[2], "rad/s", field, low=0.0, open_low=True)
     else:
         assert ratio is not None
         carried = mass if ratio[2] is None else number(ratio[2], "kg", field, low=0.0, open_low=True)
         if carried is None:
             problem = "the ratio of the critical damping 2 sqrt(k m), which needs the mass m that this spring carries"
             raise InputError(field, f"is {quoted(value)}, {problem}; write for example {quoted(value.strip() + ' of 250 kg')}")
-        found = 0.02 * size * jnp.sqrt(stiffness * carried)
-    known = when_known(float, found)
-    return found if known is None else known
+        constant = 0.02 * size * jnp.sqrt(stiffness * carried)
+    known = when_known(float, constant)
+    return constant if known is None else known
 
 
 def _require_spring(stiffness: float, field: str, value: str) -> None:

@@ -78,14 +78,14 @@ def from_matrices(
         M q'' + (C + n G) q' + K q = forces,        q = Phi r,    K Phi = M Phi diag(w^2),    Phi^T M Phi = 1
 
     A model with more than `reduce` coordinates is reduced to its lowest real normal modes, which are computed without damping
-    and rotation. The coordinates of the machine are then the modal amplitudes r. Displacements, forces and speeds at the
-    places are those of the model; amplitudes of coordinates are not.
+    and rotation. The coordinates of the machine are then the modal amplitudes r, and results for coordinates are values of r.
+    Displacements, forces and speeds at the places are those of the model, except for the contributions of the omitted modes.
 
     **Arguments** (numbers and arrays in SI; nd coordinates of the model, nb directions of the force)
 
     - `mass` M and `stiffness` K (nd, nd), symmetric, M positive definite, K without negative eigenvalues
     - `damping` C (nd, nd)
-    - `gyroscopic` G (nd, nd): G times the rotor speed n times q' is a force; skew-symmetric. None without a rotor
+    - `gyroscopic` G (nd, nd), skew-symmetric: the factor of the rotor speed n in the equation; None without a rotor
     - `places`: a list of points to which exciters can be attached, numbered from 1 in `Exciter(at=)`. Each is a list of the
       indices of its coordinates, [up], [horizontal, up] or [horizontal, up, rotation], or a matrix (1 to 3, nd) that gives its
       displacement from q; all places have the same number of directions
@@ -134,16 +134,16 @@ def _lowest_modes(mass: Array, stiffness: Array, number: int) -> Array:
 def _matrix(value: Any, name: str, shape: tuple[int, int] | None) -> Array:
     """Return a matrix, square if `shape` is None; a number stands for a 1 x 1 matrix."""
     try:
-        found = jnp.asarray(value, dtype=float)
+        matrix = jnp.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError(name, f"is {quoted(value)}; it must be a square array of numbers, in SI units") from error
-    found = found[None, None] if found.ndim == 0 else found
-    if found.ndim != 2 or found.shape != (found.shape[:1] * 2 if shape is None else shape) or found.size == 0:
+    matrix = matrix[None, None] if matrix.ndim == 0 else matrix
+    if matrix.ndim != 2 or matrix.shape != (matrix.shape[:1] * 2 if shape is None else shape) or matrix.size == 0:
         needed = "a square matrix" if shape is None else " x ".join(map(str, shape))
-        raise InputError(name, f"has the shape {found.shape}; {needed} is needed")
-    if when_known(lambda known: bool(np.all(np.isfinite(known))), found) is False:
+        raise InputError(name, f"has the shape {matrix.shape}; {needed} is needed")
+    if when_known(lambda known: bool(np.all(np.isfinite(known))), matrix) is False:
         raise InputError(name, "has an entry that is not finite; finite numbers are needed")
-    return found
+    return matrix
 
 
 def _require_definite(matrix: np.ndarray | float, name: str) -> None:
