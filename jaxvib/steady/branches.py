@@ -75,8 +75,8 @@ class Branches(AbstractJam):
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or number of axes.
         """
         folds = self.folds
-        found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
-        marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
+        existing = np.flatnonzero(np.asarray(folds.exists)).tolist()
+        marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in existing]
         return plot_branch(
             self, marks, unit, most, STABILITY_CRITERION, show, linear, ax, np.asarray(self.mode), np.asarray(self.resonances)
         )
@@ -114,8 +114,8 @@ def branches(
 
         n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 
-    For light loads n(Omega) is explicit (`jam_rotor_speed`). Every point, also of the exact branch, is computed separately,
-    without continuation. Therefore no part of the branch is missed.
+    For light loads n(Omega) is an explicit function (`jam_rotor_speed`). Every point, also of the exact branch, is computed
+    separately, without continuation from a neighbouring point. Therefore no part of the branch is missed.
 
     **Arguments**
 

@@ -51,10 +51,11 @@ ways to compute the torque have a relative rounding error of 1e-12."""
 
 
 _NEGLIGIBLE = 1e-9
-"""Strokes and forces below this fraction of the largest are not shown: they are rounding errors."""
+"""Fraction of the largest stroke or force below which a value is a rounding error and is not shown."""
 
 _LARGEST_TRANSMISSIBILITY = 1e4
-"""Larger ratios of forces are not shown: the loads balance one another, and only a decaying motion is left."""
+"""Largest ratio of forces that is shown. At a larger ratio the loads balance one another, and only a decaying motion is
+left."""
 
 
 def acceleration_of(amplitude: Array, speed: Array | float) -> Array:
@@ -77,8 +78,9 @@ def vibration_zone(
 ) -> str:
     """Return the zone A, B, C or D of ISO 20816-3 of a vibration.
 
-    A: new machines; B: allowed for long operation; C: allowed for a limited time; D: causes damage. The standard is about
-    parts that shall not vibrate, such as motors, frames and foundations. Decks, which shall vibrate, are in zone D.
+    A: new machines; B: allowed for long operation; C: allowed for a limited time; D: can cause damage. The standard is about
+    parts that shall not vibrate, such as motors, frames and foundations. It does not apply to decks, which shall vibrate; their
+    velocities are usually those of zone D.
 
     **Arguments**
 
@@ -178,8 +180,8 @@ class VibrationMeasures(eqx.Module):
     def document(self) -> dict[str, object]:
         """Return all measures by name."""
         named: dict[str, object] = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
-        there = {name: value for name, value in named.items() if value is not None}
-        return there | {"isolation_efficiency": self.isolation_efficiency}
+        present = {name: value for name, value in named.items() if value is not None}
+        return present | {"isolation_efficiency": self.isolation_efficiency}
 
     def summary(self) -> str:
         """Return the measures as text, one line for each coordinate, each support, the isolation, each shaft and each point.
@@ -277,13 +279,13 @@ def vibration_measures(
         motion = _vibration_of(scene, motion.omega, motion.displacement, motion.foundation_force)
     elif isinstance(motion, PhaseJam):
         power = -motion.rotor_speed * jnp.sum(motion.torque)
-        moved = (motion.displacement, motion.amplitude, motion.foundation_force)
-        motion = _vibration_at_phases(scene, motion.omega, motion.phase, *moved, power)
+        vibration = (motion.displacement, motion.amplitude, motion.foundation_force)
+        motion = _vibration_at_phases(scene, motion.omega, motion.phase, *vibration, power)
     elif isinstance(motion, Orbit):
         turning = eqx.tree_at(lambda s: s.drive.speed, scene, motion.rotor_speed)
         first = motion.displacement_harmonics[:, motion.orders.index(1)]
-        moved = (first, motion.amplitude, motion.foundation_force)
-        motion = _vibration_at_phases(turning, motion.omega, motion.offsets, *moved, motion.power)
+        vibration = (first, motion.amplitude, motion.foundation_force)
+        motion = _vibration_at_phases(turning, motion.omega, motion.offsets, *vibration, motion.power)
     return _measures(scene, motion, places if has_list else places[0], known_number(slope, "rad", "slope"))
 
 
@@ -319,7 +321,7 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
     static, dynamic, side = support_loads(model, w, motion.displacement)
     forced = motion.exciter_force > 0.0
     ratio = jnp.where(forced, motion.foundation_force / jnp.where(forced, motion.exciter_force, 1.0), jnp.inf)
-    found = VibrationMeasures(
+    measures = VibrationMeasures(
         speed=motion.speed,
         stroke=2.0 * amplitude,
         acceleration=acceleration_of(amplitude, w),
@@ -334,10 +336,10 @@ def _measures(scene: Scene, motion: Vibration, place: Place | tuple[Place, ...],
         coordinates=tuple(model.carrier.coordinates[k] for k in lengths),
     )
     if scene.machine.places != "plane":
-        return found
-    each = [_measures_at(scene, motion, one, slope) for one in (place if isinstance(place, tuple) else (place,))]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each) if isinstance(place, tuple) else each[0]
-    return dataclasses.replace(found, **stacked)
+        return measures
+    of_points = [_measures_at(scene, motion, point, slope) for point in (place if isinstance(place, tuple) else (place,))]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *of_points) if isinstance(place, tuple) else of_points[0]
+    return dataclasses.replace(measures, **stacked)
 
 
 def _measures_at(scene: Scene, motion: Vibration, place: Place, slope: Array) -> dict[str, Array]:
@@ -364,7 +366,7 @@ def require_platforms(scene: Scene, what: str) -> Platforms:
 
 
 def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array:
-    """Return the mean torque, N m, that light loads in a jam take from the rotor.
+    """Return the mean torque, N m, with which light loads in a jam brake the rotor.
 
     **Arguments**: the load speed `omega`, rad/s, and the complex amplitudes `displacement` (nd,) of the coordinates, m.
     """
@@ -375,9 +377,9 @@ def shaft_torque(model: JammedModel, omega: Array, displacement: Array) -> Array
         torque = torque + friction_on_light_loads(loads, scene.all_effects, omega, n)
     # With strong drag n - Omega has few correct digits. The torque then follows from the dissipation of the carrier, which has
     # all digits.
-    close = n - omega < _MIN_SLIP * n
-    taken = model.dissipated(omega * jnp.where(close, displacement, 0.0))
-    return jnp.where(close, taken / omega, torque)
+    is_close = n - omega < _MIN_SLIP * n
+    power = model.dissipated(omega * jnp.where(is_close, displacement, 0.0))
+    return jnp.where(is_close, power / omega, torque)
 
 
 def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tuple[Array, Array, Array]:
@@ -396,7 +398,8 @@ def support_loads(model: LinearModel, omega: Array, displacement: Array) -> tupl
 
 
 def weight_deflection(model: LinearModel) -> Array | None:
-    """Return the displacement (nd,), m, of all coordinates under the weight of the machine and its loads, positive downward.
+    """Return the static displacements (nd,) of the coordinates under the weight of the machine and its loads, with the
+    opposite sign, m (rad for tilts): positive if the coordinate moves downward.
 
     It is 0 for a platform that no support carries, and None if the directions of the coordinates are unknown.
     """
@@ -408,10 +411,10 @@ def weight_deflection(model: LinearModel) -> Array | None:
     if not isinstance(machine, Platforms):
         return jnp.linalg.solve(stiffness, weight)
     # The stiffness matrix of platforms without supports is singular up to rounding.
-    # Such platforms are attached to the ground here.
+    # Such platforms get a spring to the ground here.
     carried = has_support(machine)
-    held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(up))
-    return jnp.where(carried, jnp.linalg.solve(stiffness + held, weight), 0.0)
+    added = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(up))
+    return jnp.where(carried, jnp.linalg.solve(stiffness + added, weight), 0.0)
 
 
 def static_deflections(scene: Scene) -> Array:

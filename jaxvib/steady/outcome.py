@@ -25,28 +25,30 @@ from jaxvib.units.known import is_known
 REFUSED = "a traced parameter has a value that is not allowed: call the function outside of jit, grad and vmap to see which one"
 """Message of the status `refused`."""
 
-Found = TypeVar("Found", bound=Result)
+SomeResult = TypeVar("SomeResult", bound=Result)
 
 
 def outcome(
-    result: Found,
+    result: SomeResult,
     scene: Scene | None = None,
     end: Array | None = None,
     *,
     throw: bool = False,
     failures: Collection[str] = (),
     hint: Callable[[str], str] = lambda _: "",
-) -> Found:
-    """Return the result of a computation for `scene` up to the time `end`, or raise an error if its status is known and
-    denotes a failure.
+) -> SomeResult:
+    """Return the result of a computation, or raise an error if its status is known and denotes a failure.
 
-    **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: function from the name of a
-    status to the text that is appended to its message.
+    **Arguments**
+
+    - `scene` of the computation, and `end`, the time up to which it was computed, s; None if the result does not depend on it
+    - `throw`: True to raise an error if the name of a known status is among the `failures`
+    - `hint`: function from the name of a status to the text that is appended to its message
 
     **Returns** the result; under a JAX transformation it has the status `refused` and NaN in place of numbers if a parameter
     of the scene has a value that its constructor would reject, such as a negative stiffness, or if `end` is not positive.
 
-    **Raises** `ComputationError`.
+    **Raises** `ComputationError` for a status among the `failures` if `throw` is True.
     """
     is_positive = unknown_is_positive(end)
     if throw and is_known(result.status) and (name := status_name(result.status)) in failures:
@@ -61,14 +63,15 @@ def outcome(
 
 
 def unknown_is_positive(number: Array | None) -> Array | None:
-    """Return a traced Boolean, True if a traced number is finite and positive; None for a number with a known value."""
+    """Return a traced Boolean, True if a traced number is finite and positive; None for a number with a known value or no
+    number."""
     return None if number is None or is_known(number) else jnp.isfinite(number) & (number > 0.0)
 
 
-def without_numbers(allowed: Array, found: Any) -> Any:
-    """Return the tree with NaN and False in place of its numbers unless `allowed`; a scene in it is unchanged."""
+def without_numbers(allowed: Array, tree: Any) -> Any:
+    """Return a tree with NaN and False in place of its numbers if `allowed` is False; a scene in the tree is unchanged."""
 
-    def kept(value: Any) -> Any:
+    def replace(value: Any) -> Any:
         if not isinstance(value, Array):
             return value
         if jnp.issubdtype(value.dtype, jnp.inexact):
@@ -76,4 +79,4 @@ def without_numbers(allowed: Array, found: Any) -> Any:
             return jax.lax.select(allowed, value, jnp.full_like(value, jnp.nan))
         return value & allowed if value.dtype == bool else value
 
-    return jax.tree.map(kept, found, is_leaf=lambda value: isinstance(value, Scene))
+    return jax.tree.map(replace, tree, is_leaf=lambda value: isinstance(value, Scene))

@@ -123,18 +123,19 @@ def ellipse_at(amplitude: Array, speed: Array, slope: Array, remainder: Array) -
     """Return `ellipse_of` for validated values."""
     x, y = amplitude[0], amplitude[1]
     forward, backward = (x + 1j * y) / 2.0, jnp.conj(x - 1j * y) / 2.0
-    one, other = magnitude(forward), magnitude(backward)
-    is_circle = 2.0 * jnp.minimum(one, other) <= _MIN_AXES_DIFFERENCE * (one + other)
+    forward_radius, backward_radius = magnitude(forward), magnitude(backward)
+    long, short = forward_radius + backward_radius, forward_radius - backward_radius
+    is_circle = 2.0 * jnp.minimum(forward_radius, backward_radius) <= _MIN_AXES_DIFFERENCE * long
     product = jnp.where(is_circle, 1.0, forward * backward)
     normal = magnitude(-jnp.sin(slope) * x + jnp.cos(slope) * y)
     factor = speed**2 / STANDARD_GRAVITY
     return Ellipse(
-        semi_major=one + other,
-        semi_minor=one - other,
+        semi_major=long,
+        semi_minor=short,
         direction=0.5 * jnp.arctan2(product.imag, product.real),
-        acceleration=factor * (one + other),
+        acceleration=factor * long,
         throw_number=factor * normal / jnp.cos(slope),
-        remainder=jnp.asarray(remainder, one.dtype),
+        remainder=jnp.asarray(remainder, long.dtype),
     )
 
 
@@ -169,8 +170,8 @@ class Deck(Result):
     def direction_spread(self) -> Array:
         """Range of the directions of the long axes about their mean direction, rad; opposite directions count as equal."""
         turn = jnp.exp(2j * self.ellipses.direction)
-        away = 0.5 * jnp.angle(turn / jnp.mean(turn))
-        return jnp.max(away) - jnp.min(away)
+        difference = 0.5 * jnp.angle(turn / jnp.mean(turn))
+        return jnp.max(difference) - jnp.min(difference)
 
     def summary(self) -> str:
         """Return a line for each point, and the spread."""
@@ -284,16 +285,16 @@ def _deck(motion: Harmonic, points: Array, slope: Array, body: int) -> Deck:
     rows = jnp.stack([rows_in_plane(motion.machine, on_body(point, body), "points") for point in points])
     amplitude, ellipses = jax.vmap(lambda each: _at_rows(motion, each, slope))(rows)
     mean = jnp.mean(amplitude, axis=0, keepdims=True)
-    away = jnp.mean(jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1)) / jnp.sum(jnp.abs(mean) ** 2)
-    # The root has no derivative at 0; there it is set to 0.
-    is_straight = away == 0.0
-    spread = jnp.where(is_straight, 0.0, jnp.sqrt(jnp.where(is_straight, 1.0, away)))
+    variance = jnp.mean(jnp.sum(jnp.abs(amplitude - mean) ** 2, axis=1)) / jnp.sum(jnp.abs(mean) ** 2)
+    # The root has no derivative at 0, where all points have the same motion; the derivative is set to 0 there.
+    is_equal = variance == 0.0
+    spread = jnp.where(is_equal, 0.0, jnp.sqrt(jnp.where(is_equal, 1.0, variance)))
     return Deck(points, amplitude, ellipses, spread)
 
 
 def _at_rows(motion: Harmonic, rows: Array, slope: Array) -> tuple[Array, Ellipse]:
     """Return the complex amplitudes (2,) and the ellipse of the point with these rows."""
     amplitude = rows @ motion.amplitude
-    on = 0.5 * jnp.sum(jnp.abs(amplitude) ** 2)
-    off = jnp.zeros_like(on) if motion.rest is None else jnp.sum((rows @ motion.rest) * rows)
-    return amplitude, ellipse_at(amplitude, motion.speed, slope, jnp.sqrt(off / on))
+    on_ellipse = 0.5 * jnp.sum(jnp.abs(amplitude) ** 2)
+    off_ellipse = jnp.zeros_like(on_ellipse) if motion.rest is None else jnp.sum((rows @ motion.rest) * rows)
+    return amplitude, ellipse_at(amplitude, motion.speed, slope, jnp.sqrt(off_ellipse / on_ellipse))

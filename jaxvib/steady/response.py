@@ -52,8 +52,8 @@ class AbstractResponse(eqx.Module):
     **Attributes** (nd coordinates, of which nt are displacements in m)
 
     - `speed` w, rad/s
-    - `displacement` (nd,): complex amplitudes, m or rad; at w t = 0 an unbalance with the phase 0 points in the direction x, or
-      is at the angle 0 for machines that move only up and down
+    - `displacement` (nd,): complex amplitudes, m or rad; at w t = 0 an unbalance with the phase 0 is at the angle 0, which is
+      the horizontal direction
     - `amplitude` (nd,), zero to peak, and `phase` (nd,) rad: moduli and arguments of `displacement`
     - `acceleration` (nt,), in g, and `velocity` (nt,), m/s root mean square, of the coordinates in m
     - `exciter_force` and `foundation_force`, N zero to peak: resultant of the centrifugal forces, and force on the foundation;
@@ -61,7 +61,7 @@ class AbstractResponse(eqx.Module):
     - `transmissibility`: `foundation_force` divided by `exciter_force`; inf if the centrifugal forces cancel
     - `torque` (exciter,), N m: mean torque that each rotor needs to sustain the vibration; `power` (exciter,), W
     - `motor_torque` (exciter,), N m: torque of each motor at this speed. That of an ideal drive is equal to `torque`, plus an
-      equal share of what the motors of other exciters lack
+      equal share of the torque that the motors of other exciters lack
     - `torque_share`: the sum of `torque` divided by that of `motor_torque`
 
     Values at an undamped resonance are infinite.
@@ -226,14 +226,14 @@ def response(
 ) -> Response:
     """Return the response of a machine to the unbalances of its exciters over their speed, and the torque that it needs.
 
-        Y = w^2 D(w)^-1 f,    f = sum_k S_k exp(i alpha_k) B_k^T e_k,    D = K - w^2 M + i w (C + w G)
+        Y = w^2 D(w)^-1 f,    f = sum_k S_k exp(i alpha_k) B_k^T e_k,    D = K - w^2 M + i w (C + sigma w G)
         torque of exciter k = -(S_k/2) Im(exp(-i alpha_k) e_k^H B_k w^2 Y)
 
-    S, alpha, e, B: see `synchronous_regimes`. The curve of the torque over the speed has a peak at each resonance (Sommerfeld
-    effect). A motor turns at the speeds at which its torque equals that of the curve, `operating`. If the torque of the motor
-    changes, operating points appear and merge at the `folds` of the curve. The phases of several exciters are fixed, by gears
-    or a common shaft: their torques are added, and they turn as one rotor with the sum of their inertias. For motors without
-    gears use `synchronous_regimes`.
+    S, alpha, e and B are defined in `synchronous_regimes`; sigma is the mean of the directions of rotation (+1 or -1). The
+    curve of the torque over the speed has a peak at each resonance (Sommerfeld effect). A motor can turn at the speeds at which
+    its torque equals that of the curve, `operating`. If the torque of the motor changes, operating points appear and merge at
+    the `folds` of the curve. The phases of several exciters are fixed, by gears or a common shaft: their torques are added, and
+    they turn as one rotor with the sum of their inertias. For motors without gears use `synchronous_regimes`.
 
     **Arguments**
 
@@ -242,8 +242,8 @@ def response(
     - `speeds`, rad/s, one or a list; typical: 100 to 1000 values; default: `points` from 0 to `most`, denser near resonances
     - `phases` (exciter,), rad or text, of the unbalances in their directions of rotation, which do not change with the speed;
       default: 0
-    - `points`: typical: 200 to 2000 (default: 500), and `most`, rad/s or text: number and highest of the default speeds;
-      default: 4/3 of the working speed
+    - `points`: number of the default speeds; typical: 200 to 2000 (default: 500)
+    - `most`: highest of the default speeds, rad/s or text; default: 4/3 of the working speed
 
     **Returns** `Response`. Derivatives with respect to all parameters of the scene are exact, except for `growth`, `stable` and
     `lands_at`, which have none. An undamped resonance has the status `unbounded` and infinite values.
@@ -372,7 +372,7 @@ def operation_of(model: UnbalancedModel) -> tuple[OperatingPoints, TorqueFolds]:
 
 
 def _balanced_speeds(model: UnbalancedModel, pieces: Pieces) -> tuple[Array, Array]:
-    """Return the speed on each piece of the curve at which the motor supplies the required torque, and if it exists."""
+    """Return the speed on each piece of the curve at which the motor supplies the required torque, and True if it exists."""
     top = model.shaft.speed
     # The torque of the motor vanishes at the end of the last piece, whose root can be closer to it than the end of the grid.
     high = jax.lax.stop_gradient(jnp.where(pieces.high < pieces.high[-1], pieces.high, top))
@@ -397,8 +397,11 @@ def _scanned_gap(model: UnbalancedModel, omega: Array) -> Array:
 
 
 def _landing_speeds(model: UnbalancedModel, pieces: Pieces) -> Array:
-    """Return the speed to which the rotor jumps from each fold, (2 nd,) rad/s: the nearest one on a rising piece that has the
-    same share of the torque, above a maximum or below a minimum; NaN if there is none."""
+    """Return the speed to which the rotor jumps from each fold, (2 nd,) rad/s.
+
+    It is the nearest speed on a rising piece with the same share of the torque, above a maximum or below a minimum. It is NaN
+    if there is no such speed.
+    """
     number = np.arange(pieces.low.shape[0])
     rising = (number % 2 == 0) & (pieces.high > pieces.low)
 
@@ -420,7 +423,7 @@ def _landing_speeds(model: UnbalancedModel, pieces: Pieces) -> Array:
 
 
 def _operating_points(model: UnbalancedModel, speed: Array, exists: Array) -> OperatingPoints:
-    """Return the operating points at speeds, rad/s, of which those `exists` are True."""
+    """Return the operating points at the speeds, rad/s, for which `exists` is True."""
     order = jnp.argsort(jnp.where(exists, speed, jnp.inf))
     speed, exists = speed[order], exists[order]
     safe = jnp.where(exists, speed, model.shaft.speed)
@@ -428,12 +431,12 @@ def _operating_points(model: UnbalancedModel, speed: Array, exists: Array) -> Op
     frozen, at = jax.lax.stop_gradient((model.shaft, safe))
     growth = jax.vmap(lambda w: regime_growth(frozen, w, jnp.zeros(1, w.dtype), 0))(at) if at.size else at
 
-    def kept(value: Array) -> Array:
+    def nan_if_absent(value: Array) -> Array:
         return jnp.where(exists.reshape(exists.shape + (1,) * (value.ndim - 1)), value, jnp.nan)
 
     return OperatingPoints(
-        **{name: kept(value) for name, value in fields.items()},
+        **{name: nan_if_absent(value) for name, value in fields.items()},
         exists=exists,
-        growth=kept(growth),
+        growth=nan_if_absent(growth),
         stable=exists & decays(growth, at),
     )

@@ -26,9 +26,9 @@ class ModeShapes(Result):
     **Attributes**
 
     - `frequency` (nd,), rad/s
-    - `shape` (nd, nd), a row for each mode: the amplitude of each coordinate relative to the largest, tilts in rad times their
-      `lever`
-    - `lever` (nd,), m: for a tilt its radius of gyration, for a displacement 1
+    - `shape` (nd, nd), a row for each mode: the amplitude of each coordinate, divided by the largest one; a tilt (rad) is
+      multiplied by its `lever`
+    - `lever` (nd,): for a tilt its radius of gyration, m, for a displacement 1
     - `coordinates` (nd,): their names
     """
 
@@ -93,5 +93,5 @@ def _mode_shapes(scene: Scene) -> ModeShapes:
     rows = vectors.T * lever[None, :]
     # The largest amplitude is 1; if several are equal, the first one counts.
     size = jnp.abs(rows)
-    place = jnp.argmax(size > (1.0 - 1e-6) * jnp.max(size, axis=1, keepdims=True), axis=1)
-    return ModeShapes(frequency, rows / jnp.take_along_axis(rows, place[:, None], axis=1), lever, model.carrier.coordinates)
+    largest = jnp.argmax(size > (1.0 - 1e-6) * jnp.max(size, axis=1, keepdims=True), axis=1)
+    return ModeShapes(frequency, rows / jnp.take_along_axis(rows, largest[:, None], axis=1), lever, model.carrier.coordinates)

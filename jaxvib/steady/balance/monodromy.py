@@ -104,8 +104,8 @@ def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | 
     **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor so slow that the allowed steps do
     not resolve a vibration of the carrier that outlasts the turn; the method would damp it.
     """
-    asked, most = np.asarray(speeds), 0.1 * float(np.finfo(float_dtype()).max) ** 0.5
-    wrong = asked[~((asked > 0.0) & (asked < most))]
+    values, most = np.asarray(speeds), 0.1 * float(np.finfo(float_dtype()).max) ** 0.5
+    wrong = values[~((values > 0.0) & (values < most))]
     if wrong.size:
         raise InputError("speeds", f"contain {wrong[0]:g} rad/s; they must be greater than 0 and below {most:.1e}")
     if steps is not None:
@@ -123,7 +123,8 @@ def validate_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | 
 
 @cached
 def _slowest_decay(scene: Scene) -> tuple[Array, Array]:
-    """Return the slowest decay of vibrations of the carrier, 1/s, at the scene's rotor speed, and the steps in a turn."""
+    """Return the slowest decay of vibrations of the carrier, 1/s, at the scene's rotor speed, and the number of steps in a
+    turn."""
     model = linear_model(scene)
     nd = model.mass.shape[0]
     solved = jnp.linalg.solve(

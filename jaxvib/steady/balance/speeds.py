@@ -58,13 +58,14 @@ class CharacteristicSpeeds(Result):
 
     @property
     def status(self) -> CriterionStatus:
-        """Outcome, a `CriterionStatus`: whether supports resist every motion, and whether the computation succeeded.
+        """Outcome of the criterion, a `CriterionStatus`.
 
         Every machine has a first resonance, with damping and without, and finite shapes; other speeds may be absent.
         """
-        there = jnp.isfinite(self.resonances[0]) & jnp.isfinite(self.damped_resonances[0]) & jnp.all(jnp.isfinite(self.shapes))
+        resonances = jnp.stack([self.resonances[0], self.damped_resonances[0]])
+        is_finite = jnp.all(jnp.isfinite(resonances)) & jnp.all(jnp.isfinite(self.shapes))
         status = CriterionStatus.where(self.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.decided)
-        return CriterionStatus.where(there, status, CriterionStatus.not_finite)
+        return CriterionStatus.where(is_finite, status, CriterionStatus.not_finite)
 
     def labelled(self, *, damped: bool = False) -> list[tuple[str, float]]:
         """Return all speeds with their labels ("resonance 1", "additional 1", ...), ascending."""
@@ -139,8 +140,8 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     trace of A. Without damping, its poles are the eigenvalues of K y = w^2 (M_S - i G) y, and its zeros are those of the same
     problem on b^H y = 0 (the mount fixed); poles and zeros interlace. With damping, its sign changes are bracketed on a grid
     between the lowest and the highest undamped resonance: outside this range damping cannot change the sign, because
-    Re(b^H D^-1 b) = y^H (K - w^2 M_S) y, where D is the matrix in brackets and y = D^-1 b. A damper between the exciter's
-    platform and the foundation changes none of these speeds, because it adds only to the imaginary part of 1/A.
+    Re(b^H D^-1 b) = y^H (K - w^2 (M_S - i G)) y, where D is the matrix in brackets and y = D^-1 b. A damper between the
+    exciter's platform and the foundation changes none of these speeds, because it adds only to the imaginary part of 1/A.
 
     **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every parameter of the scene,
     forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).
@@ -163,10 +164,10 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     """
     scene = validate_scene(scene)
     require_one_point(scene)
-    found, *parts = _characteristic_speeds(scene)
+    speeds, *parts = _characteristic_speeds(scene)
     when_known(partial(_require_mount_that_moves, scene), *parts)
     allowed = allowed_unknowns(scene)
-    return found if allowed is None else jax.tree.map(lambda x: jnp.where(allowed, x, jnp.nan), found)
+    return speeds if allowed is None else jax.tree.map(lambda x: jnp.where(allowed, x, jnp.nan), speeds)
 
 
 @cached
@@ -188,8 +189,8 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
         resonances, additional = _inverse_root(values)[::-1], _inverse_root(fixed)[::-1]
         shapes = inverse.T @ vectors[:, ::-1] * jnp.where(jnp.isnan(resonances), 0.0, resonances)[None, :]
     changes = _sign_changes(model, direction, resonances, additional, shapes)
-    found = CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
-    return found, model.mount.rows[0], carrier.stiffness, model.mass
+    speeds = CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
+    return speeds, model.mount.rows[0], carrier.stiffness, model.mass
 
 
 def _direction(model: LinearModel) -> Array:
@@ -223,8 +224,8 @@ def _require_mount_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndar
 
 
 def _inverse_root(values: Array) -> Array:
-    there = values > 0.0
-    return jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.nan)
+    is_positive = values > 0.0
+    return jnp.where(is_positive, 1.0 / jnp.sqrt(jnp.where(is_positive, values, 1.0)), jnp.nan)
 
 
 def _free_and_fixed_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
@@ -292,7 +293,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
     passed = jnp.cumsum(positive[1:] != positive[:-1])
     order = jnp.arange(2 * resonances.shape[0] - 1)
     cell = jnp.minimum(jnp.sum(passed[None, :] <= order[:, None], axis=1), passed.shape[0] - 1)
-    found = order < passed[-1]
+    exists = order < passed[-1]
 
     def refine(low: Array, high: Array) -> Array:
         polish = None if modal is None else modal.is_rough
@@ -300,4 +301,4 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
 
     roots = jax.vmap(refine)(grid[cell], grid[cell + 1])
     roots = jnp.where((order == 0) & (grid[0] == 0.0), 0.0, roots)
-    return jnp.where(found, roots, jnp.nan)
+    return jnp.where(exists, roots, jnp.nan)

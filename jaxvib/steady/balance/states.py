@@ -244,11 +244,11 @@ def _arrangements(loads: np.ndarray, imbalance: complex, *, ordered: bool) -> _A
         return _Arrangements("alone" if sides.size == 1 else "outweighed", np.zeros((0, n)), 0, [], ())
     if largest > rest - rounding:
         # All loads are on one line, the largest opposite all others.
-        one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
+        directions = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
     else:
-        one = _inscribed_polygon(sides) * np.array([[1.0], [-1.0]])
+        directions = _inscribed_polygon(sides) * np.array([[1.0], [-1.0]])
     fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
-    angles = np.mod(one - one[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
+    angles = np.mod(directions - directions[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
     if ordered:
         angles = angles[:, :1] + np.cumsum(np.mod(np.diff(angles, axis=1, prepend=angles[:, :1]), 2.0 * np.pi), axis=1)
         angles = angles[angles[:, -1] - angles[:, 0] < 2.0 * np.pi]

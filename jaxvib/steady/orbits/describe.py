@@ -195,14 +195,14 @@ def plot_period(
     length, factor = length_unit(motion[:, np.asarray(units) == "m"])
     shown, factors = {"m": length, "rad": "mrad"}, {"m": factor, "rad": 1e3}
     labels = [f"{name}, {shown[unit]}" if len(set(units)) > 1 else name for name, unit in zip(names, units, strict=True)]
-    several = [f"{one} {k + 1}" for k in range(turned.shape[1])]
+    numbered = [f"{one} {k + 1}" for k in range(turned.shape[1])]
     panels = [
         (
             f"displacement, {' or '.join(shown[unit] for unit in dict.fromkeys(units))}",
             motion * [factors[unit] for unit in units],
             labels,
         ),
-        (title, turned, several if len(several) > 1 else [alone]),
+        (title, turned, numbered if len(numbered) > 1 else [alone]),
         ("foundation force, N", forces, ["across", "up"][-forces.shape[1] :]),
     ]
     return signals_chart(np.rad2deg(theta), panels, x_label="load angle Ωt, degrees", ax=ax)
@@ -247,8 +247,12 @@ def orbits(
 ) -> tuple[Orbit, Floquet]:
     """Solve for several exact jams of one machine.
 
-    **Arguments** (P jams, G bodies of loads, M points of the grid): `value` (P,): the given speed of each; `start` (P,):
-    initial values of the other speed; `deviation` (P, G, M): initial psi; `steps`, `implicit`, `max_steps`: see `floquet`.
+    **Arguments** (P jams, G bodies of loads, M points of the grid)
+
+    - `value` (P,), rad/s: the prescribed speed of each jam, the load speed or the rotor speed as `given` states
+    - `start` (P,), rad/s: initial values of the other speed; `deviation` (P, G, M), rad: initial psi
+    - `points`: number of collocation points; `accuracy`: largest error of a motion with the status `found`
+    - `steps`, `implicit`, `max_steps`: see `floquet`
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`.
     """
@@ -320,23 +324,25 @@ def _multipliers_of(growth: Floquet, grid: Grid) -> tuple[Array, Array, Array]:
 
 
 def _status(met: Array, separates: Array, flat: Array, resolved: Array, accurate: Array) -> OrbitStatus:
-    """Return the status of one motion, the first that applies: equations not met, loads that separate, a fold, stability not
-    resolved, error above the accuracy."""
-    known = OrbitStatus.where(accurate, OrbitStatus.found, OrbitStatus.under_resolved)
-    known = OrbitStatus.where(resolved, known, OrbitStatus.unresolved)
-    known = OrbitStatus.where(flat, OrbitStatus.at_fold, known)
-    known = OrbitStatus.where(separates, OrbitStatus.would_separate, known)
-    return OrbitStatus.where(met, known, OrbitStatus.not_converged)
+    """Return the status of one motion, the first that applies: equations not satisfied, loads that separate, a fold, stability
+    not resolved, error above the accuracy."""
+    status = OrbitStatus.where(accurate, OrbitStatus.found, OrbitStatus.under_resolved)
+    status = OrbitStatus.where(resolved, status, OrbitStatus.unresolved)
+    status = OrbitStatus.where(flat, OrbitStatus.at_fold, status)
+    status = OrbitStatus.where(separates, OrbitStatus.would_separate, status)
+    return OrbitStatus.where(met, status, OrbitStatus.not_converged)
 
 
 def differentiable_fields(
     model: JammedBodies, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
-    """Return fields of one orbit from its known motion, with derivatives. The fields are equal to those of `orbits` for the
-    same arguments, or 0 if these are NaN."""
-    grid, there = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
-    x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
-    deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
+    """Return fields of one orbit from its known motion, with derivatives.
+
+    The fields are equal to those of `orbits` for the same arguments, or 0 if those are NaN.
+    """
+    grid, exists = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
+    x = jnp.where(exists, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
+    deviation = synthesized(jnp.where(exists, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
     motion = periodic_motion(model, grid, given, value, x, deviation, is_known=True)
     harmonics, (slope, _, _, _, amplitude, force, power, _) = _all_quantities(model, grid, motion)
     fields = {
@@ -350,7 +356,7 @@ def differentiable_fields(
         "displacement_harmonics": harmonics.displacement,
         "force_harmonics": harmonics.force,
     }
-    return {name: jnp.where(there, field, 0.0) for name, field in fields.items()}
+    return {name: jnp.where(exists, field, 0.0) for name, field in fields.items()}
 
 
 def _all_quantities(model: JammedBodies, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
@@ -383,7 +389,7 @@ def _motion_quantities(
 
 
 def _least_contact_torque(model: JammedBodies, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
-    """Return the smallest mean torque over a period, N m, with which a load pushes the next one; the loads lie side by side.
+    """Return the smallest mean torque over a period, N m, with which a load pushes the next one, for loads side by side.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, and the loads up to j need the sum of these. The criterion is
     the mean, because no vibration of a jam presses the loads together at every instant.

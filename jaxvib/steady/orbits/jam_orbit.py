@@ -72,10 +72,11 @@ def jam_orbit(
 
     - Loads that have equal parameters are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
       arcsin(r/R)) / (r/R); if their mean contact force over a period would be tensile, the status is `would_separate`)
-    - Loads that differ have a psi_j each: they lie next to each other in the order that their torques require
-    - The torque is that of drag, gravity and dry friction, whose normal force depends on the acceleration a of the mount. If
-      friction can hold the loads on the rotor, they stick and slip. No number of harmonics resolves this motion, and the
-      status shows it
+    - Loads that differ have a deviation psi_j each. The differences of the means of psi_j are the angles between the loads,
+      which their torques require; the mean over all loads is 0
+    - The torque is that of drag, gravity and dry friction; the normal force of the friction depends on the acceleration a of
+      the mount. If friction can hold the loads on the rotor, they stick and slip. No number of harmonics resolves this motion;
+      its status is then `under_resolved` or `not_converged`
 
     **Arguments**: `scene`; one of `mode`, `omega` and `near`; and the other arguments
 
@@ -222,7 +223,8 @@ def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
 
 
 def _solve_accurately(plan: OrbitPlan) -> Orbit:
-    """Return the first orbit that is accurate enough, or the best one, because more points only add rounding near a fold."""
+    """Return the first orbit that is accurate enough; otherwise the one with the smallest error, because near a fold more
+    points only add rounding errors."""
     best, least = None, math.inf
     for points in plan.points:
         orbit = _solve_program(plan.problem, points, None)
@@ -237,10 +239,10 @@ def _solve_accurately(plan: OrbitPlan) -> Orbit:
 
 def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
     """Return the plan that starts from the mode in a search of the whole branch."""
-    found, start = exact_mode_speeds(plan.problem.scene).get(mode), plan.problem.start
-    start = start if found is None else jnp.asarray(found, dtype=start.dtype)
+    speed, start = exact_mode_speeds(plan.problem.scene).get(mode), plan.problem.start
+    start = start if speed is None else jnp.asarray(speed, dtype=start.dtype)
     return plan._replace(
-        problem=plan.problem._replace(exists=jnp.asarray(found is not None), start=start, is_start_solved=True)
+        problem=plan.problem._replace(exists=jnp.asarray(speed is not None), start=start, is_start_solved=True)
     )
 
 
@@ -263,14 +265,14 @@ def _solve_program(problem: JamProblem, points: int, max_steps: int | None) -> O
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
     speeds = (value, start) if given == "omega" else (start, value)
-    enough = steps_for(model, *speeds, implicit=implicit)
-    many = jnp.reshape(value, (1,)), jnp.reshape(start, (1,))
-    batch, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit, max_steps=max_steps)
+    steps = steps_for(model, *speeds, implicit=implicit)
+    batch_of_one = jnp.reshape(value, (1,)), jnp.reshape(start, (1,))
+    batch, _ = orbits(model, *batch_of_one, given, points, steps, accuracy, deviation, implicit=implicit, max_steps=max_steps)
     orbit = jax.tree.map(lambda leaf: leaf[0], batch)
     # Odd modes lie on rising pieces of the branch, even modes on falling pieces.
-    there = exists
+    is_mode = exists
     if direction is not None:
-        there = exists & (~(orbit.slope * direction < 0.0) | (orbit.status == OrbitStatus.at_fold))
-    orbit = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan) if eqx.is_inexact_array(x) else x, orbit)
-    status, stable = OrbitStatus.where(there, orbit.status, OrbitStatus.absent), there & orbit.stable
+        is_mode = exists & (~(orbit.slope * direction < 0.0) | (orbit.status == OrbitStatus.at_fold))
+    orbit = jax.tree.map(lambda x: jnp.where(is_mode, x, jnp.nan) if eqx.is_inexact_array(x) else x, orbit)
+    status, stable = OrbitStatus.where(is_mode, orbit.status, OrbitStatus.absent), is_mode & orbit.stable
     return eqx.tree_at(lambda o: (o.status, o.stable), orbit, (status, stable))

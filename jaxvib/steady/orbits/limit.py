@@ -51,7 +51,7 @@ class LimitStatus(eqx.Enumeration):
     """Outcomes of a search for the limit of synchronization. The value of each member is the message shown to the user."""
 
     found = "the motion ends at this fold and does not exist beyond it"
-    not_found = "no fold was found in this direction: the motion could not be followed to one"
+    not_found = "no fold was found in this direction: the motion could not be followed to a fold"
 
 
 class SynchronizationLimit(Result):
@@ -155,8 +155,8 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
             speed = np.asarray(unit * (1.0 + _SPEED_PER_STEP * along), speed.dtype)
         else:
             phases[exciter] = along
-        found = map(np.asarray, _branch_point(scene, over, point.value, speed, phases, exciter, points))
-        new = _Point(*found, along=np.asarray(along))
+        solution = map(np.asarray, _branch_point(scene, over, point.value, speed, phases, exciter, points))
+        new = _Point(*solution, along=np.asarray(along))
         return new if exciter is not None else new._replace(slope=new.slope * unit * _SPEED_PER_STEP)
 
     first = at(near, 0.0 if exciter is None else float(near.phases[exciter]))
@@ -177,8 +177,17 @@ def synchronization_limit(scene: Scene, regime: HasSpeedAndPhases, *, over: str)
 
 
 class _Point(NamedTuple):
-    """Point of a branch: `value` of the parameter, `speed` and `phases` (N,) of the motion; `slope` of the value over the
-    coordinate `along` the branch; `is_met`: True if the equations are satisfied."""
+    """Point of a branch.
+
+    **Attributes**
+
+    - `value` of the parameter
+    - `speed`, rad/s, and `phases` (N,), rad, of the motion
+    - `slope`: derivative of the value by the coordinate along the branch
+    - `is_met`: True if the equations are satisfied
+    - `along`: coordinate along the branch, the phase of one exciter, rad, or the change of the speed in units of
+      `_SPEED_PER_STEP`
+    """
 
     value: np.ndarray
     speed: np.ndarray
@@ -198,12 +207,12 @@ def _fold(at: Callable[[_Point, float], _Point], first: _Point, towards: float) 
             continue
         points.append(new)
         if float(new.slope) * float(first.slope) < 0.0:
-            return _refined(at, here, new), points
+            return _refine_fold(at, here, new), points
         here = new
     return None, points
 
 
-def _refined(at: Callable[[_Point, float], _Point], a: _Point, b: _Point) -> _Point | None:
+def _refine_fold(at: Callable[[_Point, float], _Point], a: _Point, b: _Point) -> _Point | None:
     """Return the point between two others at which the slope is zero, by the Illinois method."""
     x, y = [float(p.along) for p in (a, b)], [float(p.slope) for p in (a, b)]
     for _ in range(30):
@@ -254,13 +263,13 @@ def _branch_point(
         pin[nd + sum(counts[:exciter])] = 1.0 / grid.theta.size
 
     def equations(x: Array, w: Array, share: Array) -> tuple[Array, Array, Array]:
-        found = collocation(scene_at(share), grid, x, w, forced=forced)
+        system = collocation(scene_at(share), grid, x, w, forced=forced)
         by_value = jax.jvp(lambda s: residual_of(scene_at(s), grid, x, w), (share,), (jnp.ones_like(share),))[1]
-        rest = found.matrix.shape[0] - size
+        rest = system.matrix.shape[0] - size
         column = jnp.concatenate([by_value.ravel(), jnp.zeros(rest)])[:, None]
         row = jnp.asarray(np.concatenate([pin.ravel(), [0.0 if exciter is not None else 1.0] * rest, [0.0]]))[None]
-        matrix = jnp.concatenate([jnp.concatenate([found.matrix, column], axis=1), row])
-        return found.residual, found.scale, matrix
+        matrix = jnp.concatenate([jnp.concatenate([system.matrix, column], axis=1), row])
+        return system.residual, system.scale, matrix
 
     def linearize(x: Array, w: Array, share: Array) -> Linearized:
         residual, scale, matrix = equations(x, w, share)

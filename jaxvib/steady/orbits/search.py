@@ -70,10 +70,11 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     return found
 
 
-def _ends_before(scene: Scene, low: float, high: float, target: float, looks: int = 2) -> bool:
+def _ends_before(scene: Scene, low: float, high: float, target: float, refinements: int = 2) -> bool:
     """Return True if the exact branch has a fold between two load speeds, before it reaches the rotor speed `target`.
 
-    The fold is bracketed in smaller and smaller intervals; the zero of the slope locates it to rounding.
+    The fold is bracketed `refinements` times in smaller and smaller intervals; the zero of the slope then locates it to
+    rounding.
     """
     omega = np.linspace(low, high, _BRANCH_POINTS)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
@@ -81,9 +82,9 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, looks: in
     if turns.size != 1:
         return False
     ends = slice(turns[0], turns[0] + 2)
-    if looks > 1:
+    if refinements > 1:
         low, high = (float(w) for w in omega[ends])
-        return _ends_before(scene, low, high, target, looks - 1)
+        return _ends_before(scene, low, high, target, refinements - 1)
     rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     fold = _interpolated(omega[ends], speed[ends], slope[ends])[1]
     return bool(np.max(fold) < target * (1.0 - rounding) if slope[turns[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
@@ -99,15 +100,17 @@ def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.n
 
 @cached
 def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
-    """Return rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN without
-    a jam."""
+    """Return rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, points), rad/s.
+
+    The values are NaN at load speeds without a jam.
+    """
     model = jammed_bodies(jammed_model(scene))
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 
     def one(w: Array) -> tuple[Array, Array]:
         motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
         branch = branch_tangent(model, grid, motion)
-        there = branch.residual < 4096.0 * jnp.finfo(w.dtype).eps
-        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(there, branch.slope, jnp.nan)
+        is_met = branch.residual < 4096.0 * jnp.finfo(w.dtype).eps
+        return jnp.where(is_met, motion.rotor_speed, jnp.nan), jnp.where(is_met, branch.slope, jnp.nan)
 
     return jax.lax.map(jax.vmap(one), omega)

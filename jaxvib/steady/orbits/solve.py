@@ -19,10 +19,13 @@ Parameter = Literal["omega", "rotor_speed"]
 
 
 def unbalance_response(model: JammedBodies, omega: Array, speed: Array, orders: np.ndarray) -> Array:
-    """Return the response of the carrier to unbalance: its k-th harmonic per harmonic of sum_g S_g e(phi_g), (K, nd, p) for p
-    directions.
+    """Return the response of the carrier to unbalance, (K, nd, p) for a mount with p directions.
 
-    X_k = D(k w)^-1 B^T k^2 w^2,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
+        X_k = D(k Omega)^-1 B^T k^2 Omega^2,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
+
+    X_k is the k-th harmonic of the displacement per k-th harmonic of sum_g S_g e(phi_g), 1/kg.
+
+    **Arguments**: load speed `omega` and rotor `speed`, rad/s; `orders` k (K,).
     """
     port = model.linear.mount.rows[0].T.astype(complex)
 
@@ -136,7 +139,7 @@ def periodic_motion(
     - `value`: the given speed, rad/s
     - `start`: initial value of the unknown speed, rad/s
     - `deviation`: initial psi (G, M); default 0
-    - `is_known`: if True, the initial values are the solution and no steps are taken
+    - `is_known`: True if the initial values are the solution; Newton's method is then omitted
 
     Newton steps are shortened until they reduce the residuals. Derivatives with respect to `value` and every parameter of the
     scene, of any order, follow from the implicit function theorem.
@@ -218,21 +221,26 @@ def _linearize(
         port_response, by_x = known, jnp.zeros_like(known)
 
     def residual(z: Array, port_response: Array) -> tuple[Array, _Balance]:
-        found = _balance(model, grid, port_response, deviation, *_speed_pair(given, value, z))
-        return found.residual.ravel(), found
+        balance = _balance(model, grid, port_response, deviation, *_speed_pair(given, value, z))
+        return balance.residual.ravel(), balance
 
-    at, column, found = jax.jvp(residual, (x, port_response), (jnp.ones_like(x), by_x), has_aux=True)
-    matrix = _jacobian(model, grid, port_response, found, deviation, *_speed_pair(given, value, x))
-    return jnp.append(at, jnp.mean(deviation)), _bordered(matrix, column), found.scale
+    residuals, column, balance = jax.jvp(residual, (x, port_response), (jnp.ones_like(x), by_x), has_aux=True)
+    matrix = _jacobian(model, grid, port_response, balance, deviation, *_speed_pair(given, value, x))
+    return jnp.append(residuals, jnp.mean(deviation)), _bordered(matrix, column), balance.scale
 
 
 class BranchTangent(NamedTuple):
     """Tangent of a branch and errors of a point on it.
 
-    **Attributes**: `slope` dn/dOmega; `residual` of the torque balance at the points, relative to its torques; `speed_error`:
-    estimated relative error of the rotor speed at this load speed, due to the number of points; `deviation_error`: that of psi,
-    rad; `response` (K, nd, p): `unbalance_response` of the carrier at the orders of the grid; `acceleration` (p, M) of the
-    mount with p directions at the points, m/s^2."""
+    **Attributes**
+
+    - `slope` dn/dOmega
+    - `residual` of the torque balance at the points, relative to its torques
+    - `speed_error`: estimated relative error of the rotor speed at this load speed, due to the number of points
+    - `deviation_error`: estimated error of psi, rad
+    - `response` (K, nd, p): `unbalance_response` of the carrier at the orders of the grid
+    - `acceleration` (p, M) of the mount with p directions at the points, m/s^2
+    """
 
     slope: Array
     residual: Array
@@ -255,32 +263,32 @@ def branch_tangent(model: JammedBodies, grid: Grid, motion: PeriodicSolution) ->
     def residual(w: Array, n: Array) -> tuple[Array, tuple[Array, Array, _Balance]]:
         response = unbalance_response(model, w, n, fine.orders)
         port_response = _port_response_from(model, grid, w, response)
-        found = _balance(model, grid, port_response, deviation, w, n)
-        return found.residual.ravel(), (response, port_response, found)
+        balance = _balance(model, grid, port_response, deviation, w, n)
+        return balance.residual.ravel(), (response, port_response, balance)
 
     def along(by_omega: Array, by_speed: Array) -> tuple[Array, Array, tuple[Array, Array, _Balance]]:
         return jax.jvp(residual, (omega, speed), (by_omega, by_speed), has_aux=True)
 
     both = jnp.eye(2, dtype=omega.dtype)
-    at, (by_omega, by_speed), (response, port_response, found) = jax.vmap(along, out_axes=(None, 0, None))(*both)
-    matrix = _bordered(_jacobian(model, grid, port_response, found, deviation, omega, speed), by_speed)
-    there = deviation @ resampling(grid, fine)
-    between = _balance(model, fine, _port_response_from(model, fine, omega, response), there, omega, speed).residual
+    residuals, (by_omega, by_speed), (response, port_response, balance) = jax.vmap(along, out_axes=(None, 0, None))(*both)
+    matrix = _bordered(_jacobian(model, grid, port_response, balance, deviation, omega, speed), by_speed)
+    on_fine = deviation @ resampling(grid, fine)
+    between = _balance(model, fine, _port_response_from(model, fine, omega, response), on_fine, omega, speed).residual
     fine_residual = (between @ resampling(fine, grid)).ravel()
-    found_by = small_solve(
+    changes = small_solve(
         matrix,
         jnp.stack([-_append_mean_condition(by_omega), _append_mean_condition(jax.lax.stop_gradient(fine_residual))], axis=1),
     )
-    slope, error = found_by[-1, 0], jax.lax.stop_gradient(found_by[:, 1])
+    slope, error = changes[-1, 0], jax.lax.stop_gradient(changes[:, 1])
     # Real and imaginary part of the highest harmonic.
     last = jnp.max(jnp.sum((deviation @ deviation_analysis(grid)[:, [grid.deviation_orders.size - 1, -1]]) ** 2, axis=1))
     return BranchTangent(
         slope,
-        jnp.max(jnp.abs(at)) / found.scale,
+        jnp.max(jnp.abs(residuals)) / balance.scale,
         jnp.abs(error[-1] / speed),
         jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)),
         response[: grid.orders.size],
-        found.acceleration,
+        balance.acceleration,
     )
 
 
@@ -293,8 +301,8 @@ def _bordered(by_deviation: Array, by_unknown: Array) -> Array:
     """Return the bordered Jacobian: derivatives with respect to psi and to the unknown speed; the last row is the condition
     mean psi = 0."""
     m = by_deviation.shape[0]
-    pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
-    return jnp.concatenate([jnp.concatenate([by_deviation, by_unknown[:, None]], axis=1), pin[None, :]])
+    mean = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
+    return jnp.concatenate([jnp.concatenate([by_deviation, by_unknown[:, None]], axis=1), mean[None, :]])
 
 
 class Harmonics(NamedTuple):
@@ -339,9 +347,13 @@ class Linearized(NamedTuple):
 class _NewtonState(NamedTuple):
     """State of Newton's iteration.
 
-    **Attributes**: `steps` taken; the best `unknowns` so far; `norm` of their residuals and the `scale` of the terms in it;
-    `change`: the Newton step there; `length`: the largest fraction of it that may be taken; `done`: True if the iteration ends;
-    `stalled`: True if it ends because no fraction of the step reduces the residuals.
+    **Attributes**
+
+    - `steps`: number of steps so far
+    - `unknowns` with the smallest residuals so far; `norm` of these residuals, and `scale` of the terms in them
+    - `change`: Newton step from these unknowns; `length`: largest fraction of this step that is allowed
+    - `done`: True if the iteration ends
+    - `stalled`: True if it ends because no fraction of the step reduces the residuals
     """
 
     steps: Array
@@ -357,7 +369,8 @@ class _NewtonState(NamedTuple):
 def newton(
     linearize: Callable[..., Linearized], move: Callable[[Any, Array, Array], Any], start: Any, change: Array, one: Array
 ) -> Any:
-    """Return the root of the equations that `linearize` evaluates at the unknowns, or the best unknowns found.
+    """Return the root of the equations that `linearize` evaluates at the unknowns, or the unknowns with the smallest residuals
+    if the iteration does not converge.
 
     **Arguments**: `move(unknowns, change, length)`: the unknowns after at most the fraction `length` of a Newton step; `start`
     of the unknowns; a `change` of zeros; `one`: the number 1 in the precision of the unknowns.
@@ -366,17 +379,17 @@ def newton(
     no = jnp.asarray(False)
 
     def step(now: _NewtonState) -> _NewtonState:
-        there = move(now.unknowns, now.change, now.length)
-        norm, scale, solve = linearize(*there)
+        moved = move(now.unknowns, now.change, now.length)
+        norm, scale, solve = linearize(*moved)
         # Newton's method squares the reduction of the residuals: if the next step will end below rounding, the residuals after
         # it need no evaluation. The reduction by the first step, from the start, allows no such prediction.
         predicted_converged = (norm * (norm / now.norm) ** 2 < tiny / 16.0 * scale) & (now.steps > 0)
         change = solve()
         done = (norm < tiny * scale) | predicted_converged
-        then = _NewtonState(now.steps + 1, there, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), done, no)
+        accepted = _NewtonState(now.steps + 1, moved, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), done, no)
         stalled = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(now.change)) | (now.norm < 16.0 * tiny * now.scale)
-        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, done=stalled, stalled=stalled)
-        return jax.tree.map(lambda a, b: jnp.where(norm < now.norm, a, b), then, stay)
+        rejected = now._replace(steps=now.steps + 1, length=now.length / 4.0, done=stalled, stalled=stalled)
+        return jax.tree.map(lambda a, b: jnp.where(norm < now.norm, a, b), accepted, rejected)
 
     # The first iteration only evaluates the residuals at the start, because the initial norm is infinite.
     begin = _NewtonState(jnp.asarray(-1), start, jnp.inf * one, one, change, one, no, no)

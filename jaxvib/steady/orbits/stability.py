@@ -105,9 +105,14 @@ def steps_for(model: JammedBodies, omega: Array, speed: Array, *, implicit: bool
 
 
 class _Coefficients(NamedTuple):
-    """Coefficients of the linear equations at one angle: `moving` s e' with its derivatives `moving1` and `moving2`, and
-    `coupling`, s e' minus the part of dry friction, (directions, G, P); derivatives of the torque `by_angle`,
-    `by_rate`, (G, P)."""
+    """Coefficients of the linear equations at one angle.
+
+    **Attributes** (s: share of each body in the total unbalance)
+
+    - `moving` s e', with its derivatives `moving1` and `moving2` by theta, and `coupling`, s e' minus the part of dry friction,
+      (directions, G, P)
+    - `by_angle`, `by_rate` (G, P): derivatives of the torque, divided by I Omega^2
+    """
 
     moving: Array
     coupling: Array
@@ -408,7 +413,7 @@ def _times(matrix: Array, vectors: Array) -> Array:
 
 
 def _small_solve(weight: Array, right: Array) -> Array:
-    """Return the solution x (n, ...) of (1 - weight) x = right, written out for n = 1 or 2; weight (n, n, ...)."""
+    """Return the solution x (n, ...) of (1 - weight) x = right for n = 1 or 2, without a library call; weight (n, n, ...)."""
     a = np.eye(weight.shape[0]).reshape(*weight.shape[:2], *[1] * (weight.ndim - 2)) - weight
     if weight.shape[0] == 1:
         return right / a[0]
@@ -423,7 +428,8 @@ def _eigenvalues(matrices: Array) -> Array:
 
 
 def deflate(matrix: Array, known: Array) -> tuple[Array, Array]:
-    """Return the eigenvalue of the eigenvector `known`, and a matrix with the other eigenvalues."""
+    """Return the eigenvalue of the eigenvector `known` of a matrix (n, n), and a matrix (n - 1, n - 1) with the other
+    eigenvalues."""
     unit = known / jnp.linalg.norm(known)
     mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))
     mirror = mirror / jnp.linalg.norm(mirror)

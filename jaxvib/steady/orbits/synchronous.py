@@ -78,7 +78,7 @@ class SynchronousStatus(eqx.Enumeration):
 
 
 class HasSpeedAndPhases(Protocol):
-    """Synchronous regime of the averaged theory."""
+    """Motion with a speed and phases, such as a synchronous regime of the averaged theory."""
 
     @property
     def speed(self) -> Array:
@@ -215,7 +215,7 @@ def synchronous_orbit(
     **Arguments**: `scene` without effects that permit the rotation of loads about their own centres; and
 
     - `regime`: a motion of the averaged theory with `speed` and `phases`; or these two arguments:
-    - `speed`: start of Omega, rad/s or text; default: the mean speed of the motors; typical: 60 to 320
+    - `speed`: start of Omega, rad/s or text; default: the mean of the motors' no-load speeds; typical: 60 to 320
     - `phases` (N,): starts of alpha, rad; default: 0. The first phase that is free keeps its value, because it defines the
       origin of time
     - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-8 (the default; in
@@ -372,13 +372,13 @@ def _solve_program(
     status = SynchronousStatus.where(nearest < eps**0.4, SynchronousStatus.at_fold, status)
     status = SynchronousStatus.where(is_met, status, SynchronousStatus.not_converged)
     status = SynchronousStatus.where(equal, status, SynchronousStatus.different_speeds)
-    there = is_met & equal
+    is_solution = is_met & equal
     numbers = {
         **_quantities(whole, grid, motion), "multiplier": largest, "multipliers": multipliers, "trivial": trivial,
         "error": error,
     }  # fmt: skip
-    numbers = {name: jnp.where(there, x, jnp.nan) for name, x in numbers.items()}
-    stable = there & (largest < 1.0 - _STABLE_MARGIN * eps)
+    numbers = {name: jnp.where(is_solution, x, jnp.nan) for name, x in numbers.items()}
+    stable = is_solution & (largest < 1.0 - _STABLE_MARGIN * eps)
     return SynchronousOrbit(status=status, stable=stable, residual=residual, scene=scene, **numbers)
 
 

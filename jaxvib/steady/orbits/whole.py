@@ -102,8 +102,8 @@ class PeriodicScene(eqx.Module):
 
         def of_all(every: Array) -> tuple[Array, Array]:
             x, rate = jnp.split(every[:-1], 2)
-            found = self.acceleration(theta, x, rate, every[-1])
-            return found, found
+            acceleration = self.acceleration(theta, x, rate, every[-1])
+            return acceleration, acceleration
 
         return jax.jacfwd(of_all, has_aux=True)(jnp.concatenate([x, rate, omega[None]]))
 
@@ -201,9 +201,11 @@ def solve_whole(
 
         x'' = f(theta, x, x', Omega)    at the M points of the grid,    mean psi of the first body = 0
 
-    **Arguments**: `omega`: the speed of a `forced` motion, otherwise its initial value; `known`: the
-    solution, if it is known. Derivatives with respect to every parameter of the scene, and with respect to `omega` of a forced
-    motion, follow from the implicit function theorem.
+    **Arguments**: `omega`, rad/s: the speed of a `forced` motion, otherwise the initial value of the speed; `known`: the
+    solution, if it is known.
+
+    Derivatives with respect to every parameter of the scene, and with respect to `omega` of a forced motion, follow from the
+    implicit function theorem.
     """
     if known is None:
         start = linear_start(scene, grid, omega)
@@ -251,13 +253,13 @@ def _solve(
         return x + change[:size].reshape(x.shape), w if forced else w + change[-1]
 
     def linearize(x: Array, w: Array) -> Linearized:
-        found = collocation(scene, on, x, w, forced=forced)
-        right = found.residual.ravel() if forced else jnp.append(found.residual.ravel(), 0.0)
+        system = collocation(scene, on, x, w, forced=forced)
+        right = system.residual.ravel() if forced else jnp.append(system.residual.ravel(), 0.0)
         # Residuals of the carrier are weighted by the torques that they cause. Otherwise no step that turns bodies would
         # reduce the norm, because the torques between bodies are small compared with the forces on the carrier.
-        carrier, bodies = jnp.split(found.residual, [scene.coordinates])
+        carrier, bodies = jnp.split(system.residual, [scene.coordinates])
         norm = jnp.sqrt((jnp.sum((weight * carrier) ** 2) + jnp.sum(bodies**2)) / size)
-        return Linearized(norm, found.scale, lambda: -solve_in_turn(found.matrix, right))
+        return Linearized(norm, system.scale, lambda: -solve_in_turn(system.matrix, right))
 
     change = jnp.zeros(size if forced else size + 1, start.dtype)
     return newton(linearize, move, (start, omega), change, jnp.ones_like(omega))
@@ -271,9 +273,9 @@ def _solve_jvp(primals, tangents, *, grid: tuple[int, bool], forced: bool, is_kn
     by_omega = tangents[1] if forced else None
     change = eqx.filter_jvp(lambda s, v: residual_of(s, on, x, v), (scene, w), (tangents[0], by_omega))[1].ravel()
     matrix = collocation(scene, on, x, w, forced=forced).matrix
-    found = -jnp.linalg.solve(matrix, change if forced else jnp.append(change, 0.0))
-    speed = (jnp.zeros_like(w) if by_omega is None else by_omega) if forced else found[-1]
-    return (x, w), (found[: x.size].reshape(x.shape), speed)
+    tangent = -jnp.linalg.solve(matrix, change if forced else jnp.append(change, 0.0))
+    speed = (jnp.zeros_like(w) if by_omega is None else by_omega) if forced else tangent[-1]
+    return (x, w), (tangent[: x.size].reshape(x.shape), speed)
 
 
 def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, forced: bool) -> tuple[Array, Array]:
@@ -284,15 +286,15 @@ def collocation_error(scene: PeriodicScene, grid: Grid, motion: WholeMotion, *, 
     as many points, and from the highest harmonic.
     """
     scene, (x, omega) = jax.lax.stop_gradient((scene, motion))
-    found, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates
+    system, nd = collocation(scene, grid, x, omega, forced=forced), scene.coordinates
     fine = grid_of(2 * grid.theta.size, grid.symmetric)
     between = residual_of(scene, fine, x @ resampling(grid, fine), omega) @ resampling(fine, grid)
-    change = solve_in_turn(found.matrix, between.ravel() if forced else jnp.append(between.ravel(), 0.0))
+    change = solve_in_turn(system.matrix, between.ravel() if forced else jnp.append(between.ravel(), 0.0))
     last = jnp.abs(analyzed(x, deviation_analysis(grid))[:, -1:])
-    off = jnp.concatenate([jnp.abs(change[: x.size].reshape(x.shape)), last], axis=1)
+    error = jnp.concatenate([jnp.abs(change[: x.size].reshape(x.shape)), last], axis=1)
     largest = jnp.maximum(jnp.max(jnp.abs(x[:nd])), 1e-3)  # the forces of the exciters may cancel
-    each = jnp.max(off[:nd]) / largest, jnp.max(off[nd:], initial=0.0), 0.0 if forced else jnp.abs(change[-1] / omega)
-    return jnp.max(jnp.abs(found.residual)) / found.scale, jnp.max(jnp.stack([jnp.asarray(e) for e in each]))
+    errors = jnp.max(error[:nd]) / largest, jnp.max(error[nd:], initial=0.0), 0.0 if forced else jnp.abs(change[-1] / omega)
+    return jnp.max(jnp.abs(system.residual)) / system.scale, jnp.max(jnp.stack([jnp.asarray(e) for e in errors]))
 
 
 def multipliers_of(
