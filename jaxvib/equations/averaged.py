@@ -434,8 +434,9 @@ def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
     later_displacement = jnp.where(is_slow, shapes @ (periods * (to_modal @ state.velocity)), state.velocity / turning)
     w_times_q = jnp.where(is_slow, shapes @ (frequencies * (to_modal @ state.displacement)), turning * state.displacement)
     back = jnp.exp(-1j * theta)
-    displacement, velocity = state.displacement - 1j * later_displacement, state.velocity + 1j * w_times_q
-    return Amplitudes(back * displacement, back * velocity, rate, angle - theta)
+    displacement = back * (state.displacement - 1j * later_displacement)
+    velocity = back * (state.velocity + 1j * w_times_q)
+    return Amplitudes(displacement, velocity, rate, angle - theta)
 
 
 def _product(a: Array, b: Array) -> Array:
