@@ -1,10 +1,10 @@
 """Angle of a rotor over time, from the pulses of a tachometer, an angle, a speed, or the schedule of the drive.
 
 Pulses and samples are fitted by a spline of degree 5 with evenly spaced knots, whose number has the smallest Bayesian
-information criterion. The second derivative of the spline, which the force of an unbalance needs, is smooth. Marks of a wheel
-that are unevenly spaced have one unknown offset each. All pulses may be early or late by a common time, whose standard error
-is that of one pulse, because recorders round times up, down, or to the nearest sample. The covariance of the coefficients gives
-functions e_m(t), such that
+information criterion. The second derivative of the spline, which enters the force of an unbalance, is smooth. If a wheel has
+several marks, each mark has an unknown offset from its place, because marks are unevenly spaced. All pulses may be early or
+late by a common time with the standard error of one pulse, because recorders round times up, down, or to the nearest sample.
+The functions e_m(t) follow from the covariance of the coefficients:
 
     angle(t) = spline(t) + sum_m z_m e_m(t),      z_m independent and standard normal
 
@@ -48,14 +48,15 @@ MAX_ERRORS = 64
 """Largest number of errors z_m of an angle."""
 
 _ERRORS_TOGETHER = 8
-"""Errors are added in groups of this number, so that runs of nearly equal splines share a program."""
+"""The number of errors is a multiple of this number, so that runs with nearly equal splines share a program."""
 
 
 class RecordedDrive(IdealDrive):
     """Drive that follows a recorded angle, given by polynomials of the relative time in each of equal intervals.
 
-    **Attributes**: `speed`, the largest one, rad/s; `table` (intervals, powers, 1 + m): coefficients of the angle and of its
-    errors e_m; `begin` and `width`, s, of the first interval; `last`: number of the last interval (further rows are padding).
+    **Attributes**: `speed`, rad/s: the largest absolute speed; `table` (intervals, powers, 1 + m): coefficients of the angle
+    and of its errors e_m; `begin`, s: start of the first interval; `width`, s, of all intervals; `last`: index of the last
+    interval (further rows of the table are padding).
     """
 
     speed: Array = eqx.field(metadata=unit("rad/s"))
@@ -66,7 +67,7 @@ class RecordedDrive(IdealDrive):
     kind: str = eqx.field(static=True, default="recorded", kw_only=True)
 
     def columns_at(self, t: Array, order: int) -> Array:
-        """Return the angle and its errors (1 + m,) at time `t`, or their derivatives of an `order`."""
+        """Return the derivatives of an `order` of the angle and of its errors e_m (1 + m,) at time `t`; order 0: the values."""
         place = (t - self.begin) / self.width
         k = jnp.clip(jnp.floor(place), 0.0, self.last)
         rows = self.table[k.astype(int)]
@@ -87,16 +88,16 @@ class RecordedDrive(IdealDrive):
 
     def with_errors(self, z: Array) -> RecordedDrive:
         """Return the drive whose angle has the errors `z` (m,)."""
-        moved = self.table[:, :, :1] + (self.table[:, :, 1:] @ z)[:, :, None]
-        return eqx.tree_at(lambda own: own.table, self, jnp.concatenate([moved, self.table[:, :, 1:]], axis=2))
+        angle_table = self.table[:, :, :1] + (self.table[:, :, 1:] @ z)[:, :, None]
+        return eqx.tree_at(lambda own: own.table, self, jnp.concatenate([angle_table, self.table[:, :, 1:]], axis=2))
 
 
 class RotorSamples(NamedTuple):
     """Samples of a rotor.
 
-    **Attributes**: `kind` of the channel; `time` (n,), s; `value` (n,), rad or rad/s; `marks` (n,): number of the mark of each
-    pulse, otherwise 0; `spread` (n,): relative sizes of the errors; `scatter`: standard deviation about a smooth curve, in
-    these sizes (for pulses in s).
+    **Attributes**: `kind` of the channel; `time` (n,), s; `value` (n,), rad or rad/s; `marks` (n,): index of the mark of each
+    pulse, otherwise 0; `spread` (n,): for pulses the speed, rad/s, by which an error of time becomes an error of the angle,
+    otherwise 1; `scatter`: standard deviation of the values about a smooth curve, divided by `spread` (for pulses in s).
     """
 
     kind: str
@@ -112,9 +113,9 @@ class RotorAngle(NamedTuple):
 
     **Attributes**
 
-    - `drive` that turns the rotor in this way
+    - `drive` that turns the rotor by this angle
     - `spline` of the angle and its errors over time; None if the angle follows from the drive of the scene
-    - `span`, s, in which the angle is known
+    - `span`, s: first and last time at which the angle is known
     - `marked`: True if the zero of the angle is a mark on the rotor, the same in all runs
     - `error`, rad: root mean square of the standard error of the angle in the span
     - `left_out`, rad: part of `error` that the m errors do not contain
@@ -150,11 +151,13 @@ class RotorAngle(NamedTuple):
 
 
 def rotor_angles(scene: Scene, run: MeasuredRun) -> list[RotorAngle]:
-    """Return the angle of the rotor of each exciter in a run, in its direction of rotation.
+    """Return the angle of the rotor of each exciter in a run, positive in the direction of rotation.
 
-    Channels of pulses, angle or speed describe the rotor of the only exciter. Without them the drives must prescribe the angle.
+    Channels of pulses, angle or speed describe the rotor of the only exciter. Without such channels the drives must prescribe
+    the angle.
 
-    **Raises** `InputError` for a motor without such a channel, and for too few pulses.
+    **Raises** `InputError` for a motor without such a channel, for a scene with several exciters and such a channel, and for
+    fewer than 12 pulses or readings of the channel.
     """
     channels = run.of_kind("pulses", "angle", "speed")
     if channels and len(scene.exciters) > 1:
@@ -181,10 +184,10 @@ def _prescribed(scene: Scene, k: int, exciter: Exciter, run: MeasuredRun) -> Rot
 def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     time, value = np.asarray(run.times[channel.name], float), np.asarray(run.values[channel.name], float)
     time, value = time[np.isfinite(value)], value[np.isfinite(value)]
-    where = f"{run.source}: channel {channel.name!r}"
+    field = f"{run.source}: channel {channel.name!r}"
     if time.size < _MIN_PULSES:
         what = "pulses" if channel.kind == "pulses" else "readings"
-        raise InputError(where, f"has {time.size} {what}; at least {_MIN_PULSES} are needed, record more turns")
+        raise InputError(field, f"has {time.size} {what}; at least {_MIN_PULSES} are needed, record more turns")
     time = time - channel.delay
     notes: list[str] = []
     marks, spread = np.zeros(time.size, int), np.ones(time.size)
@@ -198,15 +201,15 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
     else:
         marks = value.astype(int) % channel.per_turn
         value = 2.0 * np.pi * value / channel.per_turn
-        rough = np.convolve(np.pad(np.gradient(value, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
-        spread = np.maximum(rough, _MIN_SPEED * np.max(rough))  # the errors of pulses are errors of their times
+        rough_speed = np.convolve(np.pad(np.gradient(value, time), 2, mode="edge"), np.full(5, 0.2), mode="valid")
+        spread = np.maximum(rough_speed, _MIN_SPEED * np.max(rough_speed))  # the errors of pulses are errors of their times
         spline, scatter = fit_spline(time, value, marks, spread)
         speed = spline(0.5 * (time[1:] + time[:-1]), 1)[:, 0]
-        fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite nothing
-        change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=fast, initial=0.0))
+        is_fast = np.abs(speed[1:]) > 0.2 * np.max(np.abs(speed))  # slower rotors excite nothing
+        change = float(np.max(np.abs(np.diff(speed) / speed[1:]), where=is_fast, initial=0.0))
         if change > _MAX_SPEED_CHANGE:
             notes.append(
-                f"{where}: the speed changes by up to {change:.0%} from one pulse to the next, and the angle between them is "
+                f"{field}: the speed changes by up to {change:.0%} from one pulse to the next, and the angle between them is "
                 "uncertain; use more pulses per turn"
             )
     grid = spline(np.linspace(time[0], time[-1], 4 * spline.c.shape[0]))[:, 1:]
@@ -219,8 +222,11 @@ def _measured(run: MeasuredRun, channel: Channel) -> RotorAngle:
 
 
 def recorded_drive(time: np.ndarray, columns: Sequence[np.ndarray]) -> RecordedDrive:
-    """Return the drive with an angle and its errors at evenly spaced times (n,): `columns` (n, 1 + m) of them, and of their
-    first and second derivatives. They are interpolated by polynomials of degree 5."""
+    """Return the drive whose angle and errors are interpolated by polynomials of degree 5.
+
+    **Arguments**: evenly spaced times (n,), s; `columns`: three arrays (n, 1 + m) with the angle and its m errors at these
+    times and with their first and second derivatives.
+    """
     count, intervals, width = min(1 + MAX_ERRORS, columns[0].shape[1]), time.size - 1, (time[-1] - time[0]) / (time.size - 1)
     value, slope, bend = (each[:, :count] * width**order for order, each in enumerate(columns))
     table = np.zeros(
@@ -238,15 +244,14 @@ def recorded_drive(time: np.ndarray, columns: Sequence[np.ndarray]) -> RecordedD
 def fit_spline(
     time: np.ndarray, value: np.ndarray, marks: np.ndarray | None = None, rates: np.ndarray | None = None
 ) -> tuple[Any, float]:
-    """Return a spline of degree 5 through noisy values, with 1 + m columns: the values, and m errors of them.
+    """Return a smoothing spline of degree 5 with 1 + m columns (the values and their m errors), and the scatter.
 
-    Returns also the standard deviation of the values about the spline, relative to their `rates` if these are given.
+    The scatter is the standard deviation of the values about the spline; with `rates` it is the standard deviation of the
+    times, s. The errors are principal components of the covariance of the coefficients, the largest first.
 
-    The errors are principal components of the covariance of the coefficients, in the order of their size.
-
-    **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): the number of a value's mark, each with an unknown
-    offset (0 on average); `rates` (n,): rates of values whose errors are those of their times. A common delay of all times is
-    then one of the errors.
+    **Arguments**: `time` (n,) s, ascending; `value` (n,); `marks` (n,): index of the mark of each value; each mark has an
+    unknown offset, 0 on average; `rates` (n,): time derivatives of the values, for values whose errors are errors of their
+    times. A common delay of all times is then included in the covariance.
 
     >>> t = np.linspace(0.0, 2.0, 200)
     >>> spline, _ = fit_spline(t, 30.0 * t**2 + 1e-3 * np.random.default_rng(0).normal(size=t.size))
@@ -258,35 +263,36 @@ def fit_spline(
     weights = np.ones(time.size) if rates is None else np.mean(rates) / rates
     offsets = np.zeros((time.size, 0))
     if marks is not None:
-        kinds = np.eye(int(np.max(marks)) + 1)[marks]
-        offsets = (kinds[:, 1:] - kinds[:, :1]) * weights[:, None]
-    tried = []
+        indicators = np.eye(int(np.max(marks)) + 1)[marks]
+        offsets = (indicators[:, 1:] - indicators[:, :1]) * weights[:, None]
+    fits = []
     intervals = 1
     while intervals <= min(_MAX_INTERVALS, time.size // 4):
-        tried.append(_fit_knots(time, value * weights, weights, offsets, intervals))
+        fits.append(_fit_knots(time, value * weights, weights, offsets, intervals))
         intervals = max(intervals + 1, int(1.4 * intervals))
-    best = min(tried, key=lambda each: each.criterion)
+    best = min(fits, key=lambda each: each.criterion)
     covariance, scatter = best.covariance(), math.sqrt(best.variance) / (1.0 if rates is None else float(np.mean(rates)))
     if rates is not None:
-        late = scatter * _derivative(best)
-        covariance += np.outer(late, late)
+        delay_column = scatter * _derivative(best)
+        covariance += np.outer(delay_column, delay_column)
     sizes, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(sizes, 0.0))
-    grid = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * len(best.found)), best.knots, _DEGREE)
+    grid = BSpline.design_matrix(np.linspace(time[0], time[-1], 4 * len(best.coefficients)), best.knots, _DEGREE)
     errors = root @ np.linalg.svd(grid @ root, full_matrices=False)[2].T
-    return BSpline(best.knots, np.concatenate([best.found[:, None], errors], axis=1), _DEGREE), scatter
+    return BSpline(best.knots, np.concatenate([best.coefficients[:, None], errors], axis=1), _DEGREE), scatter
 
 
 class _KnotsFit(NamedTuple):
     """Fit of a spline with given `knots`.
 
-    **Attributes**: `found` coefficients (k,); Bayesian information `criterion`; `variance` of the values; diagonals `band` of
-    the normal equations of the coefficients; `answers` (k, o): their solutions for the o products of splines and offsets;
-    `schur` (o, o): inverse of the matrix that remains for the offsets without the coefficients.
+    **Attributes**: `coefficients` (k,) of the spline; Bayesian information `criterion`; `variance` of the values; `band`:
+    diagonals of the normal equations N of the coefficients; `answers` (k, o): N^-1 B, where B (k, o) couples the coefficients
+    with the o offsets; `schur` (o, o): inverse of the Schur complement of N, which is the covariance of the offsets divided by
+    the variance.
     """
 
     knots: np.ndarray
-    found: np.ndarray
+    coefficients: np.ndarray
     criterion: float
     variance: float
     band: np.ndarray
@@ -297,18 +303,18 @@ class _KnotsFit(NamedTuple):
         """Return the covariance (k, k) of the coefficients."""
         from scipy.linalg import solveh_banded  # slow to import
 
-        alone = solveh_banded(self.band, np.eye(len(self.found)), lower=True)
-        return self.variance * (alone + self.answers @ self.schur @ self.answers.T)
+        inverse_band = solveh_banded(self.band, np.eye(len(self.coefficients)), lower=True)
+        return self.variance * (inverse_band + self.answers @ self.schur @ self.answers.T)
 
 
-def _derivative(fit: _KnotsFit) -> np.ndarray:
+def _derivative(spline_fit: _KnotsFit) -> np.ndarray:
     """Return the coefficients (k,) of the spline with the same knots that interpolates the derivative."""
     from scipy.interpolate import BSpline  # slow to import
 
-    places = np.lib.stride_tricks.sliding_window_view(fit.knots[1:-1], _DEGREE).mean(axis=1)
-    places = np.clip(places, fit.knots[0], fit.knots[-1])  # rounding errors
-    basis = BSpline.design_matrix(places, fit.knots, _DEGREE).toarray()
-    return np.linalg.solve(basis, BSpline(fit.knots, fit.found, _DEGREE)(places, 1))
+    places = np.lib.stride_tricks.sliding_window_view(spline_fit.knots[1:-1], _DEGREE).mean(axis=1)
+    places = np.clip(places, spline_fit.knots[0], spline_fit.knots[-1])  # rounding errors
+    basis = BSpline.design_matrix(places, spline_fit.knots, _DEGREE).toarray()
+    return np.linalg.solve(basis, BSpline(spline_fit.knots, spline_fit.coefficients, _DEGREE)(places, 1))
 
 
 def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets: np.ndarray, intervals: int) -> _KnotsFit:
@@ -320,18 +326,18 @@ def _fit_knots(time: np.ndarray, value: np.ndarray, weights: np.ndarray, offsets
     n = time.size
     knots = np.concatenate([[time[0]] * _DEGREE, np.linspace(time[0], time[-1], intervals + 1), [time[-1]] * _DEGREE])
     basis: Any = diags(weights) @ BSpline.design_matrix(time, knots, _DEGREE)
-    square = basis.T @ basis
-    size, count = square.shape[0], square.shape[0] + offsets.shape[1]
-    band = np.stack([np.pad(square.diagonal(k), (0, k)) for k in range(_DEGREE + 1)])
-    band[0] += 1e-12 * np.mean(band[0])  # intervals without a value
+    gram = basis.T @ basis
+    size, count = gram.shape[0], gram.shape[0] + offsets.shape[1]
+    band = np.stack([np.pad(gram.diagonal(k), (0, k)) for k in range(_DEGREE + 1)])
+    band[0] += 1e-12 * np.mean(band[0])  # otherwise the matrix is singular for intervals without a value
     answers = solveh_banded(band, basis.T @ offsets, lower=True) if offsets.size else np.zeros((size, 0))
     schur = np.linalg.inv(offsets.T @ offsets - (basis.T @ offsets).T @ answers)
-    found, shifts, left = np.zeros(size), np.zeros(offsets.shape[1]), value
-    for _ in range(2):  # once for the values, once for rounding errors
-        alone = solveh_banded(band, basis.T @ left, lower=True)
-        step = schur @ (offsets.T @ (left - basis @ alone))
-        found, shifts = found + alone - answers @ step, shifts + step
-        left = value - basis @ found - offsets @ shifts
-    square_sum = float(left @ left)
+    coefficients, offset_values, residuals = np.zeros(size), np.zeros(offsets.shape[1]), value
+    for _ in range(2):  # the second solution corrects rounding errors of the first
+        without_offsets = solveh_banded(band, basis.T @ residuals, lower=True)
+        step = schur @ (offsets.T @ (residuals - basis @ without_offsets))
+        coefficients, offset_values = coefficients + without_offsets - answers @ step, offset_values + step
+        residuals = value - basis @ coefficients - offsets @ offset_values
+    square_sum = float(residuals @ residuals)
     criterion = n * math.log(max(square_sum / n, 1e-26)) + count * math.log(n)
-    return _KnotsFit(knots, found, criterion, square_sum / max(n - count, 1), band, answers, schur)
+    return _KnotsFit(knots, coefficients, criterion, square_sum / max(n - count, 1), band, answers, schur)

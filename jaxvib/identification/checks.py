@@ -18,10 +18,10 @@ CHANCE = 1e-5
 """Share of records with pure noise about the fit that get the status `patterned`."""
 
 _WINDOWS, _ORDERS = 16, 3
-"""Number of stretches of a record, and of orders of the rotor's speed, in which residuals are compared with noise."""
+"""Number of stretches of a record, and number of orders of the rotor's speed, at which residuals are compared with noise."""
 
 _CONTRADICTION = 4.0
-"""Distance of a fitted value from a known one, in standard errors, that errors cannot explain."""
+"""Distance of a fitted value from its known value, in standard errors, above which the records contradict the known value."""
 
 _ANGLE_SHARE = 0.1
 """Share of the residuals due to errors of the rotor's angle that are not unknowns above which intervals count as too narrow.
@@ -34,7 +34,8 @@ _DECAY_TIMES = 2.0
 """Duration of a run, in decay times of the slowest mode, below which a note says that it is short."""
 
 _UNEXPLAINED = 0.5
-"""Share of a channel's standard deviation in the residuals above which a fit counts as none."""
+"""Standard deviation of a channel's residuals, relative to that of its readings, above which the model does not resemble the
+channel."""
 
 _MOSTLY = 0.5
 """Smallest share of the power of a signal in one vibration for which a note names this vibration."""
@@ -65,7 +66,10 @@ class FitStatus(eqx.Enumeration):
 
 
 def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, list[str]]:
-    """Return the status of a fit, the smallest chance of its residuals under pure noise, and notes."""
+    """Return the status of a fit, the smallest `residual_chance` of its channels, and notes.
+
+    **Arguments**: `fitted`; the information `found` about its numbers.
+    """
     chance, notes = 1.0, [*_contradictions(fitted), *_disagreements(fitted)]
     contradicted = bool(notes)
     coarse = [max(rotor.error for rotor in rotors) for rotors in fitted.problem.rotors]
@@ -115,8 +119,8 @@ def status_of(fitted: Fitted, found: Information) -> tuple[FitStatus, float, lis
 
 
 def resembles(fitted: Fitted) -> bool:
-    """Return True if the model resembles the records: the fit has converged, and a channel has smaller residuals than half of
-    its readings."""
+    """Return True if the model resembles the records: the fit has converged, and the standard deviation of the residuals of at
+    least one channel is at most half of that of its readings."""
     problem = fitted.problem
     shares = [
         np.std(left[mask[:, c], c]) / max(float(np.std(raw[mask[:, c], c])), 1e-300)
@@ -152,7 +156,7 @@ def _foreign_vibrations(fitted: Fitted, has_fit: bool) -> Iterator[str]:
 
 
 def residual_chance(left: np.ndarray, taps: np.ndarray, angle: np.ndarray, found: int) -> float:
-    """Return the probability of residuals as far from noise as these, if they are noise.
+    """Return the probability that noise has vibrations at orders of the rotor's speed as strong as those of the residuals.
 
     The residuals are filtered to white noise and compared with vibrations at the first orders of the rotor's speed in each
     stretch of the record, by an F test.
@@ -231,8 +235,11 @@ def _contradictions(fitted: Fitted) -> Iterator[str]:
 
 
 class Disagreement(NamedTuple):
-    """Deviation of a run from other runs: its `chance` if the machine is the same; `name` of the number whose change explains
-    most of it, that relative `change` and its standard `error`."""
+    """Deviation of a run from other runs.
+
+    **Attributes**: `chance` of a deviation as large as this one if the machine is the same; `name` of the number whose change
+    explains most of the deviation, this relative `change` and its standard `error`.
+    """
 
     chance: float
     name: str
@@ -248,7 +255,8 @@ class Disagreement(NamedTuple):
 
 
 def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, names: Sequence[str]) -> Disagreement:
-    """Return the deviation of a run by the ratio of likelihoods of "own numbers" to "the numbers of the others".
+    """Return the deviation of a run from other runs by the ratio of the likelihoods of two models: the run has numbers
+    different from those of the others, or all runs have the same numbers.
 
     **Arguments**: information (k, k) of the `others` and of the `run`, about relative changes of k numbers; `gradient` of the
     run, J^T residuals/noise^2, at the numbers that fit the others and the run together; `names` (k,).
@@ -273,7 +281,7 @@ def disagreement(others: np.ndarray, run: np.ndarray, gradient: np.ndarray, name
 
 
 def pseudoinverse(matrix: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the pseudoinverse of an information matrix, on the scale of its diagonal, and its rank."""
+    """Return the pseudoinverse of an information matrix, computed with a diagonal scaled to 1, and its rank."""
     size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(size, size))
     kept = values > 1e-10 * max(float(values[-1]), 1e-300)

@@ -18,13 +18,14 @@ UNDETERMINED = 1.0
 """Relative standard error of a direction above which it counts as undetermined: a factor of e."""
 
 _UNSEEN = 1e3
-"""Standard error of the logarithm of a number above which the records say nothing about it, not even that it is small."""
+"""Standard error of the logarithm of a number above which the records do not bound the number, not even from above."""
 
 _SINGLE = 0.99
-"""Share of a number in a direction above which the direction is that of the number alone."""
+"""Absolute component of a number in a direction (a vector of length 1) above which the direction is that of the number
+alone."""
 
 _MIN_SHARE = 0.05
-"""Share of a number in an undetermined direction above which the number itself counts as undetermined."""
+"""Absolute component of a number in an undetermined direction above which the number itself counts as undetermined."""
 
 _MIN_COMMON_PART = 0.95
 """Part of the direction of the common factor (of all masses, stiffnesses, dampings and unbalances) that lies within the
@@ -36,8 +37,8 @@ _ADVICE = "give one of them in kg or N as known, or record a run with a known ma
 class Direction(NamedTuple):
     """Combination of numbers that the records do not determine. Returned by `identify` in a `MachineFit`.
 
-    **Attributes**: its `sentence`; `names` of the numbers, and their relative changes `weights`, a vector of length 1; its
-    relative standard `error`.
+    **Attributes**: `sentence` that describes the direction; `names` (k,) of the numbers; `weights` (k,): their relative
+    changes, a vector of length 1; `error`: standard error along the direction, relative.
     """
 
     sentence: str
@@ -51,13 +52,15 @@ class Information(NamedTuple):
 
     **Attributes**
 
-    - `names` (k,) of the numbers; `values` (k,), SI; `scale` (k,), change of a number per unit of its coordinate; `logarithmic`
-      (k,)
+    - `names` (k,) of the numbers; `values` (k,), SI; `scale` (k,): change of a number per unit of its coordinate; `logarithmic`
+      (k,): True if the coordinate is the logarithm of the number
     - `covariance` (k, k) of the coordinates in the determined directions
-    - `undetermined`: directions (k, u); `errors` (u,) of them
+    - `undetermined` (k, u): directions that the records do not determine; `errors` (u,): their standard errors
     - `determined` (k,): False for numbers that take part in an undetermined direction
     - `vanished` (k,): True for positive numbers that are not distinguishable from 0, because their standard error is larger
-    - `by_gain`: directions (k, g) that only the known errors of the sensors' gains determine, and their errors
+      than their value
+    - `by_gain` (k, g): directions that are determined only because the gains of the sensors are known to their `gain_error`;
+      `by_gain_errors` (g,): their standard errors
     """
 
     names: tuple[str, ...]
@@ -79,39 +82,42 @@ def information_of(fitted: Fitted) -> Information:
     unknowns, p = problem.unknowns, fitted.x.size
     number_count = len(unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
-    free = free_unbalances(problem)
-    own = np.array([*range(number_count), *(p + 2 * k for k in free)], int)
-    names = (*(number.name for number in unknowns.numbers), *(f"exciters[{k}].unbalance" for k in free))
-    values = np.concatenate([np.asarray(unknowns.values(fitted.x)), sizes[free]])
-    logarithmic = np.concatenate([np.asarray(unknowns.positive), np.ones(len(free), bool)])
-    scale = np.concatenate([np.where(unknowns.positive, values[:number_count], unknowns.scale), sizes[free]])
+    free_exciters = free_unbalances(problem)
+    own = np.array([*range(number_count), *(p + 2 * k for k in free_exciters)], int)
+    names = (*(number.name for number in unknowns.numbers), *(f"exciters[{k}].unbalance" for k in free_exciters))
+    values = np.concatenate([np.asarray(unknowns.values(fitted.x)), sizes[free_exciters]])
+    logarithmic = np.concatenate([np.asarray(unknowns.positive), np.ones(len(free_exciters), bool)])
+    scale = np.concatenate([np.where(unknowns.positive, values[:number_count], unknowns.scale), sizes[free_exciters]])
     without_gains = prior.copy()
     gains = np.arange(number_count, number_count + len(unknowns.gains))
     without_gains[gains, gains] = 0.0
 
-    whole, loose = (eliminate(data + known, own) for known in (prior, without_gains))
-    errors, axes = _errors(whole)
+    with_gains, without_gain_errors = (eliminate(data + known, own) for known in (prior, without_gains))
+    errors, axes = _errors(with_gains)
     single = np.abs(axes) > _SINGLE
     error = np.sum(single * errors, axis=1)
-    # Unbalances are left out: the direction of one that runs to 0 is unknown, too.
+    # Unbalances are left out: if the size of an unbalance tends to 0, its angle is unknown, too.
     vanished = logarithmic & (error > UNDETERMINED) & (error < _UNSEEN) & (np.arange(own.size) < number_count)
-    unit = np.where(vanished, 10.0 * error, 1.0)  # of a vanished number: ten times its standard error in place of its value
-    found = covariance_of(whole * np.outer(unit, unit))
-    covariance, undetermined = found.covariance, found.undetermined
-    loose_errors, loose_axes = _errors(loose * np.outer(unit, unit))
+    factors = np.where(vanished, 10.0 * error, 1.0)  # of a vanished number: ten times its standard error in place of its value
+    determined_part = covariance_of(with_gains * np.outer(factors, factors))
+    covariance, undetermined = determined_part.covariance, determined_part.undetermined
+    loose_errors, loose_axes = _errors(without_gain_errors * np.outer(factors, factors))
     by_gain = loose_axes[:, loose_errors > UNDETERMINED]
     # Directions that nothing determines are left out of those that the gains determine.
     by_gain = by_gain - undetermined @ (undetermined.T @ by_gain)
     basis, sizes_of, _ = np.linalg.svd(by_gain, full_matrices=False)
     by_gain = basis[:, : int(np.sum(sizes_of > 0.5))]
     by_gain_errors = np.sqrt(np.einsum("ku,kl,lu->u", by_gain, covariance, by_gain))
-    found = found._replace(covariance=covariance * np.outer(unit, unit))
-    return Information(names, values, scale, logarithmic, *found, vanished, by_gain, by_gain_errors)
+    determined_part = determined_part._replace(covariance=covariance * np.outer(factors, factors))
+    return Information(names, values, scale, logarithmic, *determined_part, vanished, by_gain, by_gain_errors)
 
 
 class Covariance(NamedTuple):
-    """`covariance` (k, k) in the determined directions; `undetermined` directions (k, u) and their `errors` (u,); `determined`
-    (k,): False for numbers that take part in an undetermined direction."""
+    """Covariance of numbers (k,) that are not all determined.
+
+    **Attributes**: `covariance` (k, k) in the determined directions; `undetermined` (k, u): the other directions; `errors`
+    (u,): their standard errors; `determined` (k,): False for numbers that take part in an undetermined direction.
+    """
 
     covariance: np.ndarray
     undetermined: np.ndarray
@@ -122,9 +128,14 @@ class Covariance(NamedTuple):
 def covariance_of(information: np.ndarray) -> Covariance:
     """Return the covariance that follows from an information matrix, see `Covariance`."""
     errors, axes = _errors(information)
-    lost = errors > UNDETERMINED
-    covariance = (axes[:, ~lost] * errors[~lost] ** 2) @ axes[:, ~lost].T
-    return Covariance(covariance, axes[:, lost], errors[lost], ~np.any(np.abs(axes[:, lost]) > _MIN_SHARE, axis=1))
+    is_undetermined = errors > UNDETERMINED
+    covariance = (axes[:, ~is_undetermined] * errors[~is_undetermined] ** 2) @ axes[:, ~is_undetermined].T
+    return Covariance(
+        covariance,
+        axes[:, is_undetermined],
+        errors[is_undetermined],
+        ~np.any(np.abs(axes[:, is_undetermined]) > _MIN_SHARE, axis=1),
+    )
 
 
 def combined_information(fitted: Fitted) -> np.ndarray:
@@ -147,13 +158,17 @@ def free_unbalances(problem: Problem) -> list[int]:
 
 
 def in_polar_unbalances(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the information of data and of known values, with (logarithm of the size, angle) of each unbalance; the sizes."""
+    """Return the information of the data, that of known values, both (p + L, p + L), and the sizes (E,) of the unbalances.
+
+    The unknowns are those of the fit, but with (logarithm of the size, angle) instead of (a, b) for each unbalance.
+    """
     turn, sizes = polar_unbalances(fitted.problem, fitted.linear)
     return turn.T @ fitted.information @ turn, turn.T @ fitted.prior @ turn, sizes
 
 
 def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of all unknowns by those with (logarithm of the size, angle) of each unbalance; the sizes."""
+    """Return the derivatives (p + L, p + L) of all unknowns by the same unknowns with (logarithm of the size, angle) instead of
+    (a, b) for each unbalance, and the sizes (E,) of the unbalances."""
     p, exciters = problem.unknowns.count, len(problem.unbalances)
     turn, sizes = np.eye(p + linear.size), np.zeros(exciters)
     for k in range(exciters):
@@ -164,22 +179,22 @@ def polar_unbalances(problem: Problem, linear: np.ndarray) -> tuple[np.ndarray, 
 
 
 def eliminate(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return the information about the unknowns `own` if all others are free."""
+    """Return the information about the unknowns at the places `own` if all other unknowns are free."""
     free, size, vectors, values = _free(matrix, own)
     coupling = (matrix[np.ix_(own, free)] / size) @ vectors / np.sqrt(values)
     return matrix[np.ix_(own, own)] - coupling @ coupling.T
 
 
 def elimination(matrix: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Return L with the changes of all unknowns per change of the unknowns `own`, if all others are free.
+    """Return L: the changes of all unknowns per change of the unknowns at the places `own`, if all other unknowns are free.
 
-    `eliminate` is L^T matrix L, and for a change of the matrix L^T change L.
+    `eliminate` returns L^T F L of the matrix F; to first order its change by dF is L^T dF L.
     """
     free, size, vectors, values = _free(matrix, own)
-    found = np.zeros((len(matrix), own.size))
-    found[own, np.arange(own.size)] = 1.0
-    found[free] = -((vectors / values) @ vectors.T @ (matrix[np.ix_(free, own)] / size[:, None])) / size[:, None]
-    return found
+    changes = np.zeros((len(matrix), own.size))
+    changes[own, np.arange(own.size)] = 1.0
+    changes[free] = -((vectors / values) @ vectors.T @ (matrix[np.ix_(free, own)] / size[:, None])) / size[:, None]
+    return changes
 
 
 def _free(matrix: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -189,8 +204,8 @@ def _free(matrix: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     free = free[np.diagonal(matrix)[free] > 0.0]
     size = np.sqrt(np.diagonal(matrix)[free])
     values, vectors = np.linalg.eigh(matrix[np.ix_(free, free)] / np.outer(size, size))
-    kept = values > 1e-12 * np.max(values, initial=0.0)
-    return free, size, vectors[:, kept], values[kept]
+    is_determined = values > 1e-12 * np.max(values, initial=0.0)
+    return free, size, vectors[:, is_determined], values[is_determined]
 
 
 def _errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -201,8 +216,8 @@ def _errors(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def directions_of(found: Information) -> tuple[tuple[Direction, ...], tuple[Direction, ...]]:
-    """Return the undetermined directions, and those that only the gains of the sensors determine, with their sentences."""
-    lost = _sentences(found, found.undetermined, found.errors, " changes no reading by more than its noise", _ADVICE)
+    """Return the undetermined directions, and the directions that only the gains of the sensors determine, with sentences."""
+    undetermined = _sentences(found, found.undetermined, found.errors, " changes no reading by more than its noise", _ADVICE)
     gains = []
     for direction in _sentences(found, found.by_gain, found.by_gain_errors, "", ""):
         words = direction.sentence.rstrip(": ")
@@ -212,7 +227,7 @@ def directions_of(found: Information) -> tuple[tuple[Direction, ...], tuple[Dire
                 f"gain leaves no trace in the residuals; calibrate the sensors, or {_ADVICE}"
             )
         )
-    return tuple(lost), tuple(gains)
+    return tuple(undetermined), tuple(gains)
 
 
 def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect: str, advice: str) -> list[Direction]:
@@ -223,9 +238,9 @@ def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect:
         inside = axes @ (axes.T @ common)
         if np.linalg.norm(inside) > _MIN_COMMON_PART:
             kinds = _kinds(found.names)
-            words = f"multiplying all {kinds} by one number{effect}: {advice}"
+            text = f"multiplying all {kinds} by one number{effect}: {advice}"
             weights = (axes.T @ common) * errors
-            sentences.append(Direction(words, found.names, tuple(map(float, common)), float(np.linalg.norm(weights))))
+            sentences.append(Direction(text, found.names, tuple(map(float, common)), float(np.linalg.norm(weights))))
             spread = axes * errors
             axes = axes - np.outer(common, common @ axes)
             basis, size, _ = np.linalg.svd(axes, full_matrices=False)
@@ -235,9 +250,11 @@ def _sentences(found: Information, axes: np.ndarray, errors: np.ndarray, effect:
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         largest = [k for k in np.argsort(-np.abs(axis)) if abs(axis[k]) > 0.2]
         parts = ", ".join(f"{found.names[k]} by {axis[k]:+.2g}" for k in largest)
-        ways = "give one of these numbers as known, add a sensor at another place, or record a run through all resonances"
-        words = f"changing {parts} (relative to one another){effect}: {ways if advice else ''}"
-        sentences.append(Direction(words, found.names, tuple(map(float, axis)), float(error)))
+        advice_for_direction = (
+            "give one of these numbers as known, add a sensor at another place, or record a run through all resonances"
+        )
+        text = f"changing {parts} (relative to one another){effect}: {advice_for_direction if advice else ''}"
+        sentences.append(Direction(text, found.names, tuple(map(float, axis)), float(error)))
     return sentences
 
 
@@ -255,5 +272,5 @@ def _kinds(names: tuple[str, ...]) -> str:
         "unbalance": "unbalances",
         "torque": "torques",
     }
-    there = [plural for word, plural in words.items() if any(word in name.rpartition(".")[2] for name in names)]
-    return there[0] if len(there) == 1 else ", ".join(there[:-1]) + " and " + there[-1]
+    present = [plural for word, plural in words.items() if any(word in name.rpartition(".")[2] for name in names)]
+    return present[0] if len(present) == 1 else ", ".join(present[:-1]) + " and " + present[-1]

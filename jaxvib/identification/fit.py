@@ -32,7 +32,8 @@ _CONVERGED = 1e-2
 """Length of the next undamped step, in standard errors, below which the fit has converged."""
 
 _VANISHED = 10.0
-"""Standard error of the logarithm of a number above which it is not reduced further: the data cannot distinguish it from 0."""
+"""Standard error of the logarithm of a number above which the number is not reduced further: the data do not distinguish it
+from 0."""
 
 _MAX_PASSES = 8
 _STEADY_NOISE = 0.01
@@ -62,7 +63,7 @@ class Fitted(NamedTuple):
     - `differences` (n, C) of each run, readings minus model
     - `noise` (C,) of each run: standard deviation of the residuals
     - `outliers` (C,) of each run: share of the residuals that are outliers
-    - `converged`
+    - `converged`: True if the last descent reached a minimum
     - `misfits` of each run: deviation of the rotor from its torque balance, relative to that from a smooth curve; empty if no
       number of a motor is unknown
     """
@@ -86,7 +87,7 @@ class Fitted(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """Unknowns `x` with the best linear unknowns, their cost, and the parts of the linear unknowns in each run."""
+    """Unknowns `x`, the best linear unknowns for them, and the `cost`: sum of the squares of weighted residuals."""
 
     x: np.ndarray
     linear: np.ndarray
@@ -116,7 +117,7 @@ def unknown_count(problem: Problem) -> int:
 
 
 def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solution of scaled normal equations."""
+    """Return the solution (k,) of normal equations with a `matrix` (k, k) and a `right` side (k,), scaled by the diagonal."""
     size = np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
     scaled = matrix / np.outer(size, size) + _RIDGE * np.eye(len(size))
     return np.linalg.solve(scaled, right / size) / size
@@ -279,7 +280,7 @@ def _undamped(matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
 
 
 def limited_step(problem: Problem, step: np.ndarray) -> np.ndarray:
-    """Return the step whose part of x is not longer than the longest one; errors of rotor angles do not count."""
+    """Return the step, shortened such that no entry of x changes by more than 0.7; errors of rotor angles do not count."""
     longest = float(np.max(np.abs(step[: problem.unknowns.count - problem.unknowns.errors]), initial=0.0))
     return step * min(1.0, _LONGEST_STEP / max(longest, 1e-300))
 
@@ -287,8 +288,8 @@ def limited_step(problem: Problem, step: np.ndarray) -> np.ndarray:
 def _follow_valley(
     trial: Any, equations: Callable[[Any], Equations], moved: Callable[[Any, np.ndarray], Any], positive: np.ndarray
 ) -> Any:
-    """Return the values after some undamped steps. The cost may rise in between: this follows a curved valley of the cost,
-    such as that of two dampings under hardly any noise, in a tenth of the steps of the damped method."""
+    """Return the trial after up to 3 undamped steps. The cost may rise in between: the steps follow a curved valley of the
+    cost, such as that of two dampings with very small noise. The damped method needs about ten times as many steps."""
     for _ in range(_VALLEY_STEPS):
         matrix, gradient = _without_vanished(equations(trial), positive)
         step = _undamped(matrix, gradient)
@@ -315,7 +316,7 @@ def differences_of(problem: Problem, x: np.ndarray, linear: np.ndarray) -> list[
 
 
 def _delayed(values: np.ndarray, delay: float) -> np.ndarray:
-    """Return values that are later by a number of steps."""
+    """Return the values (n,), interpolated, with a delay in steps of the grid."""
     if delay == 0.0:
         return values
     from scipy.interpolate import make_interp_spline  # slow to import
@@ -357,13 +358,14 @@ def fit_from(problem: Problem, starts: Sequence[np.ndarray]) -> Fitted:
 
 
 def _has_scores(problem: Problem, noise: Sequence[Sequence[Noise]]) -> bool:
-    """Return True if the readings of a fit depend on the last fit: outliers and bounds."""
+    """Return True if the readings of a fit depend on the fit before: with outliers and with clipped readings."""
     heavy = any(each.outliers for of_run in noise for each in of_run)
     return heavy or any(np.any(each) for each in problem.bounds)
 
 
 def angle_shares(fitted: Fitted) -> list[np.ndarray]:
-    """Return, for each run and channel, the reading due to the standard error of the rotor's angle, relative to the noise."""
+    """Return, for each run, the change (C,) of the readings due to the standard error of the rotor's angle, divided by the
+    noise."""
     problem = fitted.problem
     return [
         np.array([error * np.std(raw[mask[:, k], k]) / max(noise[k], 1e-300) for k in range(raw.shape[1])])

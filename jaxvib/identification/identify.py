@@ -63,13 +63,14 @@ class MachineFit(Result):
     - `information` (k + g + 1, k + g + 1): Fisher information about relative changes of the numbers and of the gains, and about
       the angle of the first unbalance
     - `undetermined`: a `Direction` for each combination of numbers that the records do not determine
-    - `by_gain`: a `Direction` for each one that is known from the gains of the sensors only
+    - `by_gain`: a `Direction` for each combination that is known from the gains of the sensors only
     - `frequency` (m,), rad/s, and `damping_ratio` (m,): natural frequencies and damping ratios of the damped modes
     - `gain_names` (g,) and `gains` (g,) of the channels
     - `phase`, rad: angle of the unbalance of each exciter ahead of the zero of the rotor's angle
     - `channels`: names of the compared channels of each run
     - `noise`: standard deviation of the residuals of each run's channels, SI
-    - `chance` of residuals as far from noise as these
+    - `chance`: smallest probability, over the channels, that noise has vibrations at orders of the rotor's speed as strong as
+      those of the residuals
     - `time`, s, `readings` and `fitted`, SI: arrays for each run, NaN for samples that do not count
     """
 

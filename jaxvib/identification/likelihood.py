@@ -37,10 +37,10 @@ _MAX_DISTANCE = 20.0
 class _Profile:
     """Profile of one number of a fit.
 
-    **Attributes**: the `fitted` problem; `index` of the number in x, or of an exciter if `is_unbalance`; `center` and standard
-    error `spread` of its coordinate (its entry of x, or the logarithm of the unbalance); `slopes` (p,): change of x with the
-    number; `floor`: the least cost; `is_vanished`: True for a number whose distances count in standard errors of its value, not
-    of its logarithm.
+    **Attributes**: the `fitted` problem; `index` of the number in x, or of the exciter if `is_unbalance`; `center` and standard
+    error `spread` of the coordinate of the number (its entry of x, or the logarithm of the unbalance); `slopes` (p,): change of
+    x per change of the coordinate; `floor`: the least cost; `is_vanished`: True if distances are multiples of the standard
+    error of the number itself, not of its logarithm.
     """
 
     fitted: Fitted
@@ -60,41 +60,43 @@ class _Profile:
         """Return the rise of the cost at a `distance` in standard errors. If `is_exact`, all other unknowns are fitted;
         otherwise only the linear ones are fitted, and the others follow the quadratic form."""
         target = self.center + self.shift(distance)
-        problem, own_cost = self._held(target)
+        problem, known_cost = self._held(target)
         x = self.fitted.x + distance * self.spread * self.slopes
         if self.is_vanished:
             x[self.index] = target
         trial = minimize(problem, x)[0] if is_exact else project(problem, x)
-        return trial.cost + own_cost - self.floor
+        return trial.cost + known_cost - self.floor
 
     def _held(self, target: float) -> tuple[Problem, float]:
-        """Return the problem with the number held at `target`, and the cost of its own known value there."""
-        problem, tight = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
+        """Return the problem with the number held at `target`, and the cost of its known value at `target`."""
+        problem, relative_error = self.fitted.problem, _TIGHT_ERROR * min(self.spread, 1.0)
         if self.is_unbalance:
             known, value = problem.unbalances[self.index], math.exp(target)
             unbalances = list(problem.unbalances)
-            unbalances[self.index] = Known(value, tight * value)
-            own_cost = 0.0 if known is None else ((known.value - value) / known.error) ** 2
-            return problem._replace(unbalances=tuple(unbalances)), own_cost
+            unbalances[self.index] = Known(value, relative_error * value)
+            known_cost = 0.0 if known is None else ((known.value - value) / known.error) ** 2
+            return problem._replace(unbalances=tuple(unbalances)), known_cost
         means, precisions = problem.means.copy(), problem.precisions.copy()
-        own_cost = float(precisions[self.index] * (target - means[self.index]) ** 2)
-        means[self.index], precisions[self.index] = target, 1.0 / tight**2
-        return problem._replace(means=means, precisions=precisions), own_cost
+        known_cost = float(precisions[self.index] * (target - means[self.index]) ** 2)
+        means[self.index], precisions[self.index] = target, 1.0 / relative_error**2
+        return problem._replace(means=means, precisions=precisions), known_cost
 
     def end(self, side: float) -> float:
-        """Return the end of the interval on one side, in standard errors from the center; infinite without an end.
+        """Return the distance of an end of the interval from the center, in standard errors; infinite if there is no end.
+
+        **Arguments**: `side`: -1 for the lower end, 1 for the upper end.
 
         The square root of the rise is nearly proportional to the distance. The secant method therefore finds the end in a few
         steps.
         """
-        last, root, distance = 0.0, 0.0, _COMPARED_DISTANCE
+        last_distance, last_root, distance = 0.0, 0.0, _COMPARED_DISTANCE
         for _ in range(8):
-            new = math.sqrt(max(self.rise(side * distance, is_exact=True), 0.0))
-            if abs(new - QUANTILE) < 0.01 * QUANTILE:
+            new_root = math.sqrt(max(self.rise(side * distance, is_exact=True), 0.0))
+            if abs(new_root - QUANTILE) < 0.01 * QUANTILE:
                 return distance
-            slope = (new - root) / (distance - last)
-            last, root = distance, new
-            distance += (QUANTILE - new) / slope if slope > 0.0 else math.inf
+            slope = (new_root - last_root) / (distance - last_distance)
+            last_distance, last_root = distance, new_root
+            distance += (QUANTILE - new_root) / slope if slope > 0.0 else math.inf
             if not 0.0 < distance < _MAX_DISTANCE:
                 return math.inf
         return math.inf
@@ -104,31 +106,31 @@ def profile_intervals(fitted: Fitted, known: Information) -> Mapping[str, tuple[
     """Return the distances of the ends of the intervals from the fitted values, by the names of the numbers in which the cost
     is not quadratic. A distance is a change of the number's entry of x, or of the logarithm of an unbalance.
 
-    A number that is not distinguishable from 0 has no lower end. Undetermined numbers are left out.
+    A number that is not distinguishable from 0 has the lower distance minus infinity. Undetermined numbers are left out.
 
-    **Arguments**: `fitted`, and what is `known` about its numbers.
+    **Arguments**: `fitted`, and `known`: the `Information` about its numbers.
     """
     problem, p, number_count = fitted.problem, fitted.x.size, len(fitted.problem.unknowns.numbers)
     data, prior, sizes = in_polar_unbalances(fitted)
-    free = free_unbalances(problem)
-    own = np.array([*range(p), *(p + 2 * k for k in free)], int)
+    free_exciters = free_unbalances(problem)
+    own = np.array([*range(p), *(p + 2 * k for k in free_exciters)], int)
     covariance = np.linalg.pinv(eliminate(data + prior, own), rcond=1e-13, hermitian=True)
-    floor, found = project(problem, fitted.x).cost, {}
+    floor, intervals = project(problem, fitted.x).cost, {}
     for i, name in enumerate(known.names):
         if not known.determined[i]:
             continue
         is_unbalance, is_vanished = i >= number_count, bool(known.vanished[i])
         place = p + i - number_count if is_unbalance else i
-        index = free[i - number_count] if is_unbalance else i
+        index = free_exciters[i - number_count] if is_unbalance else i
         center = math.log(sizes[index]) if is_unbalance else float(fitted.x[i])
         slopes, variance = covariance[:p, place] / covariance[place, place], covariance[place, place]
         if is_vanished:  # its information may be below the accuracy of the pseudoinverse
             slopes, variance = np.zeros(p), known.covariance[i, i]
         profile = _Profile(fitted, index, is_unbalance, center, math.sqrt(variance), slopes, floor, is_vanished)
         if is_vanished:
-            found[name] = -math.inf, profile.shift(profile.end(1.0))
+            intervals[name] = -math.inf, profile.shift(profile.end(1.0))
             continue
         rises = [profile.rise(side * _COMPARED_DISTANCE, is_exact=False) for side in (-1.0, 1.0)]
         if max(abs(rise / _COMPARED_DISTANCE**2 - 1.0) for rise in rises) > _MAX_DIFFERENCE:
-            found[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)
-    return found
+            intervals[name] = -profile.spread * profile.end(-1.0), profile.spread * profile.end(1.0)
+    return intervals

@@ -41,13 +41,14 @@ EXACT = 1e-4
 """Relative standard deviation of an unbalance that counts as known exactly."""
 
 _FILTER_LENGTHS = (1, 9, 49, 129, 513)
-"""Lengths to which filters are extended, so that a few programs serve all of them."""
+"""Lengths to which filters are extended with zeros, so that filters of nearly equal length share a program."""
 
 _MARGIN, _TIMES = 1.5, 64
-"""Margin of the highest natural frequency, and number of times at which the speed of a drive is evaluated for it."""
+"""Factor on the highest natural frequency, and number of times at which the speed of a drive is evaluated, for the choice of a
+sampling rate."""
 
 _DELAY_MARGIN = 2
-"""Steps by which readings and model are both delayed in addition, so that the interpolation has samples on both sides."""
+"""Number of steps by which both readings and model are delayed, so that the interpolation has samples on both sides."""
 
 
 class Known(NamedTuple):
@@ -69,11 +70,11 @@ class Problem(NamedTuple):
 
     - `scene` with the known values; `unknowns`, see `Unknowns`
     - `runs`: the samples of each run, padded to whole stretches
-    - of each run, without the padding: `masks` (n, C), True for samples that count; `raw` (n, C), readings without a filter;
+    - for each run, without the padding: `masks` (n, C), True for samples that count; `raw` (n, C), readings without a filter;
       `bounds` (n, C), 1 for readings clipped from above, -1 from below, otherwise 0; `times` (n,), s; `angles` of the rotors
       (n, E), rad
-    - `rotors`: of each run, the angles of the rotors as functions of time
-    - `means` and `precisions` (p,): known values of x, and 1/error^2, 0 for a free number
+    - `rotors`: for each run, the angles of the rotors as functions of time
+    - `means` and `precisions` (p,): known values of x, and 1/error^2 of these values; both are 0 for a free number
     - `marked`: True if the zero of the rotor's angle is the same mark in all runs
     - `unbalances`: for each exciter its known value, None if it is free
     - `angle_errors`, rad: standard error of the rotor's angle in each run, without the errors that are unknowns
@@ -439,7 +440,7 @@ def _delay_taps(delay: float) -> tuple[np.ndarray, np.ndarray]:
 
 @cached
 def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
-    """Return the matrices of mass, damping and stiffness."""
+    """Return the matrices (nd, nd) of mass, damping and stiffness."""
     model = linear_model(scene)
     return model.mass, model.carrier.damping, model.carrier.stiffness
 

@@ -8,11 +8,12 @@ the state at the samples is exact for the machine; three Gauss points per step i
 
     x_{k+1} = exp(A h) x_k + sum_j w_j h exp(A (h - c_j h)) B F(t_k + c_j h)
 
-The steps are computed in blocks: all blocks of a stretch of the record at once from zero, then the starts of the blocks from
-one another, then their contributions. Readings are linear in the unknowns of `LINEAR` order: the state at the first sample,
-the two components (a, b) of each unbalance, and the offsets. Derivatives by all other unknowns are forward derivatives of the
-same steps; those by errors of a rotor's angle (`RecordedDrive`) are responses to the changes of the force. The normal equations
-of a whole record are summed over stretches, which bounds the memory.
+The steps are computed in blocks: first the responses from the state zero in all blocks of a stretch of the record at once, then
+the state at the start of each block from that of the block before, then the responses to these states. Readings are linear in
+the state at the first sample, the two components (a, b) of each unbalance, and the offsets: these are the linear unknowns, in
+this order. Derivatives by all other unknowns are forward derivatives of the same steps; derivatives by errors of a rotor's
+angle (`RecordedDrive`) are responses to changes of the force. The normal equations of a whole record are sums over stretches,
+which bounds the memory.
 """
 
 from __future__ import annotations
@@ -50,9 +51,13 @@ class Unknowns(eqx.Module):
 
         value = first exp(x) for positive numbers,      value = first + scale x otherwise
 
-    **Attributes**: `numbers` of the scene; `first` and `scale` (n,) of each single number, `positive` (n,); `gains`: names of
-    the channels whose gains are unknown, exp(x) each, behind the numbers; `turns`: number of runs whose rotor angle has an
-    unknown zero, rad, behind the gains; `errors`: number of errors of rotor angles, in standard errors, behind the turns.
+    **Attributes** (x has the entries of the numbers, the gains, the turns and the errors, in this order)
+
+    - `numbers` (n,) of the scene; `first` (n,) and `scale` (n,), SI, of the equations above; `positive` (n,): True for positive
+      numbers
+    - `gains`: names of the channels whose gains are unknown; each gain is exp(x)
+    - `turns`: number of runs whose rotor angle has an unknown zero; x is this zero, rad
+    - `errors`: number of unknown errors of rotor angles; x is in standard errors
     """
 
     numbers: tuple[NamedNumber, ...] = eqx.field(static=True)
@@ -89,9 +94,9 @@ class Samples(eqx.Module):
 
     - `drives`: for each exciter the drive that turns its rotor in this run
     - `begin` and `end`, s: times of the first and the last sample
-    - `readings` (N, n, C): readings after the filter `data_filter` of `whitened`
+    - `readings` (N, n, C): readings after the filter to white noise, see `with_noise` in `jaxvib.identification.problem`
     - `weights` (N, n, C): 1/noise of each reading, 0 for readings that do not count
-    - `taps` (m + 1, C): filter of the model's readings
+    - `taps` (m + 1, C): filter to white noise for the readings of the model
     - `step` h, s
     - `amounts` by which the `actions` change the numbers `changed` of the scene in this run
     - `channels` that are compared, `changed` and `actions`, `turn`: index of the run's unknown zero of the angle, or None
@@ -138,7 +143,7 @@ def state_count(scene: Scene, channels: tuple[Channel, ...]) -> int:
 
 
 def rows_of_channel(scene: Scene, channel: Channel) -> Array:
-    """Return the row (nd,) by which the point of a channel moves in its direction."""
+    """Return the row (nd,) that gives the displacement of a channel's point in its direction from the coordinates."""
     place = scene.exciters[0].place if channel.at is None else channel.at
     place = jnp.asarray(place) if isinstance(place, tuple) else place
     axes, rows = scene.machine.mounting().axes, scene.machine.rows_at(place, f"channel {channel.name!r}: at")
@@ -271,8 +276,8 @@ def _built(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array) -> _Ste
 
 
 def _forces(samples: Samples, scene: Scene, x: Array, stretch: Array) -> tuple[Array, Array]:
-    """Return F (n, 4, 2 E) of each exciter, (horizontal, up), at the samples of a stretch and at the three Gauss points after
-    each, and its derivatives (m, n, 4, 2) by the errors of the rotor's angle."""
+    """Return F (n, 4, 2 E), (horizontal, up) for each exciter, at each sample of a stretch and at the three Gauss points of the
+    step that follows, and the derivatives (m, n, 4, 2) of F by the errors of the rotor's angle."""
     first, count = samples.errors
     n = samples.readings.shape[1]
     places = (stretch * n + jnp.arange(n))[:, None] + jnp.asarray([0.0, *GAUSS_POINTS])[None]
@@ -302,7 +307,7 @@ def _linear_columns(steps: _Steps, samples: Samples):
     ns, exciters, count = steps.power.shape[0], steps.inputs.shape[2], len(samples.channels)
     own, m = ns + 2 * exciters, samples.taps.shape[0] - 1
     first = jnp.concatenate([jnp.eye(ns), jnp.zeros((ns, 2 * exciters))], axis=1), jnp.zeros((m, count, own))
-    level = jnp.sum(samples.taps, axis=0)  # an offset that has always been there
+    level = jnp.sum(samples.taps, axis=0)  # the filtered value of a constant offset
 
     def columns(carry: tuple[Array, Array], force: Array) -> tuple[tuple[Array, Array], Array]:
         state, before = carry

@@ -13,7 +13,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.identification.records.agreement import ROTOR_KINDS, check_agreement, rotor_speed
 from jaxvib.identification.records.channel import UNITS, Channel
-from jaxvib.identification.records.pulses import numbered_pulses, rising_edges
+from jaxvib.identification.records.pulses import number_pulses, rising_edges
 from jaxvib.identification.records.recorded import described_channels, recorded_from_sep005
 from jaxvib.identification.records.sampling import clipped_at, even_samples, require_ascending
 from jaxvib.results.table import is_number
@@ -78,9 +78,9 @@ class MeasuredRun(eqx.Module):
         **Arguments**
 
         - `channels`: one `Channel` for each recorded quantity
-        - `times`, s: one array for all channels, or one for each by its name
-        - `values`, in the unit of each channel, by its name; for kind "pulses" the sampled signal, or nothing if `times` has
-          the times of the pulses
+        - `times`, s: one array (n,) for all channels, or a dictionary with an array for each channel by its name
+        - `values`: arrays (n,) in the unit of each channel, by its name; for kind "pulses" the sampled signal, or no entry if
+          `times` has the times of the pulses
         - `change`: numbers of the scene that were different in this run: "+10 kg" and "-10 kg" add to a number, "+5 %" scales
           it, "95 kg" replaces it
         - `source`: name of the run in messages
@@ -101,18 +101,21 @@ class MeasuredRun(eqx.Module):
         for name in names:
             if names.count(name) > 1:
                 raise InputError("channels", f"has the name {quoted(name)} twice; names must differ")
-        found = {channel.name: _read_channel(channel, times, values, source) for channel in channels}
+        samples = {channel.name: _read_channel(channel, times, values, source) for channel in channels}
         parsed = {name: parse_change(value, f"change[{quoted(name)}]") for name, value in (change or {}).items()}
-        its_times, its_values = {k: each.time for k, each in found.items()}, {k: each.value for k, each in found.items()}
+        times_by_name, values_by_name = (
+            {k: each.time for k, each in samples.items()},
+            {k: each.value for k, each in samples.items()},
+        )
         grids: dict[tuple[int, float, float], np.ndarray] = {}  # channels with the same times share one array
         for channel in channels:
-            time = its_times[channel.name]
+            time = times_by_name[channel.name]
             if channel.kind != "pulses":
-                its_times[channel.name] = grids.setdefault((time.size, time[0], time[-1]), time)
-        notes = [note for each in found.values() for note in each.notes]
-        notes += check_agreement(channels, its_times, its_values, source)
-        clipped = {name: each.clipped for name, each in found.items()}
-        return cls(tuple(channels), its_times, its_values, clipped, parsed, tuple(notes), source)
+                times_by_name[channel.name] = grids.setdefault((time.size, time[0], time[-1]), time)
+        notes = [note for each in samples.values() for note in each.notes]
+        notes += check_agreement(channels, times_by_name, values_by_name, source)
+        clipped = {name: each.clipped for name, each in samples.items()}
+        return cls(tuple(channels), times_by_name, values_by_name, clipped, parsed, tuple(notes), source)
 
     @classmethod
     @validated
@@ -148,7 +151,7 @@ class MeasuredRun(eqx.Module):
 
         Channels of pulses, and channels that do not begin at 0 s, have a list `time` (s).
         """
-        found = []
+        entries = []
         for channel in self.channels:
             time = self.times[channel.name]
             entry: dict[str, Any] = {"name": channel.name, "data": self.values[channel.name], "unit_str": UNITS[channel.kind]}
@@ -158,8 +161,8 @@ class MeasuredRun(eqx.Module):
                 entry["fs"] = self.rate(channel.name)
             if channel.kind == "pulses" or time[0] != 0.0:
                 entry["time"] = time.tolist()
-            found.append(entry)
-        return found
+            entries.append(entry)
+        return entries
 
     def of_kind(self, *kinds: str) -> tuple[Channel, ...]:
         """Return the channels of the given `kinds`."""
@@ -204,7 +207,7 @@ def parse_change(value: Number, field: str) -> Change:
 
 
 class _Samples(NamedTuple):
-    """Samples of a channel: `time` s, `value` in SI units, True in `clipped` at the end of the range, `notes`."""
+    """Samples of a channel: `time` (n,) s, `value` (n,) in SI units, `clipped` (n,): True at an end of the range, `notes`."""
 
     time: np.ndarray
     value: np.ndarray
@@ -226,7 +229,7 @@ def _read_channel(
     if name not in values:
         if channel.kind != "pulses" or not isinstance(times, Mapping):
             raise InputError("values", f"has no entry {quoted(name)}; it has: {', '.join(values) or 'none'}")
-        time, number, notes = numbered_pulses(time, where)
+        time, number, notes = number_pulses(time, where)
         return _Samples(time, number, np.zeros(time.size, bool), notes)
     value = _as_samples(values[name], where)
     if channel.factor != 1.0 or value is values[name]:  # a copy, but no second one of a long recording
@@ -236,7 +239,7 @@ def _read_channel(
     if channel.kind == "pulses":
         require_ascending(time, where)
         edges = rising_edges(time, value if channel.direction[1] >= 0.0 else -value, where)
-        edges, number, notes = numbered_pulses(edges, where)
+        edges, number, notes = number_pulses(edges, where)
         return _Samples(edges, number, np.zeros(edges.size, bool), notes)
     time, value, notes = even_samples(time, value, where)
     low, high = (-np.inf, np.inf) if channel.kind in ("speed", "angle") else clipped_at(value)
@@ -252,9 +255,9 @@ def _read_channel(
 
 def _as_samples(values: ArrayLike, where: str) -> np.ndarray:
     try:
-        found = np.asarray(values, dtype=float)
+        samples = np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError(where, "has entries that are not numbers; give one list of numbers") from error
-    if found.ndim != 1:
-        raise InputError(where, f"has an array of shape {found.shape}; one list of numbers is needed")
-    return found
+    if samples.ndim != 1:
+        raise InputError(where, f"has an array of shape {samples.shape}; one list of numbers is needed")
+    return samples

@@ -1,7 +1,8 @@
-"""First values of an identification: steady amplitudes of the machine fitted to the amplitudes of the record, turn by turn.
+"""First values of an identification: the steady amplitudes of the machine are fitted to the amplitudes of the records.
 
-The machine has no time to reach these amplitudes in a run-up, but their peaks lie near those of the record from any first
-values. The fit of the whole record continues from here.
+In a run-up the machine does not reach its steady amplitudes, but their peaks over speed lie near the peaks of the record. The
+fit of the whole records starts from the resulting values, and a second time from the first values of the scene; the better fit
+counts.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 
 _WINDOWS = 128
-"""Number of stretches of a run, of whole turns, that have one amplitude each."""
+"""Largest number of stretches of a run, each of whole turns, for each of which one amplitude is computed."""
 
 _PRIOR_WEIGHT = 0.05
 """Weight of the logarithm of the change of an unknown, relative to that of the logarithm of an amplitude."""
@@ -30,10 +31,11 @@ _PRIOR_WEIGHT = 0.05
 def amplitudes(
     readings: np.ndarray, mask: np.ndarray, angle: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the speeds (W,), rad/s, of W stretches, the amplitudes (W, C) of C channels at the rotor's angle, and their
-    weights.
+    """Return the speeds (W,), rad/s, in W stretches, the amplitudes (W, C) of the vibrations of C channels at the rotor's
+    speed, and their weights (W, C) between 0 and 1.
 
-    Each stretch of whole turns is fitted by c + a cos(angle) + b sin(angle). The weight compares the amplitude with the rest.
+    The readings of each stretch of whole turns are fitted by c + a cos(angle) + b sin(angle). The weight is small if the
+    amplitude is not above its standard error.
 
     >>> angle = np.linspace(0.0, 300.0, 20000)
     >>> speed, size, weight = amplitudes(2.0 * np.cos(angle)[:, None], np.ones((20000, 1), bool), angle, 1e-3)
@@ -89,7 +91,8 @@ def _steady(unknowns: Unknowns, samples: Samples, scene: Scene, x: Array, speeds
 
 @cached
 def _track(unknowns: Unknowns, runs: tuple[Samples, ...], scene: Scene, data: tuple[tuple[Array, Array, Array], ...]) -> Array:
-    """Return the unknowns whose steady amplitudes resemble those of the runs, up to one factor for each run."""
+    """Return the unknowns (p,) for which the steady amplitudes have the same shape over speed as those of the runs: a common
+    factor of all amplitudes of a run is free."""
 
     def residual(x: Array, _: None) -> Array:
         parts = [_PRIOR_WEIGHT * x]

@@ -62,7 +62,7 @@ _FINE_ANGLE = 0.2
 """Largest angle, rad, between the times at which the torque of the vibration is computed."""
 
 _ACCURACY = 1e-5
-"""Error of the predicted angle, rad, below which the scatter of the pulses does not count as known."""
+"""Error of the predicted angle, rad: smallest noise of the rotor's angle in the fit, even if the pulses scatter less."""
 
 _OWN_PASSES = 2
 """Number of fits of vibrations and rotor together: with the scatter of the pulses, then with the noise of the first fit. The
@@ -154,8 +154,12 @@ def _runge_kutta(
 
 
 class _Run(NamedTuple):
-    """Run of a fit: its fine `samples`, those of its `rotor`, the places (f,) of its unknowns among all, its `own` unknowns
-    (first angle, first speed, delay, offsets of all marks but the first), and the `noise` of the rotor."""
+    """Run of a fit of vibrations and rotor.
+
+    **Attributes**: `samples` with smaller steps; `rotor`: samples of the rotor; `places` (f,): places of the run's unknowns
+    among all unknowns; `own`: number of unknowns of this run only (first angle, first speed, delay, offsets of all marks but
+    the first); `noise` of the rotor.
+    """
 
     samples: Samples
     rotor: RotorSamples
@@ -165,7 +169,7 @@ class _Run(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """Values `y` of all unknowns (x, linear ones, own ones of the rotors), with their cost and `equations`."""
+    """Values `y` of all unknowns (x, linear unknowns, unknowns of the rotors), with their cost and `equations`."""
 
     y: np.ndarray
     cost: float
@@ -246,7 +250,7 @@ def _runs(fitted: Fitted) -> tuple[list[_Run], np.ndarray]:
 
 
 def _parts(problem: Problem, run: _Run, y: np.ndarray) -> list[Array]:
-    """Return x, the state and the unbalance, and the own unknowns of a run."""
+    """Return x, the state at the first sample with the unbalance, and the unknowns of this run only."""
     x, linear = y[: problem.unknowns.count], y[run.places[problem.unknowns.count - problem.unknowns.errors :]]
     return [jnp.asarray(each) for each in (x, linear[: -run.own], linear[-run.own :])]
 
@@ -258,7 +262,7 @@ def _deviations_of(problem: Problem, run: _Run, y: np.ndarray) -> list[np.ndarra
 
 
 def _predicted_drive(problem: Problem, run: _Run, rotor: RotorAngle, y: np.ndarray) -> RecordedDrive:
-    """Return the drive that follows the predicted angle of a run, with the errors of the recorded one."""
+    """Return the drive that follows the predicted angle of a run, with the errors of the recorded angle."""
     x, part, own = _parts(problem, run, y)
     time, *found = map(np.asarray, _predicted(problem.unknowns, run.samples, problem.scene, x, part, own[:2]))
     return recorded_drive(time, [np.column_stack([each, rotor.spline(time, k)[:, 1:]]) for k, each in enumerate(found)])

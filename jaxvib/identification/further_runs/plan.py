@@ -26,9 +26,10 @@ class RunPlan(Result):
     **Attributes** (c candidates, k numbers)
 
     - `candidates` (c,): names of the runs, the best one first; `numbers` (k,): names of the numbers
-    - `errors` (c, k): expected relative standard errors with the runs so far and this one, infinite if not determined
-    - `now` (k,): relative standard errors with the runs so far
-    - `minutes` (c,): durations
+    - `errors` (c, k): expected relative standard errors after the runs so far and the candidate, infinite for numbers that
+      remain undetermined
+    - `now` (k,): relative standard errors after the runs so far
+    - `minutes` (c,): durations, min
     - `benefit` (c,): sum over the numbers of the logarithm of the ratio of errors before and after, per minute of test. An
       undetermined number counts as an error of 1
     - `profile`: the `SpeedProfile` of the run with the optimized speed; None without limits, and if no such run is better than
@@ -73,9 +74,9 @@ class RunPlan(Result):
 
 @validated
 def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping[str, Number] | None = None) -> RunPlan:
-    """Return the errors that the fitted numbers would have after each of some candidate runs, without making them.
+    """Return the errors that the fitted numbers would have after each candidate run, computed before any of them is recorded.
 
-        errors^2 = diagonal of (F_so_far + F_candidate)^-1,       F = J^T J / noise^2
+        errors^2 = diagonal of (F_so_far + F_candidate)^-1,       F = J^T J / noise^2,       J = d readings / d unknowns
 
     - F is the Fisher information about the unknown numbers and the gains of the sensors; the state at the first sample and the
       offsets of the candidate are free, and so is the zero of the rotor's angle, unless a channel of kind pulses or angle has
@@ -91,7 +92,7 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     - `fit` from `identify`
     - `candidates`: a `PlannedRun` each
     - `limits`: {"speed": largest rotor speed, rad/s, "acceleration": largest absolute angular acceleration, rad/s^2}; typical:
-      {"speed": "1500 rpm", "acceleration": "10 rad/s^2"}; default: no such run
+      {"speed": "1500 rpm", "acceleration": "10 rad/s^2"}; default: no run with an optimized speed
 
     **Returns** `RunPlan`, the candidates in the order of their `benefit`. **Raises** `InputError` for a channel whose noise is
     unknown, and for a candidate beyond the limits.
@@ -112,25 +113,25 @@ def plan_runs(fit: MachineFit, candidates: Sequence[PlannedRun], limits: Mapping
     """
     if not candidates:
         raise InputError("candidates", "is empty; give at least one PlannedRun")
-    bounds = None if limits is None else read_limits(limits)
-    if bounds is not None:
+    checked_limits = None if limits is None else read_limits(limits)
+    if checked_limits is not None:
         for each in candidates:
-            require_within(each, bounds)
+            require_within(each, checked_limits)
     k = len(fit.names)
     runs = [expected_run(fit, each) for each in candidates]
     errors = [expected_errors(fit.information + expected_information(fit, each), k) for each in runs]
     now, minutes = expected_errors(fit.information, k), [each.duration / 60.0 for each in candidates]
     benefit = [_benefit(now, *each) for each in zip(errors, minutes, strict=True)]
     names, profile = [each.name for each in candidates], None
-    if bounds is not None:
+    if checked_limits is not None:
         best = int(np.argmax(benefit))
-        profile = optimized_profile(fit, candidates[best], runs[best], bounds)
+        profile = optimized_profile(fit, candidates[best], runs[best], checked_limits)
         planned = eqx.tree_at(lambda run: run.drive, candidates[best], profile)
-        better = expected_errors(fit.information + expected_information(fit, expected_run(fit, planned)), k)
-        if _benefit(now, better, minutes[best]) > benefit[best]:
+        optimized_errors = expected_errors(fit.information + expected_information(fit, expected_run(fit, planned)), k)
+        if _benefit(now, optimized_errors, minutes[best]) > benefit[best]:
             names.append(f"{names[best]}, optimized speed")
-            errors.append(better)
-            benefit.append(_benefit(now, better, minutes[best]))
+            errors.append(optimized_errors)
+            benefit.append(_benefit(now, optimized_errors, minutes[best]))
             minutes.append(minutes[best])
         else:
             profile = None

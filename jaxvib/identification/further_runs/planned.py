@@ -82,8 +82,8 @@ class PlannedRun(eqx.Module):
 class Expected(NamedTuple):
     """Planned run at the numbers of a fit.
 
-    **Attributes**: `fitted` without iterations; `own`: places of the unknowns that the run shares with the fit, among those of
-    the run; `place` of them in the information of the fit.
+    **Attributes**: `fitted`: a fit without iterations; `own`: places of the shared unknowns of the run and the fit among the
+    unknowns of the run; `place`: their places in the information of the fit.
     """
 
     fitted: Fitted
@@ -91,7 +91,8 @@ class Expected(NamedTuple):
     place: np.ndarray
 
     def shared(self, information: np.ndarray, size: int) -> np.ndarray:
-        """Return the information (size, size) of the run about the unknowns of the fit, from that about its own unknowns."""
+        """Return the information (size, size) of the run about the unknowns of the fit, from its `information` about all
+        unknowns of the run."""
         total = np.zeros((size, size))
         total[np.ix_(self.place, self.place)] = eliminate(information, self.own)
         return total
@@ -107,21 +108,21 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
     for names, noise, time in reversed(list(zip(fit.channels, fit.noise, fit.time, strict=True))):
         deviations |= dict(zip(names, noise * math.sqrt(time[1] - time[0]), strict=True))
     deviations |= {name: each / math.sqrt(planned.rate) for name, each in planned.noise.items()}
-    moving = [channel for channel in planned.channels if channel.kind in MOTIONS]
-    for channel in moving:
+    vibration_channels = [channel for channel in planned.channels if channel.kind in MOTIONS]
+    for channel in vibration_channels:
         if channel.name not in deviations:
             there = f"channel {quoted(channel.name)}"
             raise InputError(f"candidates: {planned.name}: {there}", "is new; give its noise, noise={name: standard deviation}")
     time = np.arange(0.0, planned.duration, 1.0 / planned.rate)
-    readings = {channel.name: np.zeros(time.size) for channel in moving}
-    run = MeasuredRun.from_arrays(moving, time, readings, planned.change, planned.name)
+    readings = {channel.name: np.zeros(time.size) for channel in vibration_channels}
+    run = MeasuredRun.from_arrays(vibration_channels, time, readings, planned.change, planned.name)
     exciter, count = fit.scene.exciters[0], len(fit.scene.exciters)
     if count > 1:
         raise InputError("fit.scene", f"has {count} exciters; plan_runs needs a scene with one exciter")
     scene = eqx.tree_at(lambda s: s.exciters[0], fit.scene, exciter.with_parts(None, planned.drive))
     problem = build_problem(scene, [run], vibrating(fit), {})
     root = math.sqrt(float(problem.runs[0].step))
-    problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name]) / root) for c in moving]])
+    problem = with_noise(problem, [[Noise(np.ones(1), float(deviations[c.name]) / root) for c in vibration_channels]])
     problem = problem._replace(precisions=own_precisions(fit, problem))
     size = float(np.asarray(exciter.unbalance, float))
     fitted = information_at(problem, size * np.array([np.cos(fit.phase[0]), np.sin(fit.phase[0])]))
@@ -130,7 +131,7 @@ def expected_run(fit: MachineFit, planned: PlannedRun) -> Expected:
 
 
 def vibrating(fit: MachineFit) -> list[str]:
-    """Return the names of the numbers of a fit, without those of the motor, which the vibrations do not determine."""
+    """Return the names of the numbers of a fit without numbers of the motor, which the vibrations do not determine."""
     return [name for name in fit.names if "drive." not in name]
 
 
@@ -144,20 +145,20 @@ def own_precisions(fit: MachineFit, problem: Problem) -> np.ndarray:
 
 
 def shared_places(fit: MachineFit, problem: Problem, has_mark: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places of the unknowns that a run shares with a fit: among those of the run, and in `fit.information`.
+    """Return the places of the shared unknowns of a run and a fit: among the unknowns of the run, and in `fit.information`.
 
     **Arguments**: `has_mark`: True if the zero of the rotor's angle in the run is that of the fit.
     """
     unknowns, p, count = problem.unknowns, problem.unknowns.count, len(fit.names)
-    names, moved = [number.name for number in unknowns.numbers], len(unknowns.numbers)
+    names, number_count = [number.name for number in unknowns.numbers], len(unknowns.numbers)
     pairs = [(at, fit.names.index(name)) for at, name in enumerate(names)]
     unbalances = {f"exciters[{k}].unbalance": p + 2 * k for k in range(len(problem.unbalances))}
     pairs += [(at, fit.names.index(name)) for name, at in unbalances.items() if name in fit.names]
     gains = enumerate(unknowns.gains)
-    pairs += [(moved + at, count + fit.gain_names.index(name)) for at, name in gains if name in fit.gain_names]
+    pairs += [(number_count + at, count + fit.gain_names.index(name)) for at, name in gains if name in fit.gain_names]
     pairs += [(p + 1, count + len(fit.gain_names))] * has_mark
-    own, place = np.array(pairs, int).T
-    return own, place
+    places_in_run, places_in_fit = np.array(pairs, int).T
+    return places_in_run, places_in_fit
 
 
 def expected_information(fit: MachineFit, expected: Expected) -> np.ndarray:
@@ -168,5 +169,5 @@ def expected_information(fit: MachineFit, expected: Expected) -> np.ndarray:
 
 def expected_errors(information: np.ndarray, count: int) -> np.ndarray:
     """Return the relative standard errors (count,) of the numbers, infinite for those that are not determined."""
-    found = covariance_of(eliminate(information, np.arange(count)))
-    return np.where(found.determined, np.sqrt(np.diagonal(found.covariance)), np.inf)
+    result = covariance_of(eliminate(information, np.arange(count)))
+    return np.where(result.determined, np.sqrt(np.diagonal(result.covariance)), np.inf)

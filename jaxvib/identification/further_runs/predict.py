@@ -1,4 +1,4 @@
-"""Prediction of a held-out run by a fit, and its comparison with the readings."""
+"""Prediction of a run that a fit did not use, and comparison of the prediction with the readings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 
 _NOISE_RATIO = 1.5
-"""Ratio of the residuals to the noise of the fit above which the model is said to lack a part."""
+"""Ratio of the residuals to the noise of the fit above which a note says that they are too large, and the status is
+`patterned`."""
 
 
 class PredictionStatus(eqx.Enumeration):
@@ -192,6 +193,6 @@ def _deviation(fit: MachineFit, at: _Predicted) -> Disagreement:
     part[np.ix_(place, place)] = eliminate(matrix, own)
     gradient[place] = elimination(matrix, own).T @ slope
     names = [*fit.names, *(f"the gain of channel {name!r}" for name in fit.gain_names), "the angle (rad) of the unbalance"]
-    # The gradient at the numbers that fit the run and the records of the fit together.
+    # Change to the gradient at the numbers of a common fit of the run and the records of the fit.
     gradient = fit.information @ pseudoinverse(fit.information + part)[0] @ gradient
     return disagreement(fit.information, part, gradient, names)

@@ -24,7 +24,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, number
 
 _SEGMENTS = 8
-"""Number of parts of a run with constant accelerations."""
+"""Number of equal parts of a run; the acceleration is constant in each part."""
 
 _MAX_ITERATIONS = 30
 
@@ -89,7 +89,7 @@ def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, 
         value, gradient = _spread(fit, expected, times, shares * limits.speed)
         return value, gradient * limits.speed
 
-    found = minimize(
+    optimum = minimize(
         objective,
         np.clip(speeds / limits.speed, 0.0, 1.0),
         jac=True,
@@ -98,7 +98,7 @@ def optimized_profile(fit: MachineFit, planned: PlannedRun, expected: Expected, 
         constraints={"type": "ineq", "fun": lambda v: 1.0 - rows @ v, "jac": lambda v: -rows},
         options={"maxiter": _MAX_ITERATIONS, "ftol": 1e-3},
     )
-    return SpeedProfile(times, np.clip(found.x, 0.0, 1.0) * limits.speed)
+    return SpeedProfile(times, np.clip(optimum.x, 0.0, 1.0) * limits.speed)
 
 
 def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.ndarray) -> tuple[float, np.ndarray]:
@@ -116,9 +116,9 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
         x, linear = jnp.asarray(fitted.x), jnp.asarray(fitted.linear[place])
         return _information(problem.unknowns, problem.runs[0], problem.scene, x, linear, jnp.asarray(times), speeds)
 
-    found, pull = jax.vjp(of_run, jnp.asarray(speeds))
+    equations, vector_product = jax.vjp(of_run, jnp.asarray(speeds))
     run = np.zeros_like(fitted.information)
-    run[np.ix_(where, where)] = np.asarray(found)[:-1, :-1]
+    run[np.ix_(where, where)] = np.asarray(equations)[:-1, :-1]
     data, known, _ = in_polar_unbalances(fitted._replace(information=run))
     inner = elimination(data + known, expected.own)
     total = fit.information + expected.shared(data + known, len(fit.information))
@@ -129,9 +129,9 @@ def _spread(fit: MachineFit, expected: Expected, times: np.ndarray, speeds: np.n
     weights = -0.5 * outer @ (covariance / variances) @ covariance @ outer.T
     polar, _ = polar_unbalances(problem, fitted.linear)
     weights = polar @ inner @ weights[np.ix_(expected.place, expected.place)] @ inner.T @ polar.T
-    padded = np.zeros(found.shape)
+    padded = np.zeros(equations.shape)
     padded[:-1, :-1] = weights[np.ix_(where, where)]
-    (gradient,) = pull(jnp.asarray(padded))
+    (gradient,) = vector_product(jnp.asarray(padded))
     return 0.5 * float(np.sum(np.log(variances))), np.asarray(gradient)
 
 

@@ -32,11 +32,11 @@ _OTHER_UNITS = {
 """Units that a file may have in place of the stated one."""
 
 _SPEED_ERROR, _MOTION_ERROR, _UNIT_ERROR = 0.03, 0.3, 0.15
-"""Largest relative differences between two speeds and between two motions, and between two motions if another unit explains
-them."""
+"""Largest allowed relative difference between two speeds, and between two motions; largest relative difference between the
+ratio of two motions and the ratio of two units that explains it."""
 
 _COHERENT, _STRONG = 0.9, 1e-3
-"""Smallest coherence of a frequency that is compared, and smallest power relative to the largest one."""
+"""Smallest coherence at a frequency that is compared, and smallest power at this frequency relative to the largest power."""
 
 _SEGMENTS = 8
 """Number of segments of a record whose spectra are averaged."""
@@ -75,41 +75,41 @@ def check_agreement(
 
 
 def rotor_speed(channel: Channel, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and the speed of the rotor, rad/s, from a channel of pulses, angle or speed; on average over each turn for
-    pulses, whose marks may be uneven."""
+    """Return times, s, and the speed of the rotor, rad/s, from a channel of pulses, angle or speed. For pulses the speed is the
+    average over each turn, because marks may be unevenly spaced."""
     if channel.kind == "speed":
-        known = np.isfinite(value)
-        return time[known], value[known]
-    turned, step = (
+        is_finite = np.isfinite(value)
+        return time[is_finite], value[is_finite]
+    angles, stride = (
         (2.0 * np.pi * value / channel.per_turn, channel.per_turn)
         if channel.kind == "pulses"
         else (value, max(1, time.size // 500))
     )
-    known = np.isfinite(turned[::step])
-    turned, time = turned[::step][known], time[::step][known]
-    return 0.5 * (time[1:] + time[:-1]), np.diff(turned) / np.diff(time)
+    is_finite = np.isfinite(angles[::stride])
+    angles, time = angles[::stride][is_finite], time[::stride][is_finite]
+    return 0.5 * (time[1:] + time[:-1]), np.diff(angles) / np.diff(time)
 
 
-def _compare_speeds(one: _Signal, other: _Signal, source: str) -> list[str]:
+def _compare_speeds(reference_signal: _Signal, other: _Signal, source: str) -> list[str]:
     """Compare two speeds of the rotor; `other` is the one whose unit is in doubt."""
-    inside = (one.time > other.time[0]) & (one.time < other.time[-1])
+    inside = (reference_signal.time > other.time[0]) & (reference_signal.time < other.time[-1])
     if np.count_nonzero(inside) < 4:
         return []
-    time, reference = one.time[inside], one.value[inside]
+    time, reference = reference_signal.time[inside], reference_signal.value[inside]
     speed = np.interp(time, other.time, other.value)
-    turning = np.abs(reference) > 0.05 * np.max(np.abs(reference))
-    ratio = float(np.median(speed[turning] / reference[turning]))
-    where, name = f"{source}: channel {quoted(other.channel.name)}", quoted(one.channel.name)
+    is_turning = np.abs(reference) > 0.05 * np.max(np.abs(reference))
+    ratio = float(np.median(speed[is_turning] / reference[is_turning]))
+    where, name = f"{source}: channel {quoted(other.channel.name)}", quoted(reference_signal.channel.name)
     if abs(abs(ratio) - 1.0) <= _SPEED_ERROR:
         if ratio < 0.0 and other.channel.kind != "speed":
             raise InputError(where, f"turns against {name}; reverse the sign of one of them")
-        return _drift(one, other, np.sign(ratio), source)
+        return _drift(reference_signal, other, np.sign(ratio), source)
     if other.channel.kind == "speed":
-        fits = _fitting_unit(other.channel, 1.0 / abs(ratio), _SPEED_ERROR)
-        if fits:
+        fitting_unit = _fitting_unit(other.channel, 1.0 / abs(ratio), _SPEED_ERROR)
+        if fitting_unit:
             problem = f"is {abs(ratio):.4g} times the speed of {name}"
-            raise InputError(where, f"{problem}; the unit {quoted(fits)} would fit")
-    scatter = float(np.median(np.abs(speed[turning] / reference[turning] / ratio - 1.0)))
+            raise InputError(where, f"{problem}; the unit {quoted(fitting_unit)} would fit")
+    scatter = float(np.median(np.abs(speed[is_turning] / reference[is_turning] / ratio - 1.0)))
     if scatter > _SPEED_ERROR:
         raise InputError(
             where, f"and {name} are not the speed of one rotor: their ratio changes by {scatter:.0%}; leave one out"
@@ -127,32 +127,33 @@ def _fitting_unit(channel: Channel, factor: float, error: float) -> str | None:
     return None
 
 
-def _drift(one: _Signal, other: _Signal, sign: float, source: str) -> list[str]:
+def _drift(reference_signal: _Signal, other: _Signal, sign: float, source: str) -> list[str]:
     """Return a note if the clock of one speed drifts against that of the other: while the speed changes at the rate a, a
     delay of d + e t changes the reading by -a (d + e t)."""
-    inside = (one.time > other.time[0]) & (one.time < other.time[-1])
-    time, reference = one.time[inside], one.value[inside]
+    inside = (reference_signal.time > other.time[0]) & (reference_signal.time < other.time[-1])
+    time, reference = reference_signal.time[inside], reference_signal.value[inside]
     if time.size < 32:
         return []
     rate = np.gradient(reference, time)
-    late = time - time[0]
-    columns = np.stack([reference, -rate, -rate * late], axis=1)
+    elapsed = time - time[0]
+    columns = np.stack([reference, -rate, -rate * elapsed], axis=1)
     difference = sign * np.interp(time, other.time, other.value)
     scale = np.linalg.norm(columns, axis=0)
     if np.min(scale) < 1e-9 * np.max(np.abs(reference)) or np.linalg.cond(columns / scale) > 1e3:
         return []
-    found, *_ = np.linalg.lstsq(columns / scale, difference, rcond=None)
-    left = difference - columns / scale @ found
-    spread = (
-        np.sqrt(np.sum(left**2) / (time.size - 3) * np.diag(np.linalg.inv((columns / scale).T @ (columns / scale)))) / scale
+    coefficients, *_ = np.linalg.lstsq(columns / scale, difference, rcond=None)
+    residuals = difference - columns / scale @ coefficients
+    errors = (
+        np.sqrt(np.sum(residuals**2) / (time.size - 3) * np.diag(np.linalg.inv((columns / scale).T @ (columns / scale))))
+        / scale
     )
-    drift, error = found[2] / scale[2], max(float(spread[2]), 1e-7)
-    moved = abs(drift) * late[-1]
-    if abs(drift) < _DRIFT * error or moved * float(np.max(np.abs(reference))) < 0.1:
+    drift, error = coefficients[2] / scale[2], max(float(errors[2]), 1e-7)
+    final_delay = abs(drift) * elapsed[-1]
+    if abs(drift) < _DRIFT * error or final_delay * float(np.max(np.abs(reference))) < 0.1:
         return []
-    pair = f"{quoted(one.channel.name)} and {quoted(other.channel.name)}"
+    pair = f"{quoted(reference_signal.channel.name)} and {quoted(other.channel.name)}"
     return [
-        f"{source}: the clocks of {pair} drift by {1e3 * moved:.3g} ms over the record ({1e6 * abs(drift):.3g} ppm); "
+        f"{source}: the clocks of {pair} drift by {1e3 * final_delay:.3g} ms over the record ({1e6 * abs(drift):.3g} ppm); "
         "record both by one device, or leave one out"
     ]
 
@@ -161,16 +162,20 @@ def _check_motions(motions: Sequence[_Signal], source: str) -> None:
     """Compare motions of the same point in the same direction."""
     pairs = [pair for pair in itertools.combinations(motions, 2) if _same_place(pair[0].channel, pair[1].channel)]
     factors = {(one.channel.name, other.channel.name): _factor(one, other) for one, other in pairs}
-    wrong = [pair for pair in pairs if not _agrees(factors[pair[0].channel.name, pair[1].channel.name])]
-    for (a, b), (c, d) in itertools.combinations(wrong, 2):
+    disagreeing = [pair for pair in pairs if not _agrees(factors[pair[0].channel.name, pair[1].channel.name])]
+    for (a, b), (c, d) in itertools.combinations(disagreeing, 2):
         for first, second, third, fourth in ((a, b, c, d), (a, b, d, c)):
-            alike = second.channel.kind == fourth.channel.kind
-            if alike and _agrees(_factor(first, fourth), known=True) and _agrees(_factor(third, second), known=True):
+            same_kind = second.channel.kind == fourth.channel.kind
+            if (
+                same_kind
+                and _agrees(_factor(first, fourth), is_required=True)
+                and _agrees(_factor(third, second), is_required=True)
+            ):
                 names = f"{quoted(second.channel.name)} and {quoted(fourth.channel.name)}"
                 raise InputError(
                     f"{source}: channels {names}", "are swapped: each fits the other's place; exchange their places"
                 )
-    for one, other in wrong:
+    for one, other in disagreeing:
         factor = factors[one.channel.name, other.channel.name]
         assert factor is not None
         where, name = f"{source}: channel {quoted(other.channel.name)}", quoted(one.channel.name)
@@ -191,12 +196,13 @@ def _same_place(one: Channel, other: Channel) -> bool:
     return one.at == other.at and abs(across) < 1e-6
 
 
-def _agrees(factor: complex | None, known: bool = False) -> bool:
-    return not known if factor is None else abs(factor - 1.0) <= _MOTION_ERROR
+def _agrees(factor: complex | None, is_required: bool = False) -> bool:
+    return not is_required if factor is None else abs(factor - 1.0) <= _MOTION_ERROR
 
 
 def _factor(one: _Signal, other: _Signal) -> complex | None:
-    """Return Y / ((i w)^d X) of two motions X, Y, positive if their directions agree; None without coherent frequencies."""
+    """Return the median of Y / ((i w)^d X) of two motions X, Y over the coherent frequencies, with the sign for equal
+    directions; None without coherent frequencies. It is 1 if the channels agree."""
     step = max(float(np.median(np.diff(each.time))) for each in (one, other))
     start, end = max(one.time[0], other.time[0]), min(one.time[-1], other.time[-1])
     count = int((end - start) / step)
@@ -217,12 +223,12 @@ def _factor(one: _Signal, other: _Signal) -> complex | None:
     w = 2.0 * np.pi * np.fft.rfftfreq(length, step)
     with np.errstate(divide="ignore", invalid="ignore"):
         coherence = np.abs(xy) ** 2 / (xx * yy)
-        strong = (coherence > _COHERENT) & (xx > _STRONG * np.max(xx[2:])) & (yy > _STRONG * np.max(yy[2:]))
-        strong &= (np.arange(w.size) >= 2) & (w < 0.8 * np.pi / step)
+        is_strong = (coherence > _COHERENT) & (xx > _STRONG * np.max(xx[2:])) & (yy > _STRONG * np.max(yy[2:]))
+        is_strong &= (np.arange(w.size) >= 2) & (w < 0.8 * np.pi / step)
         factors = xy / xx / (1j * w) ** (_ORDERS[other.channel.kind] - _ORDERS[one.channel.kind])
-    if np.count_nonzero(strong) < 2:
+    if np.count_nonzero(is_strong) < 2:
         return None
-    return complex(np.median(factors[strong].real), np.median(factors[strong].imag)) * float(sign)
+    return complex(np.median(factors[is_strong].real), np.median(factors[is_strong].imag)) * float(sign)
 
 
 def _aliasing(motion: _Signal, speeds: Sequence[_Signal], source: str) -> list[str]:
@@ -232,10 +238,10 @@ def _aliasing(motion: _Signal, speeds: Sequence[_Signal], source: str) -> list[s
     """
     rate = 1.0 / float(np.median(np.diff(motion.time)))
     where = f"{source}: channel {quoted(motion.channel.name)}"
-    fastest = max((float(np.quantile(np.abs(each.value), 0.99)) for each in speeds), default=0.0) / (2.0 * np.pi)
-    if fastest > 0.5 * rate:
-        problem = f"is sampled at {rate:.4g} Hz, less than twice the largest speed of the rotor, {fastest:.4g} Hz"
-        raise InputError(where, f"{problem}: its vibration is aliased; record at more than {2.56 * fastest:.3g} Hz")
+    fastest_hertz = max((float(np.quantile(np.abs(each.value), 0.99)) for each in speeds), default=0.0) / (2.0 * np.pi)
+    if fastest_hertz > 0.5 * rate:
+        problem = f"is sampled at {rate:.4g} Hz, less than twice the largest speed of the rotor, {fastest_hertz:.4g} Hz"
+        raise InputError(where, f"{problem}: its vibration is aliased; record at more than {2.56 * fastest_hertz:.3g} Hz")
     length = min(motion.value.size, _ALIASING_LENGTH)
     starts = np.unique(np.linspace(0, motion.value.size - length, _ALIASING_PIECES).astype(int))
     pieces = np.stack([motion.value[k : k + length] for k in starts])
@@ -250,5 +256,5 @@ def _aliasing(motion: _Signal, speeds: Sequence[_Signal], source: str) -> list[s
 
 def _filled(value: np.ndarray) -> np.ndarray:
     """Return readings with missing ones interpolated."""
-    known = np.isfinite(value)
-    return value if np.all(known) else np.interp(np.arange(value.size), np.flatnonzero(known), value[known])
+    is_finite = np.isfinite(value)
+    return value if np.all(is_finite) else np.interp(np.arange(value.size), np.flatnonzero(is_finite), value[is_finite])

@@ -31,7 +31,7 @@ UNITS: dict[str, str] = {
 """SI unit of each kind of channel."""
 
 _GAIN_ERROR = {"acceleration": 0.01}
-"""Relative standard uncertainty of the gain by kind, if it is not stated; 0 for all other kinds."""
+"""Default relative standard uncertainty of the gain by kind; 0 for all other kinds."""
 
 _DIRECTIONS = {"up": (0.0, 1.0), "down": (0.0, -1.0), "across": (1.0, 0.0), "-across": (-1.0, 0.0)}
 
@@ -55,9 +55,9 @@ class Channel(eqx.Module):
     - `delay`, s, of the readings behind the motion; typical: 0 to 1e-3
     - `high_pass`, Hz, corner frequency of the sensor's first-order high-pass filter, 0 for none; typical: 0.1 to 1 for IEPE
       accelerometers
-    - `range`: largest absolute reading, in `unit` or with its own unit; readings at it are clipped; default: detected in the
-      histogram
-    - `per_turn`: number of pulses per turn
+    - `range`: largest absolute reading of the sensor, as a number in `unit` or a string with a unit, such as "50 g"; readings
+      from 99.9 % of it are clipped. Clipping is also detected from the histogram of the readings; default: only from it
+    - `per_turn`: number of pulses per turn; typical: 1 to 60 (default 1)
 
     **Raises** `InputError` for an unknown kind or direction, a unit of another dimension, and numbers that are not allowed.
 

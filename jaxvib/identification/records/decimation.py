@@ -1,12 +1,12 @@
-"""Lower sampling rate of long records: every n-th reading after a low-pass filter.
+"""Reduction of the sampling rate of long records: every n-th reading after a low-pass filter.
 
-Above the frequencies of the machine, a record contains only noise and other vibrations. The filter removes this part of
-records that are sampled much faster than the machine moves. It is symmetric in time. Its gain is 1 up to 0.3 times the new
-rate and 0 from 0.7 times the new rate, both to 1e-5. Aliases lie above 0.3 times the new rate, and white noise remains nearly
-white.
+Above the frequencies of the machine, a record contains only noise and other vibrations. The filter removes this part from
+records whose sampling rate is much higher than the frequencies of the machine. The filter is symmetric in time. Its gain is 1
+up to 0.3 times the new rate and 0 from 0.7 times the new rate, both to 1e-5. Aliases lie above 0.3 times the new rate, and
+white noise remains nearly white.
 
-Outliers and missing readings are replaced by values of the filtered signal, and the readings are filtered again. This is exact
-enough, because outliers and gaps are much shorter than the response of the filter.
+Outliers and missing readings are replaced by values of the filtered signal, and the readings are filtered again. The remaining
+error is small, because outliers and gaps are much shorter than the impulse response of the filter.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ MIN_SAMPLES = 2**14
 """Smallest number of samples of a record that is filtered."""
 
 _MIN_FACTOR, _MIN_LEFT = 4, 1024
-"""Smallest factor between the rates, and smallest number of samples after the filter."""
+"""Smallest ratio of the old to the new rate, and smallest number of samples after the filter."""
 
 _HALF_LENGTH, _KAISER = 8, 10.06
-"""Half of the length of the filter, in new steps, and the parameter of its Kaiser window: 100 dB."""
+"""Half of the length of the filter, in new steps, and the parameter beta of its Kaiser window (100 dB attenuation)."""
 
 _PASSES, _OUTLIER_DISTANCE, _RIPPLE = 4, 6.0, 1e-3
 """Largest number of filter passes for a record with outliers or missing readings. The distance of an outlier from the filtered
@@ -50,7 +50,7 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
     """Return a run with a lower sampling rate, and a note about both rates, if the run is long and its rate is much higher than
     the `highest` frequency (rad/s) of the machine and its rotors; otherwise return the same run.
 
-    A run with clipped readings, which are bounds, or with channels at different times is not changed.
+    A run with clipped readings (each is only a bound of the motion), or with channels at different times, is not changed.
     """
     channels = run.of_kind(*_KINDS)
     first = run.times[channels[0].name] if channels else np.zeros(0)
@@ -60,17 +60,17 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
         return run
     for channel in channels:
         time = run.times[channel.name]
-        same = time.size == first.size and abs(time[0] - first[0]) + abs(time[-1] - first[-1]) < 0.01 / rate
-        if not same or np.any(run.clipped[channel.name]):
+        has_same_times = time.size == first.size and abs(time[0] - first[0]) + abs(time[-1] - first[-1]) < 0.01 / rate
+        if not has_same_times or np.any(run.clipped[channel.name]):
             return run
     half = _HALF_LENGTH * factor
-    kept = slice(half, first.size - half, factor)
+    sample_slice = slice(half, first.size - half, factor)
     values, replaced = dict(run.values), 0
     for channel in channels:
-        values[channel.name], count = filtered(run.values[channel.name], factor)
+        values[channel.name], count = filter_readings(run.values[channel.name], factor)
         replaced += count
     names = {channel.name for channel in channels}
-    time = first[kept].copy()
+    time = first[sample_slice].copy()
     note = (
         f"{run.source}: the readings were filtered to the band of the machine, and their rate was lowered from {rate:.6g} to "
         f"{rate / factor:.6g} Hz"
@@ -84,15 +84,15 @@ def decimated(run: MeasuredRun, highest: float) -> MeasuredRun:
     )
 
 
-def filtered(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
-    """Return every `factor`-th filtered reading without the ends, and the number of outliers.
+def filter_readings(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
+    """Return every `factor`-th filtered reading, without 8 `factor` readings at each end, and the number of outliers.
 
     Results near gaps of more than `factor` / 2 readings are NaN.
 
     >>> t = 1e-3 * np.arange(40000)
     >>> value = np.sin(20.0 * t) + 0.1 * np.sin(3000.0 * t)
     >>> value[[7000, 9000]] += 5.0, np.nan
-    >>> found, outliers = filtered(value, 20)
+    >>> found, outliers = filter_readings(value, 20)
     >>> bool(np.max(np.abs(found - np.sin(20.0 * t[160:-160:20]))) < 1e-2), outliers
     (True, 1)
     """
@@ -100,38 +100,39 @@ def filtered(value: np.ndarray, factor: int) -> tuple[np.ndarray, int]:
     place = np.arange(-half, half + 1)
     taps = np.sinc(place / factor) * np.kaiser(place.size, _KAISER)
     taps /= np.sum(taps)
-    missing = ~np.isfinite(value)
-    bad, inside = missing.copy(), slice(half, value.size - half)
-    if np.any(bad):
-        value = np.interp(np.arange(value.size), np.flatnonzero(~bad), value[~bad])
-    low = value
+    is_missing = ~np.isfinite(value)
+    is_bad, inside = is_missing.copy(), slice(half, value.size - half)
+    if np.any(is_bad):
+        value = np.interp(np.arange(value.size), np.flatnonzero(~is_bad), value[~is_bad])
+    smooth = value
     for _ in range(_PASSES):
-        low = _smoothed(value, taps)
-        rest = value - low
-        spread = 1.4826 * float(np.median(np.abs(rest[inside][:: max(value.size // 100_000, 1)])))
+        smooth = _smooth(value, taps)
+        deviation = value - smooth
+        spread = 1.4826 * float(np.median(np.abs(deviation[inside][:: max(value.size // 100_000, 1)])))
         limit = max(_OUTLIER_DISTANCE * spread, _RIPPLE * float(np.std(value)))
-        far = np.flatnonzero(np.abs(rest[inside]) > limit) + half
-        around = np.median(rest[far[:, None] + np.arange(-_NEIGHBORS, _NEIGHBORS + 1)], axis=1)
-        bad[far[np.abs(rest[far] - around) > limit]] = True  # an outlier also moves the filtered signal around it
-        if not np.any(bad):
+        far_indices = np.flatnonzero(np.abs(deviation[inside]) > limit) + half
+        local_median = np.median(deviation[far_indices[:, None] + np.arange(-_NEIGHBORS, _NEIGHBORS + 1)], axis=1)
+        # An outlier also moves the filtered signal around it; the comparison with the local median excludes these readings.
+        is_bad[far_indices[np.abs(deviation[far_indices] - local_median) > limit]] = True
+        if not np.any(is_bad):
             break
-        value = np.where(bad, low, value)
-    found = low[inside][::factor].copy()
-    starts = np.flatnonzero(np.diff(missing.astype(np.int8), prepend=0) == 1)
-    ends = np.flatnonzero(np.diff(missing.astype(np.int8), append=0) == -1) + 1
+        value = np.where(is_bad, smooth, value)
+    result = smooth[inside][::factor].copy()
+    starts = np.flatnonzero(np.diff(is_missing.astype(np.int8), prepend=0) == 1)
+    ends = np.flatnonzero(np.diff(is_missing.astype(np.int8), append=0) == -1) + 1
     for start, end in zip(starts, ends, strict=True):
         if end - start > factor // 2:
-            found[max(-(-(start - 2 * half) // factor), 0) : max(end // factor + 1, 0)] = np.nan
-    return found, int(np.count_nonzero(bad & ~missing))
+            result[max(-(-(start - 2 * half) // factor), 0) : max(end // factor + 1, 0)] = np.nan
+    return result, int(np.count_nonzero(is_bad & ~is_missing))
 
 
-def _smoothed(value: np.ndarray, taps: np.ndarray) -> np.ndarray:
-    """Return values after a filter of odd length, in pieces that bound the memory."""
+def _smooth(value: np.ndarray, taps: np.ndarray) -> np.ndarray:
+    """Return the values (n,) after a filter of odd length; they are computed in pieces, which bounds the memory."""
     from scipy.signal import oaconvolve  # slow to import
 
-    half, found = taps.size // 2, np.empty(value.size)
+    half, result = taps.size // 2, np.empty(value.size)
     for start in range(0, value.size, _PIECE):
         begin, end = max(start - half, 0), min(start + _PIECE, value.size)
         part = oaconvolve(value[begin : end + half], taps, mode="same")
-        found[start:end] = part[start - begin : end - begin]
-    return found
+        result[start:end] = part[start - begin : end - begin]
+    return result

@@ -14,7 +14,7 @@ _LINE, _AROUND = 2, 8
 which the line is compared."""
 
 _STEEP = 10.0
-"""Smallest mean power of the bins of a line, relative to that of the bins around the line."""
+"""Mean power of the bins of a peak, relative to that of the bins around them, from which the peak counts as a line."""
 
 _MIN_TURNS, _MIN_SAMPLES = 16, 512
 """Smallest number of turns and of samples whose spectra are examined."""
@@ -55,23 +55,23 @@ def foreign_vibration(values: np.ndarray, angle: np.ndarray, step: float) -> For
     >>> print(foreign_vibration(0.3 * np.cos(25.0 * t) + np.cos(angle), angle, 0.01))
     None
     """
-    known = np.isfinite(values)
+    is_finite = np.isfinite(values)
     turns = np.maximum.accumulate(np.abs(angle - angle[0])) / (2.0 * np.pi)
-    if np.count_nonzero(known) < _MIN_SAMPLES or turns[-1] < _MIN_TURNS:
+    if np.count_nonzero(is_finite) < _MIN_SAMPLES or turns[-1] < _MIN_TURNS:
         return None
-    values = np.where(known, values - np.mean(values[known]), 0.0)
+    values = np.where(is_finite, values - np.mean(values[is_finite]), 0.0)
     if not np.any(values):
         return None
-    even = np.interp(np.linspace(0.0, turns[-1], values.size), turns, values)
-    over_angle, spacing = _spectrum(even, turns[-1] / (values.size - 1))
+    over_turns = np.interp(np.linspace(0.0, turns[-1], values.size), turns, values)
+    over_angle, spacing = _spectrum(over_turns, turns[-1] / (values.size - 1))
     over_time, width = _spectrum(values, step)
     rotor = round(1.0 / spacing)
     near = slice(max(rotor - 2 * _LINE, 0), rotor + 2 * _LINE + 1)
-    own, others = float(np.sum(over_angle[near])), over_angle.copy()
-    others[near] = 0.0
-    order, by_order = _line(others)
+    rotor_share, without_rotor = float(np.sum(over_angle[near])), over_angle.copy()
+    without_rotor[near] = 0.0
+    order, by_order = _line(without_rotor)
     frequency, by_time = _line(over_time)
-    if own >= max(by_order, by_time) or max(by_order, by_time) == 0.0:
+    if rotor_share >= max(by_order, by_time) or max(by_order, by_time) == 0.0:
         return None
     if by_order >= by_time:
         return ForeignVibration(float(order * spacing), None, by_order)
@@ -87,7 +87,7 @@ def _spectrum(values: np.ndarray, step: float) -> tuple[np.ndarray, float]:
 
 
 def _line(power: np.ndarray) -> tuple[float, float]:
-    """Return the place of the strongest line of a spectrum, in bins, and its share of the power, 0 without a line."""
+    """Return the place of the strongest line of a spectrum, in bins, and its share of the power; both are 0 without a line."""
     inner = power[_LINE + 1 :]
     peak = int(np.argmax(inner)) + _LINE + 1
     line = slice(peak - _LINE, peak + _LINE + 1)

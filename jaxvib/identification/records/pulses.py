@@ -10,7 +10,8 @@ MIN_PULSES = 12
 """Smallest number of pulses of a run."""
 
 _LOW, _HIGH = 0.35, 0.65
-"""Levels relative to the range of the signal; a pulse begins above the high one after the signal was below the low one."""
+"""Levels relative to the range of the signal: a pulse counts if the signal rises above the high level after it was below the
+low level."""
 
 _MISSED, _DOUBLED = 1.6, 0.62
 """Limits of an interval relative to its neighbours: above the first, pulses were missed; below the second, one of its two
@@ -32,9 +33,9 @@ def rising_edges(time: np.ndarray, level: np.ndarray, where: str) -> np.ndarray:
     >>> rising_edges(t, np.sin(40.0 * np.pi * t - 1.0), "run: channel 'tacho'")[:2].round(5).tolist()
     [0.00796, 0.05796]
     """
-    known = np.isfinite(level)
-    if not np.all(known):
-        time, level = time[known], level[known]
+    is_finite = np.isfinite(level)
+    if not np.all(is_finite):
+        time, level = time[is_finite], level[is_finite]
     low, high = (float(x) for x in np.quantile(level, [0.01, 0.99])) if level.size else (0.0, 0.0)
     if level.size and high - low < 0.5 * np.ptp(level):  # pulses shorter than a hundredth of their period
         low, high = float(np.min(level)), float(np.max(level))
@@ -57,8 +58,8 @@ def _starts(flags: np.ndarray) -> np.ndarray:
     return np.flatnonzero(flags & ~np.concatenate([[False], flags[:-1]]))
 
 
-def numbered_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the times of pulses without false ones, their numbers, and notes about repairs.
+def number_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the times (n,), s, of the pulses without false pulses, their numbers (n,), and notes about repairs.
 
     The interval between two pulses is compared with the geometric mean of the medians of five intervals before it and five
     after it, which is also right while a rotor starts from rest. A missed pulse leaves a number out.
@@ -66,30 +67,32 @@ def numbered_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarra
     **Raises** `InputError` for too few pulses, times that do not ascend, and too many missed and false pulses.
 
     >>> t = np.delete(np.arange(40) / 10.0, 17)
-    >>> _, number, notes = numbered_pulses(t, "run: channel 'tacho'")
+    >>> _, number, notes = number_pulses(t, "run: channel 'tacho'")
     >>> number[15:19].tolist(), notes
     ([15.0, 16.0, 18.0, 19.0], ["run: channel 'tacho' missed 1 pulse, at 1.6 s, which is counted"])
     """
     if time.size < MIN_PULSES:
         raise InputError(where, f"has {time.size} pulses; at least {MIN_PULSES} are needed, record more turns")
-    wrong = np.flatnonzero(~(np.diff(time) > 0.0))
-    if wrong.size:
-        k = int(wrong[0])
+    not_ascending = np.flatnonzero(~(np.diff(time) > 0.0))
+    if not_ascending.size:
+        k = int(not_ascending[0])
         raise InputError(where, f"has a pulse at {time[k + 1]:g} s after one at {time[k]:g} s; times must ascend")
     count, notes = time.size, []
-    false: list[float] = []
-    while (doubtful := _false_pulses(time)).size and len(false) <= _MAX_FAULTS * count:
-        false += time[doubtful].tolist()
+    false_times: list[float] = []
+    while (doubtful := _false_pulses(time)).size and len(false_times) <= _MAX_FAULTS * count:
+        false_times += time[doubtful].tolist()
         time = np.delete(time, doubtful)
-    ratio = np.diff(time) / _usual(np.diff(time))
+    ratio = np.diff(time) / _usual_intervals(np.diff(time))
     steps = np.where(ratio > _MISSED, np.maximum(np.rint(ratio), 1.0), 1.0)
-    steps[[0, -1]] = 1.0  # neighbours on one side only
+    steps[[0, -1]] = 1.0  # these intervals have neighbours on one side only
     missed = int(np.sum(steps - 1.0))
-    if len(false) + missed > _MAX_FAULTS * count:
-        found = f"misses {missed} and doubles {len(false)} of {count} pulses"
-        raise InputError(where, f"{found}; check the trigger level, the marks and the direction of the edge")
-    if false:
-        notes.append(f"{where} had {len(false)} false {_pulses(len(false))}, the first at {min(false):.4g} s; left out")
+    if len(false_times) + missed > _MAX_FAULTS * count:
+        problem = f"misses {missed} and doubles {len(false_times)} of {count} pulses"
+        raise InputError(where, f"{problem}; check the trigger level, the marks and the direction of the edge")
+    if false_times:
+        notes.append(
+            f"{where} had {len(false_times)} false {_pulses(len(false_times))}, the first at {min(false_times):.4g} s; left out"
+        )
     if missed:
         first = float(time[np.argmax(steps > 1.0)])
         place = f"at {first:.4g} s" if missed == 1 else f"the first at {first:.4g} s"
@@ -98,8 +101,8 @@ def numbered_pulses(time: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarra
     return time, np.concatenate([[0.0], np.cumsum(steps)]), notes
 
 
-def _usual(steps: np.ndarray) -> np.ndarray:
-    """Return the interval that the neighbours of each interval suggest."""
+def _usual_intervals(steps: np.ndarray) -> np.ndarray:
+    """Return, for each interval, the geometric mean of the medians of 5 intervals before it and 5 after it."""
     padded = np.concatenate([np.full(_NEIGHBOURS, np.nan), steps, np.full(_NEIGHBOURS, np.nan)])
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1)
     before, after = np.full(steps.size, np.nan), np.full(steps.size, np.nan)
@@ -114,15 +117,15 @@ def _false_pulses(time: np.ndarray) -> np.ndarray:
     adjacent pulses are returned."""
     if time.size < MIN_PULSES:
         return np.array([], int)
-    steps, usual = np.diff(time), _usual(np.diff(time))
+    steps, usual = np.diff(time), _usual_intervals(np.diff(time))
     ratio = steps / usual
-    short, long = np.minimum(ratio[:-1], ratio[1:]), np.maximum(ratio[:-1], ratio[1:])
-    pairs = np.abs(np.log((time[2:] - time[:-2]) / np.sqrt(usual[1:] * usual[:-1])))
-    doubtful = (short < _DOUBLED) & (long < 1.25) & (pairs < np.log(1.4))
+    shorter, longer = np.minimum(ratio[:-1], ratio[1:]), np.maximum(ratio[:-1], ratio[1:])
+    log_ratios = np.abs(np.log((time[2:] - time[:-2]) / np.sqrt(usual[1:] * usual[:-1])))
+    doubtful = (shorter < _DOUBLED) & (longer < 1.25) & (log_ratios < np.log(1.4))
     doubtful[[0, -1]] = False
-    error = np.concatenate([[np.inf], np.where(doubtful, pairs, np.inf), [np.inf]])
-    best = doubtful & (error[1:-1] <= error[:-2]) & (error[1:-1] < error[2:])
-    return np.flatnonzero(best) + 1
+    error = np.concatenate([[np.inf], np.where(doubtful, log_ratios, np.inf), [np.inf]])
+    is_false = doubtful & (error[1:-1] <= error[:-2]) & (error[1:-1] < error[2:])
+    return np.flatnonzero(is_false) + 1
 
 
 def _pulses(count: int) -> str:

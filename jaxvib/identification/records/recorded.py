@@ -1,4 +1,4 @@
-"""Channels as recorders store them, and the selection of those that the description of a run names."""
+"""Channels as recorders store them, and the selection of the channels that the description of a run names."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ def recorded_from_sep005(timeseries: Sequence[Mapping[str, Any]], source: str) -
     >>> recorded_from_sep005([{"name": "a", "unit_str": "g", "fs": 10.0, "data": [0.1, 0.2]}], "run")[0].time.tolist()
     [0.0, 0.1]
     """
-    found = []
-    for k, each in enumerate(timeseries):
+    channels = []
+    for k, entry in enumerate(timeseries):
         where = f"{source}: timeseries[{k}]"
-        missing = [name for name in ("data", "name", "unit_str") if name not in each]
-        if missing or (each.get("time") is None and each.get("fs") is None):
+        missing = [name for name in ("data", "name", "unit_str") if name not in entry]
+        if missing or (entry.get("time") is None and entry.get("fs") is None):
             needed = missing[0] if missing else "fs"
             raise InputError(where, f"has no entry {quoted(needed)}; SEP-005 needs data, name, unit_str, and fs or time")
         try:
-            values = np.asarray([np.nan if x is None else x for x in each["data"]], float)
-            if each.get("time") is not None:
-                time = np.asarray(each["time"], float)
-            elif (rate := float(each["fs"])) > 0.0:
+            values = np.asarray([np.nan if x is None else x for x in entry["data"]], float)
+            if entry.get("time") is not None:
+                time = np.asarray(entry["time"], float)
+            elif (rate := float(entry["fs"])) > 0.0:
                 time = np.arange(values.size) / rate
             else:
                 raise ValueError(rate)
         except (TypeError, ValueError) as error:
             raise InputError(where, "has data, fs or time that are not numbers; fs must be greater than 0") from error
-        found.append(Recorded(str(each["name"]), str(each["unit_str"]), time, values))
-    return found
+        channels.append(Recorded(str(entry["name"]), str(entry["unit_str"]), time, values))
+    return channels
 
 
 def described_channels(
@@ -56,27 +56,27 @@ def described_channels(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return the times (s, from `low` to `high`) and the values of channels.
 
-    The values are in SI, or as in the file if the channel has its own `unit`.
+    The values are in SI units, or in the unit of the file if the channel has a `unit`.
 
-    **Raises** `InputError` for a channel that was not recorded or not once only, a wrong unit, and times and values of
-    different length.
+    **Raises** `InputError` for a channel that the file does not have or has more than once, a wrong unit, and times and values
+    of different length.
     """
     times, values = {}, {}
     for channel in channels:
         where = f"{source}: channel {quoted(channel.name)}"
-        found = _find(recorded, channel, where)
-        factor = _factor(found, channel, where)
-        if found.time is None:
+        recorded_channel = _find(recorded, channel, where)
+        factor = _factor(recorded_channel, channel, where)
+        if recorded_channel.time is None:
             if channel.kind != "pulses":
                 raise InputError(where, "has no times in the file; give the sampling rate of the run, `rate`")
-            times[channel.name] = _between(found.values, low, high, found.values)
+            times[channel.name] = _between(recorded_channel.values, low, high, recorded_channel.values)
             continue
-        if found.time.size != found.values.size:
-            sizes = f"has {found.time.size} times but {found.values.size} values"
+        if recorded_channel.time.size != recorded_channel.values.size:
+            sizes = f"has {recorded_channel.time.size} times but {recorded_channel.values.size} values"
             raise InputError(where, f"{sizes}; save both with the same length")
-        times[channel.name] = _between(found.time, low, high, found.time)
-        own = _between(found.time, low, high, found.values)
-        values[channel.name] = own if factor == 1.0 else own * factor
+        times[channel.name] = _between(recorded_channel.time, low, high, recorded_channel.time)
+        in_span = _between(recorded_channel.time, low, high, recorded_channel.values)
+        values[channel.name] = in_span if factor == 1.0 else in_span * factor
     return times, values
 
 
@@ -85,25 +85,26 @@ def _between(time: np.ndarray, low: float, high: float, values: np.ndarray) -> n
 
 
 def _find(recorded: Sequence[Recorded], channel: Channel, where: str) -> Recorded:
-    """Return the channel of the file with a name, which may include its unit; upper and lower case are not distinguished."""
-    wanted = channel.name.strip().lower()
+    """Return the recorded channel with the name of `channel`. An exact match comes first; then upper and lower case are not
+    distinguished, and the name in the file may include its unit."""
+    wanted_name = channel.name.strip().lower()
     for name_of in (
-        lambda each: wanted if each.name == channel.name else None,
+        lambda each: wanted_name if each.name == channel.name else None,
         lambda each: each.name.strip().lower(),
         lambda each: f"{each.name} ({each.unit})".lower(),
         lambda each: split_head(each.name, UNITS[channel.kind])[0].lower(),
     ):
-        found = [each for each in recorded if name_of(each) == wanted]
-        if len(found) > 1:
-            raise InputError(where, f"is the name of {len(found)} channels of the file; give them different names")
-        if found:
-            return found[0]
+        matches = [each for each in recorded if name_of(each) == wanted_name]
+        if len(matches) > 1:
+            raise InputError(where, f"is the name of {len(matches)} channels of the file; give them different names")
+        if matches:
+            return matches[0]
     names = ", ".join(quoted(each.name) for each in recorded[:20])
     raise InputError(where, f"is not in the file; its channels are {names}")
 
 
 def _factor(recorded: Recorded, channel: Channel, where: str) -> float:
-    """Return the factor from the unit in the file to SI for a channel without a unit of its own."""
+    """Return the factor from the unit in the file to SI; 1 for pulses and for a channel whose `unit` is given."""
     if channel.kind == "pulses" or channel.unit is not None:
         return 1.0
     si = UNITS[channel.kind]

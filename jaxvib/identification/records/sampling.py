@@ -10,7 +10,7 @@ MIN_SAMPLES = 16
 """Smallest number of samples of a channel."""
 
 _MAX_MISSING = 0.1
-"""Largest share of readings that may be NaN or constant dropouts."""
+"""Largest share of readings that may be NaN, and largest share that may be in dropouts."""
 
 _MAX_GAPS = 0.5
 """Largest share of the duration of a record that may be in gaps."""
@@ -22,24 +22,24 @@ _GAP = 1.5
 """Interval between samples, relative to the step, above which readings are missing."""
 
 _MIN_DROPOUT, _MIN_RATIO = 20, 10
-"""A stretch of equal readings is a dropout if it has at least this number of readings, and is at least this factor longer than
-99 % of all stretches of equal readings."""
+"""A stretch of equal readings is a dropout if it has at least the first number of readings, and at least the second number
+times the length that 99 % of all stretches do not exceed."""
 
 _BINS, _SPIKE, _MIN_CLIPPED = (0.001, 0.003, 0.01), 3.0, 10
-"""Widths of the last bin of the histogram relative to all values; number of readings in it, relative to the next four bins and
-absolute, above which they are clipped. The peak of any smooth signal has a ratio below 2."""
+"""Widths of the last bin of the histogram relative to the range of the values; number of readings in this bin, relative to the
+number in the next four bins and absolute, above which the readings are clipped. For a smooth signal the ratio is below 2."""
 
 
 def require_ascending(time: np.ndarray, where: str) -> None:
-    """Check times. **Raises** `InputError` for too few, and for times that are not finite or do not ascend."""
+    """**Raises** `InputError` for fewer than 16 times, and for times that are not finite or do not ascend."""
     if time.size < MIN_SAMPLES:
         raise InputError(where, f"has {time.size} samples; at least {MIN_SAMPLES} are needed, record more")
-    wrong = np.flatnonzero(~np.isfinite(time))
-    if wrong.size:
-        raise InputError(where, f"has the time {time[wrong[0]]} at sample {wrong[0] + 1}; times must be finite numbers")
-    wrong = np.flatnonzero(np.diff(time) <= 0.0)
-    if wrong.size:
-        k = int(wrong[0])
+    invalid = np.flatnonzero(~np.isfinite(time))
+    if invalid.size:
+        raise InputError(where, f"has the time {time[invalid[0]]} at sample {invalid[0] + 1}; times must be finite numbers")
+    invalid = np.flatnonzero(np.diff(time) <= 0.0)
+    if invalid.size:
+        k = int(invalid[0])
         if time[k + 1] == time[k]:
             problem = f"has the time {time[k]:g} s twice, at samples {k + 1} and {k + 2}"
             raise InputError(
@@ -67,63 +67,63 @@ def even_samples(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.nd
     require_ascending(time, where)
     if not np.all(np.isfinite(value)):
         value = np.where(np.isfinite(value), value, np.nan)
-    time, value, notes = _own_rate(time, value, where)
-    missing = np.isnan(value)
-    if np.any(missing):
-        count = int(np.count_nonzero(missing))
-        first = f"the first at {time[np.argmax(missing)]:g} s"
+    time, value, notes = _reduced_to_own_rate(time, value, where)
+    is_missing = np.isnan(value)
+    if np.any(is_missing):
+        count = int(np.count_nonzero(is_missing))
+        first = f"the first at {time[np.argmax(is_missing)]:g} s"
         if count > _MAX_MISSING * value.size:
             share = f"has {count} of {value.size} readings that are not numbers, {first}"
             raise InputError(where, f"{share}; at most {_MAX_MISSING:.0%} may be missing, use another part of the record")
         notes.append(f"{where} has {count} {_readings(count)} that {_are(count)} not {_numbers(count)}, {first}; left out")
-    dropped = dropouts(value)
-    if np.any(dropped):
-        count = int(np.count_nonzero(dropped))
-        first = f"the first at {time[np.argmax(dropped)]:g} s"
+    is_dropout = dropouts(value)
+    if np.any(is_dropout):
+        count = int(np.count_nonzero(is_dropout))
+        first = f"the first at {time[np.argmax(is_dropout)]:g} s"
         if count > _MAX_MISSING * value.size:
             share = f"is constant in stretches for {count} of {value.size} readings, {first}"
             raise InputError(where, f"{share}: the sensor or its cable failed; use another part of the record")
         notes.append(f"{where} is constant in stretches with {count} readings in total (dropouts), {first}; left out")
-        value = np.where(dropped, np.nan, value)
-    time, value, more = _on_grid(time, value, where)
-    return time, value, notes + more
+        value = np.where(is_dropout, np.nan, value)
+    time, value, grid_notes = _on_grid(time, value, where)
+    return time, value, notes + grid_notes
 
 
-def _own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the samples of a channel that has a reading only at every n-th time, without the other times."""
+def _reduced_to_own_rate(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Return the samples without the times that have no reading, if the channel has a reading only at every n-th time."""
     if not np.any(np.isnan(value)):
         return time, value, []
-    there = np.flatnonzero(~np.isnan(value))
-    if there.size < MIN_SAMPLES:
-        raise InputError(where, f"has {there.size} readings; at least {MIN_SAMPLES} are needed, record more")
-    stride = int(np.median(np.diff(there)))
-    if stride == 1 or np.mean(np.diff(there) % stride == 0) < 1.0:
+    with_reading = np.flatnonzero(~np.isnan(value))
+    if with_reading.size < MIN_SAMPLES:
+        raise InputError(where, f"has {with_reading.size} readings; at least {MIN_SAMPLES} are needed, record more")
+    stride = int(np.median(np.diff(with_reading)))
+    if stride == 1 or np.mean(np.diff(with_reading) % stride == 0) < 1.0:
         return time, value, []
-    part = slice(there[0] % stride, None, stride)
+    part = slice(with_reading[0] % stride, None, stride)
     rate = 1.0 / float(np.median(np.diff(time[part])))
     return time[part], value[part], [f"{where} has a reading at one of {stride} times only: its rate is {rate:.6g} Hz"]
 
 
 def _on_grid(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
     even = np.linspace(time[0], time[-1], time.size)
-    away = time - even
-    if max(np.max(away), -np.min(away)) <= _JITTER * (even[1] - even[0]):
+    deviation = time - even
+    if max(np.max(deviation), -np.min(deviation)) <= _JITTER * (even[1] - even[0]):
         return even, value, []
     steps = np.diff(time)
     step = float(np.median(steps))
-    step = float(np.mean(steps[steps < _GAP * step]))  # not rounded to the digits of the file
-    gaps, notes = steps > _GAP * step, []
-    if np.any(gaps):
-        lost = float(np.sum(steps[gaps]))
+    step = float(np.mean(steps[steps < _GAP * step]))  # the median may be rounded to the digits of the file
+    is_gap, notes = steps > _GAP * step, []
+    if np.any(is_gap):
+        gap_time = float(np.sum(steps[is_gap]))
         longest = int(np.argmax(steps))
-        count = int(np.count_nonzero(gaps))
-        found = "1 gap" if count == 1 else f"{count} gaps"
+        count = int(np.count_nonzero(is_gap))
+        gap_count = "1 gap" if count == 1 else f"{count} gaps"
         place = f"the longest is {steps[longest]:.3g} s at {time[longest]:g} s"
-        if lost > _MAX_GAPS * (time[-1] - time[0]):
+        if gap_time > _MAX_GAPS * (time[-1] - time[0]):
             raise InputError(
-                where, f"has {found} in {lost:.3g} of {time[-1] - time[0]:.3g} s; {place}: use a part without gaps"
+                where, f"has {gap_count} in {gap_time:.3g} of {time[-1] - time[0]:.3g} s; {place}: use a part without gaps"
             )
-        notes.append(f"{where} has {found}; {place}")
+        notes.append(f"{where} has {gap_count}; {place}")
     index = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / step), 1.0))]).astype(int)
     centred = index - np.mean(index)
     slope = float(centred @ time / (centred @ centred))
@@ -135,17 +135,18 @@ def _on_grid(time: np.ndarray, value: np.ndarray, where: str) -> tuple[np.ndarra
         return grid, even, notes
     count = max(round((time[-1] - time[0]) / step), 1)
     grid = time[0] + (time[-1] - time[0]) / count * np.arange(count + 1)
-    known = ~np.isnan(value)
-    even = np.interp(grid, time[known], value[known])
-    after = np.clip(np.searchsorted(time[known], grid), 1, np.count_nonzero(known) - 1)
-    even[np.diff(time[known])[after - 1] > _GAP * step] = np.nan
-    spread = f"{np.min(steps):.3g} to {np.max(steps[~gaps]):.3g} s"
+    is_known = ~np.isnan(value)
+    even = np.interp(grid, time[is_known], value[is_known])
+    after = np.clip(np.searchsorted(time[is_known], grid), 1, np.count_nonzero(is_known) - 1)
+    even[np.diff(time[is_known])[after - 1] > _GAP * step] = np.nan
+    spread = f"{np.min(steps):.3g} to {np.max(steps[~is_gap]):.3g} s"
     notes.append(f"{where} has steps of {spread}; its readings were interpolated to even steps of {grid[1] - grid[0]:.4g} s")
     return grid, even, notes
 
 
 def _resolution(time: np.ndarray) -> float:
-    """Return half a unit of the last decimal digit to which all times are rounded; 0 if they are not rounded."""
+    """Return half a unit (with a margin of 2 %) of the last decimal digit to which all times are rounded; 0 if they are not
+    rounded."""
     for digits in range(1, 9):
         if np.all(
             np.abs(time * 10.0**digits - np.rint(time * 10.0**digits)) < 1e-6 * np.maximum(np.abs(time) * 10.0**digits, 1.0)
@@ -155,7 +156,8 @@ def _resolution(time: np.ndarray) -> float:
 
 
 def dropouts(value: np.ndarray) -> np.ndarray:
-    """Return True for readings in long stretches of exactly equal ones within the range of a signal that otherwise changes.
+    """Return True for readings in dropouts: long stretches of exactly equal readings that are neither the largest nor the
+    smallest, in a signal that otherwise changes.
 
     >>> x = np.sin(np.arange(400.0))
     >>> x[100:140] = 0.0
@@ -167,11 +169,11 @@ def dropouts(value: np.ndarray) -> np.ndarray:
         return np.zeros(value.size, bool)
     starts = np.concatenate([[0], np.flatnonzero(~equal) + 1])
     lengths = np.diff(np.concatenate([starts, [value.size]]))
-    usual = max(float(np.quantile(lengths, 0.99)), 1.0)
+    usual_length = max(float(np.quantile(lengths, 0.99)), 1.0)
     with np.errstate(invalid="ignore"):
-        inside = (value[starts] > np.nanmin(value)) & (value[starts] < np.nanmax(value))
-    long = (lengths >= max(_MIN_DROPOUT, _MIN_RATIO * usual)) & inside
-    return np.repeat(long, lengths)
+        is_inside = (value[starts] > np.nanmin(value)) & (value[starts] < np.nanmax(value))
+    is_long = (lengths >= max(_MIN_DROPOUT, _MIN_RATIO * usual_length)) & is_inside
+    return np.repeat(is_long, lengths)
 
 
 def clipped_at(value: np.ndarray) -> tuple[float, float]:
@@ -181,8 +183,8 @@ def clipped_at(value: np.ndarray) -> tuple[float, float]:
     >>> bool(np.isinf(low)), bool(0.85 < high <= 0.9)
     (True, True)
     """
-    missing = np.isnan(value)
-    known = value[~missing] if np.any(missing) else value
+    is_missing = np.isnan(value)
+    known = value[~is_missing] if np.any(is_missing) else value
     return -_clipped_above(-known), _clipped_above(known)
 
 
@@ -194,10 +196,10 @@ def _clipped_above(value: np.ndarray) -> float:
     level = np.inf
     for share in _BINS:
         width = max(share * size, 1.5 * (top - float(np.max(below))))  # a bin has at least one step of the converter
-        flat = value > top - width
-        last, before = np.count_nonzero(flat), np.count_nonzero((value > top - 5.0 * width) & ~flat)
-        three = np.count_nonzero(flat[2:] & flat[1:-1] & flat[:-2])
-        if last >= _MIN_CLIPPED and last > _SPIKE * before and three >= _MIN_CLIPPED // 2:
+        is_top = value > top - width
+        in_last_bin, in_next_bins = np.count_nonzero(is_top), np.count_nonzero((value > top - 5.0 * width) & ~is_top)
+        in_triples = np.count_nonzero(is_top[2:] & is_top[1:-1] & is_top[:-2])
+        if in_last_bin >= _MIN_CLIPPED and in_last_bin > _SPIKE * in_next_bins and in_triples >= _MIN_CLIPPED // 2:
             level = top - 2.0 * width  # noise on the clipped readings may exceed one bin
     return level
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.identification.records.decimation import decimated, filtered
+from jaxvib.identification.records.decimation import decimated, filter_readings
 
 RATE, FACTOR = 1000.0, 20
 T = np.arange(40_000) / RATE
@@ -21,13 +21,13 @@ def run_of(values, **options):
 def test_gain_of_the_filter_over_frequency(place, gain):
     """A vibration of `place` times the new rate."""
     wave = np.exp(2j * np.pi * place * RATE / FACTOR * T + 1j)
-    found = filtered(wave.real, FACTOR)[0] + 1j * filtered(wave.imag, FACTOR)[0]
+    found = filter_readings(wave.real, FACTOR)[0] + 1j * filter_readings(wave.imag, FACTOR)[0]
     np.testing.assert_allclose(found, gain * wave[KEPT], atol=1e-2 if gain == 0.5 else 2e-5)
 
 
 def test_white_noise_keeps_its_power_in_each_frequency():
     noise = np.random.default_rng(0).normal(size=T.size)
-    found, outliers = filtered(noise, FACTOR)
+    found, outliers = filter_readings(noise, FACTOR)
     assert outliers == 0
     np.testing.assert_allclose(np.var(found) * FACTOR, 0.95, atol=0.1)
     next_ones = found[1:] @ found[:-1] / (found @ found)
@@ -41,15 +41,15 @@ def test_outliers_and_short_gaps_leave_no_trace():
     values = SIGNAL + noise
     values[places[:20]] += 5.0
     values[places[20:]] = np.nan
-    found, outliers = filtered(values, FACTOR)
+    found, outliers = filter_readings(values, FACTOR)
     assert 20 <= outliers <= 40  # with some of their neighbours
-    np.testing.assert_allclose(found, filtered(SIGNAL + noise, FACTOR)[0], atol=2e-3)
+    np.testing.assert_allclose(found, filter_readings(SIGNAL + noise, FACTOR)[0], atol=2e-3)
 
 
 def test_readings_near_a_gap_are_missing():
     values = SIGNAL.copy()
     values[20_000:20_100] = np.nan
-    found, _ = filtered(values, FACTOR)
+    found, _ = filter_readings(values, FACTOR)
     missing = np.isnan(found)
     reach = 8 * FACTOR
     assert np.array_equal(np.flatnonzero(missing), np.arange((20_000 - 2 * reach) // FACTOR, 20_100 // FACTOR + 1))
