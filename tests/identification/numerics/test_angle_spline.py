@@ -43,20 +43,20 @@ def test_fit_is_the_weighted_least_squares(marks):
     columns = np.concatenate([basis, offsets], axis=1) * weights[:, None]
     found = np.linalg.lstsq(columns, value * weights, rcond=None)[0]
     size = basis.shape[1]
-    np.testing.assert_allclose(fit.found, found[:size], rtol=1e-8)
+    np.testing.assert_allclose(fit.coefficients, found[:size], rtol=1e-8)
     square = np.sum((value * weights - columns @ found) ** 2)
     n, k = columns.shape
     assert fit.criterion == pytest.approx(n * np.log(square / n) + k * np.log(n), rel=1e-9)
     covariance = square / (n - k) * np.linalg.inv(columns.T @ columns)[:size, :size]
     np.testing.assert_allclose(fit.covariance(), covariance, rtol=1e-5, atol=1e-7 * np.max(covariance))
     spline, scatter = fit_spline(T, value, marks, spread)
-    counts = [len(_fit_knots(T, value * weights, weights, offsets * weights[:, None], each).found) for each in (1, 2)]
+    counts = [len(_fit_knots(T, value * weights, weights, offsets * weights[:, None], each).coefficients) for each in (1, 2)]
     assert spline.c.shape[0] in counts  # a parabola needs one interval, or few
     best = min(
         (_fit_knots(T, value * weights, weights, offsets * weights[:, None], each) for each in (1, 2, 3, 4, 5, 7, 9, 12)),
         key=lambda each: each.criterion,
     )
-    np.testing.assert_allclose(spline.c[:, 0], best.found)
+    np.testing.assert_allclose(spline.c[:, 0], best.coefficients)
     assert scatter == pytest.approx(np.sqrt(best.variance) / np.mean(spread))
     # The errors have the covariance of the coefficients, and are orthogonal over time, the largest first.
     # A common delay of all values moves the curve along its slope.
@@ -67,7 +67,7 @@ def test_fit_is_the_weighted_least_squares(marks):
     )
     expected = basis @ best.covariance() @ basis.T + np.outer(late, late)
     np.testing.assert_allclose(spline(t)[:, 1:] @ spline(t)[:, 1:].T, expected, atol=1e-8 * np.max(expected))
-    grid = spline(np.linspace(T[0], T[-1], 4 * len(best.found)))[:, 1:]
+    grid = spline(np.linspace(T[0], T[-1], 4 * len(best.coefficients)))[:, 1:]
     products = grid.T @ grid
     np.testing.assert_allclose(products, np.diag(np.diagonal(products)), atol=1e-9 * products[0, 0])
     assert np.all(np.diff(np.diagonal(products)) <= 1e-9 * products[0, 0])
