@@ -11,43 +11,47 @@ A mutant is the package with one change in one line:
 
 Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
 in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
-Each is given to the nearest `--files` test files, first the test file of its name, then those of its folder, then those that
-name most of it; a third of them are those that consist most of calls of it, in any folder. The examples in its own file are run
-as well. Of these the tests that reach its line run first; the first test that fails ends it. The lines that each test of a file
-reaches are measured (`coverage`) when a mutant needs that file, once for an `--out`. Take a new `--out` for changed packages.
 
-A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
-Survivors, and mutants that no such test reaches, are printed with their changes, to be explained or killed by a new test.
-All results are kept in `--out`, so that a second call goes on where the first was stopped; `--again` runs the survivors anew,
-after tests were added.
+A mutant is given to the `--tests` tests that are most likely to see it, and to the examples of its own file. Those whose text
+names the changed function or class come first, then those of the test file of its name and those that name a public part of
+its module; the shorter of two equal tests comes first. The first test that fails ends it: the shares are lower bounds of those
+of the whole suite.
+
+A mutant is killed when a test fails or when the process dies. Survivors, those whose tests did not end in `--seconds` of
+processor time, and those without a test are printed with their changes, to be explained or killed by a new test. All results
+are kept in `--out`, so that a second call goes on where the first was stopped; `--again` runs the survivors anew, after tests
+were added. Processes are forked from one that has imported the libraries, but nothing of the packages.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import collections
 import concurrent.futures
+import functools
 import itertools
 import json
+import multiprocessing
 import os
 import pathlib
 import re
+import resource
 import shutil
-import subprocess
 import sys
-import threading
 import time
 from collections.abc import Sequence
 
+import pytest
 from changes import Mutant, folder_of, mutants
-from coverage import Coverage, CoverageData
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PACKAGES = ("jaxvib", "optimize")
-ALIVE = ("survived", "not reached")
+ALIVE = ("survived", "slow", "without tests")
 
-PYTEST = ("-m", "pytest", "-p", "no:cacheprovider", "-p", "mutants")
-"""The arguments of Python that run tests with this module as a plugin."""
+LIBRARIES = ["jax", "diffrax", "equinox", "optimistix", "optax", "pytest", "pint", "click", "rich"]
+LIBRARIES += ["scipy.integrate", "scipy.optimize", "scipy.linalg", "scipy.signal", "matplotlib.pyplot"]
+"""Modules that each process finds imported; none of them starts a backend of JAX."""
 
 
 def drawn(count: int, seed: int, folders: Sequence[str]) -> list[Mutant]:
@@ -76,30 +80,48 @@ def all_folders() -> list[str]:
     return sorted({folder_of(file) for file in sources()})
 
 
-# --- tests and the lines that they reach ---
+# --- tests that may see a mutant ---
 
 
-def nearest(file: str, count: int) -> list[str]:
-    """The test files nearest to a file of the packages, and the file itself if it has examples."""
-    text, place = (ROOT / file).read_text(), _home(pathlib.Path(file.removeprefix("jaxvib/")))
-    public = re.search(r"^__all__ = \[(.*?)\]", text, re.DOTALL | re.MULTILINE)
-    words = re.findall(r"\w+", public[1]) if public else re.findall(r"^(?:def|class) ([a-zA-Z]\w*)", text, re.MULTILINE)
-    names, calls = (re.compile(rf"\b({'|'.join(each)}){end}") for each, end in (([place[-1], *words], r"\b"), (words, r"\(")))
+@functools.cache
+def _test_files() -> list[tuple[str, list[tuple[str, str]]]]:
+    """All test files with their tests: the names and the texts."""
+    found = []
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        text = path.read_text()
+        nodes = [node for node in ast.parse(text).body if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+        named = [(node.name, ast.get_source_segment(text, node)) for node in nodes if node.name.lower().startswith("test")]
+        found.append((str(path.relative_to(ROOT)), named))
+    return found
 
-    def distance(path: pathlib.Path) -> tuple:
-        own, test = _home(path.relative_to(ROOT / "tests")), path.read_text()
+
+def likely_tests(mutant: Mutant, count: int) -> list[str]:
+    """The tests that are most likely to see a mutant, and its own file if it has examples."""
+    text = (ROOT / mutant.file).read_text()
+    place = _home(pathlib.Path(mutant.file.removeprefix("jaxvib/")))
+    enclosing, public = [_word(names) for names in _names(ast.parse(text), mutant.line)]
+    ranked = []
+    for file, tests in _test_files():
+        own = _home(pathlib.Path(file).relative_to("tests"))
         common = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(place, own, strict=False)))
-        same, named = own[-1] == place[-1], len(set(names.findall(test)))
-        return not (same and common), common < len(own), common < len(place) - 1, -common - named, not same, len(test)
+        near = 2 * (own[-1] == place[-1] and common > 0) + common / len(place)
+        for name, test in tests:
+            score = near + 4 * bool(enclosing.search(f"{name} {test}")) + 2 * bool(public.search(test))
+            ranked.append((-score, len(test), f"{file}::{name}"))
+    chosen = [name for *_, name in sorted(ranked)[:count]]
+    return [*chosen[: count // 2], *[mutant.file] * (">>>" in text), *chosen[count // 2 :]]
 
-    def share(path: pathlib.Path) -> float:
-        test = path.read_text()
-        return -len(calls.findall(test)) / len(test)
 
-    tests = sorted((ROOT / "tests").rglob("test_*.py"), key=distance)
-    tests[count - count // 3 :] = sorted(tests[count - count // 3 :], key=share)
-    first, *others = [str(path.relative_to(ROOT)) for path in tests[:count]]
-    return [first, *[file] * (">>>" in text), *others]
+def _names(tree: ast.Module, line: int) -> tuple[list[str], list[str]]:
+    """The names of the functions and classes that hold a line, and of the public parts of a module."""
+    defined = [node for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+    holding = [node.name for node in defined if node.lineno <= line <= node.end_lineno and not node.name.startswith("__")]
+    return holding, [node.name for node in defined if node in tree.body and not node.name.startswith("_")]
+
+
+def _word(names: Sequence[str]) -> re.Pattern:
+    """A pattern that finds any of the names, which are written without their first underscores."""
+    return re.compile(rf"\b_*({'|'.join(name.lstrip('_') for name in names)})\b" if names else r"(?!)")
 
 
 def _home(path: pathlib.Path) -> tuple[str, ...]:
@@ -108,134 +130,80 @@ def _home(path: pathlib.Path) -> tuple[str, ...]:
     return path.parent.parts if name == "__init__" and path.parent.parts else (*path.parent.parts, name)
 
 
-class Reach:
-    """The tests that reach each line of the packages, by test files, measured when they are asked for."""
+# --- processes that run tests ---
 
-    def __init__(self, out: pathlib.Path, measures: bool) -> None:
-        self.measures, self.out = measures, out / "reach"
-        self.out.mkdir(exist_ok=True)
-        self.locks = collections.defaultdict(threading.Lock)
-
-    def tests_of(self, mutant: Mutant, file: str) -> tuple[list[str], float]:
-        """The tests of a file to run for a mutant, and their seconds; none if none reaches its line.
-
-        Those that reach the line come before the others, which may use a program that the first ones traced.
-        """
-        with self.locks[file]:
-            kept = self.out / f"{file.replace('/', '-')}.json"
-            if not kept.exists():
-                kept.write_text(json.dumps(self._measured(file)))
-            entry = json.loads(kept.read_text())
-        seconds, reaching = entry["seconds"], entry["lines"].get(mutant.file, {}).get(str(mutant.line))
-        if reaching is None:
-            return [], 0.0
-        return sorted(seconds, key=lambda name: (name not in reaching, seconds[name])), sum(seconds.values())
-
-    def _measured(self, file: str) -> dict[str, dict]:
-        """The seconds of each test and the tests that reach each line; none of them for a line that runs at import."""
-        data, home, seconds = (self.out / f"{file.replace('/', '-')}.{kind}" for kind in ("coverage", "cache", "seconds"))
-        # No traced program is read from the disk: it executes none of the lines that it was traced from.
-        environment = {"COVERAGE_FILE": str(data), "XDG_CACHE_HOME": str(home), **_plugin(ROOT, seconds=seconds)}
-        command = [sys.executable, "-m", "coverage", "run", f"--source={','.join(PACKAGES)}", *PYTEST, file]
-        began = time.perf_counter()
-        result = subprocess.run(command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True)
-        shutil.rmtree(home, ignore_errors=True)
-        if result.returncode != 0 or not seconds.exists():
-            if result.returncode != 5:  # 5: all of its tests are slow ones
-                print(f"left out, as it fails without a change: {file}\n{result.stdout[-1000:]}", flush=True)
-            return {"seconds": {}, "lines": {}}
-        print(f"     measured  {time.perf_counter() - began:6.1f} s {file}", flush=True)
-        found, lines = CoverageData(str(data)), {}
-        found.read()
-        for path in found.measured_files():
-            at = {line: [name for name in names if name] for line, names in found.contexts_by_lineno(path).items()}
-            lines[str(pathlib.Path(path).relative_to(ROOT))] = at
-        data.unlink()
-        return {"seconds": json.loads(seconds.read_text()), "lines": lines}
+_processes = multiprocessing.get_context("forkserver")
 
 
-# --- this module as a plugin of pytest ---
+def _in_process(work, *arguments, log: pathlib.Path) -> int:
+    """The exit code of a function in a forked process whose output goes to a file."""
+    process = _processes.Process(target=_logged, args=(work, str(log), *arguments))
+    process.start()
+    process.join()
+    return process.exitcode
 
 
-def _plugin(root: pathlib.Path, **settings: object) -> dict[str, str]:
-    return {"PYTHONPATH": f"{root}:{root / 'benchmarks' / 'trials'}", "MUTANTS": json.dumps(settings, default=str)}
+def _logged(work, log: str, *arguments) -> None:
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    code = int(work(*arguments))
+    sys.stdout.flush()
+    os._exit(code)  # threads that compile for later are of no use
 
 
-def _setting(name: str):
-    return json.loads(os.environ.get("MUTANTS", "{}")).get(name)
+def _pytest(root: pathlib.Path, files: Sequence[str], plugin: object, *options: str) -> int:
+    os.chdir(root)
+    os.environ["PYTHONPATH"] = str(root)
+    sys.path.insert(0, str(root))
+    # The libraries are imported before pytest can rewrite their assertions.
+    quiet = ["-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
+    return pytest.main([*quiet, *options, *files], plugins=[plugin])
 
 
-def pytest_collection_modifyitems(items: list) -> None:
-    """Keep the chosen tests in their order."""
-    if (chosen := _setting("tests")) is not None:
-        by_name = {item.nodeid: item for item in items}
-        items[:] = [by_name[name] for name in chosen if name in by_name]
+class _Chosen:
+    """Keeps the chosen tests, in their order, and writes which one failed."""
+
+    def __init__(self, tests: Sequence[str], failed: str) -> None:
+        self.tests, self.failed = tests, failed
+
+    def pytest_collection_modifyitems(self, items: list) -> None:
+        by_name = collections.defaultdict(list)
+        for item in items:
+            by_name[item.nodeid.split("[")[0]].append(item)
+            by_name["::".join(item.nodeid.split("::")[:2])].append(item)
+            by_name[item.nodeid.split("::")[0]].append(item)
+        items[:] = dict.fromkeys(item for name in self.tests for item in by_name[name])
+
+    def pytest_runtest_logreport(self, report) -> None:
+        if report.failed:
+            pathlib.Path(self.failed).write_text(report.nodeid)
 
 
-def pytest_runtest_logstart(nodeid: str) -> None:
-    """Have coverage note which test runs a line."""
-    if _setting("seconds") is not None and (running := Coverage.current()) is not None:
-        running.switch_context(nodeid)
+def _run_tests(place: str, tests: Sequence[str], seconds: int, failed: str) -> int:
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 5))
+    files = list(dict.fromkeys(name.split("::")[0] for name in tests))
+    return _pytest(pathlib.Path(place), files, _Chosen(tests, failed), "-x")
 
-
-def pytest_runtest_logreport(report) -> None:
-    """Add the time of a test's setup, call or end."""
-    _seconds[report.nodeid] += report.duration
-
-
-def pytest_sessionfinish() -> None:
-    """Write the seconds of each test."""
-    if (file := _setting("seconds")) is not None:
-        pathlib.Path(file).write_text(json.dumps(_seconds))
-
-
-_seconds: collections.Counter = collections.Counter()
 
 # --- fates ---
 
 
-def fate_of(mutant: Mutant, copy_of: pathlib.Path, reach: Reach, files: int) -> dict:
-    """The mutant's fate: "killed", "slow" (too slow, killed), "died" (the process did), "survived", "not reached"."""
-    fate, by, began, chosen = "not reached", "", time.perf_counter(), nearest(mutant.file, files)
-    if not reach.measures:
-        fate, by = _run(mutant, copy_of, chosen, None, 100.0)
-        chosen = []
-    for file in chosen:
-        tests, seconds = reach.tests_of(mutant, file)
-        if tests != []:
-            found, by = _run(mutant, copy_of, [file], tests, seconds)
-            fate = fate if found == "not reached" else found
-            if fate not in ALIVE:
-                break
-    return {"fate": fate, "by": by, "seconds": round(time.perf_counter() - began, 1)}
-
-
-def _run(mutant: Mutant, copy_of: pathlib.Path, chosen: list[str], tests: list[str] | None, seconds: float) -> tuple[str, str]:
-    """The mutant's fate by tests of files, and the line about the test that failed."""
-    path = copy_of / mutant.file
+def fate_of(mutant: Mutant, copy_of: pathlib.Path, tests: Sequence[str], seconds: int) -> dict:
+    """The mutant's fate: "killed", "died" (the process did), "survived", "slow" (no answer) or "without tests"."""
+    began, path = time.perf_counter(), copy_of / mutant.file
+    log, failed = copy_of.with_suffix(".log"), copy_of.with_suffix(".failed")
+    failed.unlink(missing_ok=True)
     whole = path.read_bytes()
-    home = str(copy_of.with_suffix(".cache"))  # a mutant's traced programs are of no use to others
-    environment = {"XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1", **_plugin(copy_of, tests=tests)}
+    path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
     try:
-        path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
-        result = subprocess.run(
-            [sys.executable, *PYTEST, "-x", *chosen],
-            cwd=copy_of,
-            env={**os.environ, **environment},
-            capture_output=True,
-            text=True,
-            timeout=3 * seconds + 60,
-            errors="replace",
-        )
-    except subprocess.TimeoutExpired:
-        return "slow", ""
+        code = _in_process(_run_tests, str(copy_of), tests, seconds, str(failed), log=log)
     finally:
         path.write_bytes(whole)
-    failed = [line for line in result.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    # 5: all tests of the file are slow ones
-    return {0: "survived", 1: "killed", 2: "killed", 5: "not reached"}.get(result.returncode, "died"), failed[0][
-        :200
-    ] if failed else ""
+    # 2 and 4: the tests cannot be collected, 5: all of them are slow ones
+    fates = {0: "survived", 1: "killed", 2: "killed", 4: "killed", 5: "without tests", -9: "slow", -24: "slow"}
+    by = failed.read_text() if failed.exists() else ""
+    return {"fate": fates.get(code, "died"), "by": by, "seconds": round(time.perf_counter() - began, 1)}
 
 
 def main() -> None:
@@ -247,16 +215,16 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=30, help="mutants of each folder (30)")
     parser.add_argument("--seed", type=int, default=0, help="order of the draw (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")
-    parser.add_argument("--files", type=int, default=5, help="test files that a mutant is given, beside its examples (5)")
-    parser.add_argument("--whole-files", action="store_true", help="measure no lines: cheaper for one mutant in a file")
+    parser.add_argument("--tests", type=int, default=20, help="tests that a mutant is given, beside its examples (20)")
+    parser.add_argument("--seconds", type=int, default=240, help="processor time of a mutant's tests (240)")
     parser.add_argument("--again", action="store_true", help="run the survivors anew")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of the results")
     asked = parser.parse_args()
     out = asked.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
 
-    reach, taken = Reach(out, not asked.whole_files), drawn(asked.count, asked.seed, asked.folder)
-    kept = out / "fates.json"
+    _processes.set_forkserver_preload(LIBRARIES)
+    taken, kept = drawn(asked.count, asked.seed, asked.folder), out / "fates.json"
     fates = json.loads(kept.read_text()) if kept.exists() else {}
     if asked.again:
         fates = {name: fate for name, fate in fates.items() if fate["fate"] not in ALIVE}
@@ -269,7 +237,7 @@ def main() -> None:
 
     def one(mutant: Mutant) -> None:
         place = free.popleft()
-        fates[mutant.name] = fate_of(mutant, place, reach, asked.files)
+        fates[mutant.name] = fate_of(mutant, place, likely_tests(mutant, asked.tests), asked.seconds)
         free.append(place)
         kept.write_text(json.dumps(fates, indent=1))
         print(
