@@ -221,3 +221,14 @@ def test_a_text_has_its_own_unit_in_si():
 def test_hertz_count_as_turns_in_every_power():
     np.testing.assert_allclose(to_float("20 Hz^2", "rad^2/s^2", "hold"), 20 * 4 * np.pi**2)
     assert to_float("20 Hz", "1/s", "rate") == 20.0
+
+
+def test_a_small_angle_out_of_bounds_names_its_bounds():
+    with pytest.raises(jv.InputError, match="is -1 rad; it must be at least 0"):
+        number(-1.0, "rad", "phase", low=0.0)
+
+
+def test_equal_parts_of_equal_parts_are_refused():
+    assert to_float("2 x 3 kg", "kg", "mass") == 6.0
+    with pytest.raises(jv.InputError, match="2 x 3 x 4 kg"):
+        to_float("2 x 3 x 4 kg", "kg", "mass")

@@ -10,7 +10,7 @@ from scenes import scene
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, pareto, synthesize, total
 from optimize.pareto import Front
-from optimize.result import Influence, Limit, Machine, Outcome, Row, objective_text
+from optimize.result import Influence, Limit, Machine, Outcome, Row, _limit_influence, objective_text
 
 SCENE = scene("two_mass")
 
@@ -119,3 +119,22 @@ def test_figures_show_the_results(searched, monkeypatch):
     (across, up), how = shown["front_chart"]
     np.testing.assert_allclose([across, up], [[20.0, 30.0], [500.0, 250.0]])
     assert how == {"x_label": "two, kN", "y_label": "one, mm", "ax": None}
+
+
+@pytest.mark.parametrize(
+    ("gain", "text"),
+    [
+        (0.5, "changed by 1 %: about +0.5 % of the objective"),
+        (-25.0, "changed by 0.1 %: about -2.5 % of the objective"),
+        (1e9, "the objective is almost zero relative to its slope"),
+    ],
+)
+def test_influence_of_a_limit_is_stated_for_a_small_change(gain, text):
+    assert _limit_influence(gain) == text
+
+
+def test_machines_of_one_value_are_equally_good(searched):
+    """Values equal to their first digits only are different."""
+    machines = (Machine(2, 2e4, (1.0,)), Machine(1, 2e4, (2.0,)), Machine(1, 2e4, (3.0,)))
+    (line,) = dataclasses.replace(searched, limits=(), influences=(), machines=machines).findings()
+    assert line == "  3 different machines are equally good (20 kN): the objective does not decide between them"

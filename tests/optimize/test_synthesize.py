@@ -21,6 +21,7 @@ from optimize.synthesize import (
     _options,
     _other_tiers,
     _rank,
+    _report,
     _run,
     _standard_rows,
     _table,
@@ -220,3 +221,10 @@ def test_searches_of_all_numbers_of_loads_count(monkeypatch):
     here, problem, found = module._search(space, total_mass(), (), options, lambda *_: None)
     assert here.scene.loads.count == problem.space.scene.loads.count == 3
     assert (found.drawn, found.existing) == (50, 5) and found.point.values[0, 0] == 6.0
+
+
+def test_reported_shares_grow_from_search_to_verification():
+    told = []
+    for share in (0.0, 0.45, 0.9, 0.95, 1.0):
+        _report(lambda what, shown: told.append(shown), 0.6, "searching", share)
+    np.testing.assert_allclose(told, [0.0, 0.3, 0.6, 0.8, 1.0], atol=1e-12)

@@ -10,6 +10,7 @@ import jaxvib as jv
 from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.status import status_names
 from jaxvib.steady.jams.phases import phase_jam
+from jaxvib.steady.outcome import unknown_is_positive
 
 BALL = dict(count=1, mass=0.5, radius=0.1, drag=0.5)
 ONE = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0), jv.balls(**BALL), jv.ConstantSpeed(60.0))
@@ -82,3 +83,9 @@ def test_derivatives_of_known_numbers_are_checked_by_value(stiffness, expected):
 
     jax.grad(question)(stiffness)
     assert expected is found[0] if expected is None else bool(found[0]) is expected
+
+
+@pytest.mark.parametrize(("number", "positive"), [(2.0, True), (0.0, False), (-1.0, False), (np.inf, False), (np.nan, False)])
+def test_a_number_known_to_the_program_only_is_judged_in_it(number, positive):
+    assert unknown_is_positive(jnp.asarray(number)) is None
+    assert bool(jax.jit(unknown_is_positive)(number)) is positive

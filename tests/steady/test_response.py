@@ -145,6 +145,7 @@ def test_a_motor_with_an_imbalance_runs_at_the_operating_point():
 def test_operating_points_and_folds_are_scipys():
     scene = one_mass(drive=motor())
     found = jv.response(scene)
+    assert {"operating_speed", "fold_speed"} <= set(found.to_xarray().variables)
 
     def share(w):
         return needed(w) / (12.0 * (1.0 - w / (50.0 * np.pi)))

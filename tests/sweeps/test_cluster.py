@@ -41,3 +41,8 @@ def test_a_scheduler_that_is_none(tmp_path):
         with pytest.raises(jv.InputError, match="no scheduler with workers answers there within 2 s"):
             run_study(STUDY, tmp_path / "s.zarr", scheduler=address, timeout="2 s")
     assert run_study(STUDY, tmp_path / "s.zarr").status_name == "done"
+
+
+def test_workers_and_a_scheduler_exclude_each_other(tmp_path):
+    with pytest.raises(jv.InputError, match="scheduler cannot be combined with workers"):
+        run_study(STUDY, tmp_path / "s.zarr", workers=2, scheduler="tcp://127.0.0.1:1")

@@ -14,6 +14,7 @@ import jaxvib as jv
 from jaxvib.motion import batch
 from jaxvib.sweeps import program
 from jaxvib.sweeps import sweep as sweep_module
+from jaxvib.sweeps.definition import _round_up
 from jaxvib.sweeps.study import study
 from jaxvib.sweeps.sweep import run_study
 from optimize import Quantity, jam_frequency
@@ -260,3 +261,8 @@ def test_runs_agree_with_simulate(runs):
         run = jv.simulate(one, 400.0, start=start, save="window")
         assert int(run.regime.mode) == int(data["mode"][i, j])
         np.testing.assert_allclose(float(run.omega), data.load_speed.values[i, j], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("count", "unit", "rounded"), [(0, 4, 0), (1, 4, 4), (4, 4, 4), (5, 4, 8), (7, 1, 7)])
+def test_counts_are_rounded_up_to_whole_units(count, unit, rounded):
+    assert _round_up(count, unit) == rounded

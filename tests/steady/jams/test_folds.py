@@ -160,6 +160,7 @@ def test_folds_are_differentiable():
         ([1.1, 1.5, 3.1, 3.5], 4, [1, 2, 5, 6, 7, 7, 7]),  # none at the second
         ([2.9, 2.95, 3.1, 3.5], 4, [3, 4, 5, 6, 7, 7, 7]),  # two nearest to the third, which the last one needs
         ([1.1, 1.2, 1.3, 1.5], 4, [1, 2, 3, 4, 7, 7, 7]),  # two nearest to the first
+        ([1.1, 1.2, 2.1, 2.5], 4, [1, 2, 3, 4, 7, 7, 7]),  # none at the third
         ([], 0, [7] * 7),
     ],
 )

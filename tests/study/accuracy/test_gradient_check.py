@@ -179,3 +179,12 @@ def test_a_quantity_of_chaos_is_named_and_one_with_noise_is_not():
     assert jv.check_gradients(SCENE, of_orbit(5), **asked).status_name == "agree"
     noisy = jv.check_gradients(SCENE, lambda s: closed(s) * (1.0 + 1e-2 * jnp.sin(jax.lax.stop_gradient(closed(s)))), **asked)
     assert noisy.status_name != "chaotic"
+
+
+def test_a_number_at_its_upper_bound_is_left_out():
+    """A step of a difference would cross it."""
+    balls = jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25, ball_radius=0.02)
+    for restitution, left_out in ((1.0, ("effects.load_contact.restitution",)), (0.5, ())):
+        scene = jv.Scene(SCENE.machine, balls, SCENE.drive, (jv.LoadContact(1e5, restitution=restitution),))
+        check = jv.check_gradients(scene, closed, free=("effects.load_contact.restitution", "machine.stiffness"))
+        assert check.left_out == left_out

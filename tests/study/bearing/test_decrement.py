@@ -74,3 +74,12 @@ def test_dry_friction_biases_the_formula_as_stated(dry):
     middle = (0.1 - last) / np.log(0.1 / last)
     bias = found.estimates[0] - 1e-3
     np.testing.assert_allclose(bias, 4.0 * torque / (np.pi * w * middle), rtol=0.05)
+
+
+def test_turning_points_beside_an_end_are_left_out():
+    """Half of an arc determines its turning point badly."""
+    points = (np.arctan(3.0 / 0.02) + np.pi * np.arange(9)) / 3.0
+    for begin, end, kept in ((0.0, points[5] + 0.05, points[:5]), (points[1] - 0.05, points[6] + 0.3, points[2:7])):
+        t = np.arange(begin, end, 0.01)
+        turns = turning_points(jv.Record(t, 0.1 * np.exp(-0.02 * t) * np.sin(3.0 * t)))
+        np.testing.assert_allclose(turns.time, kept, atol=2e-3)  # damping is left out of the arcs
