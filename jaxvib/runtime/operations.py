@@ -37,9 +37,7 @@ def _walk(jaxpr: Any) -> Iterator[Any]:
 
 
 def _programs(value: Any) -> Iterator[Any]:
-    if hasattr(value, "jaxpr"):
-        yield value.jaxpr
-    elif hasattr(value, "eqns"):
+    if hasattr(value, "eqns"):
         yield value
     elif isinstance(value, (list, tuple)):
         for each in value:

@@ -248,7 +248,7 @@ def choose(problem: Problem, options: Options, report: Progress) -> SearchResult
                     continue
                 value = float(child.point.values[child.best, 0])
                 if best is None or value < best[0]:
-                    report(f"choosing, best {best[0]:.4g}" if best else "choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
+                    report("choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
                     heapq.heappush(queue, (value, next(order), child, initial))
     except KeyboardInterrupt:
         interrupted = True

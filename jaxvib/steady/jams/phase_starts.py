@@ -273,8 +273,7 @@ def _poles(model: LinearModel, speed: Array) -> np.ndarray:
 def _regular_phases(balance: TorqueBalance) -> np.ndarray:
     """Return regular sets of phases (ns, count): all equal, and every division into two opposite groups."""
     n = balance.unbalance.shape[0]
-    splits = range(2 ** min(n - 1, 5))
-    return np.array([[np.pi * ((k >> j) & 1) if j < min(n - 1, 5) else 0.0 for j in range(n)] for k in splits])
+    return np.array([[np.pi * ((k >> j) & 1) for j in range(n)] for k in range(2 ** min(n - 1, 5))])
 
 
 def phases_near(
