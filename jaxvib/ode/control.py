@@ -36,15 +36,20 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
     - Steps of constant length have e = s^32. In double precision s = 0.88 and e = 1/60, so that the sum of the errors of 10^5
       steps is near the tolerance. In single precision s = 0.97 and e = 0.38, because smaller estimates consist of rounding
       errors, which shorter steps hardly reduce
-    - h_next / h lies between 0.2 and 5
+    - h_next / h lies between 0.2 and 5, after a rejected step between 0.2 and 0.9
+    - |y| of an entry is the larger of its absolute values at the ends of the step
     - A step whose error is NaN is rejected with e = infinity. If no shorter step advances the time in its dtype, the run ends
       with `diffrax.RESULTS.dt_min_reached`
-    - A run with more than `max_steps` steps ends with `diffrax.RESULTS.max_steps_reached`. The limit is an input of the
-      program, so that another limit needs no other program
+    - A run with more than `max_steps` steps, rejected ones included, ends with `diffrax.RESULTS.max_steps_reached`. The limit
+      is an input of the program, so that another limit needs no other program
 
-    **Attributes**: `tolerance` scalar, without a unit; `unit` and `relative`, trees like the state: the scale of each entry
-    (in its unit), and the fraction of |y| that is added to it. `relative` is 0 for angles, because they grow without limit,
-    and a long run would lose its phase with an error relative to them. `max_steps`: a whole number, or None.
+    **Attributes**
+
+    - `tolerance`, a scalar without a unit
+    - `unit`, a tree like the state: the scale of each entry, in its unit
+    - `relative`, a tree like the state: the fraction of |y| that is added to the scale. It is 0 for angles, because they grow
+      without limit, and a long run would lose its phase with an error relative to them
+    - `max_steps`: a whole number, None for no limit
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -105,7 +110,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         controller_state: _State,
     ) -> Decision:
         """Return the acceptance of the step, the beginning and the end of the next one, and the state of the controller."""
-        root_before, left = controller_state
+        root_before, steps_left = controller_state
 
         def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
             size = self.tolerance * (unit + relative * jnp.maximum(jnp.abs(a), jnp.abs(b)))
@@ -125,14 +130,15 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         end = start + factor * (t1 - t0)
         root = jnp.where(accept, root, root_before)
         result = step_success(accept, start, t1, end)
-        if left is not None:
-            left = left - 1
-            result = diffrax.RESULTS.where(left >= 0, result, diffrax.RESULTS.max_steps_reached)
-        return accept, start, end, False, (root, left), result
+        if steps_left is not None:
+            steps_left = steps_left - 1
+            result = diffrax.RESULTS.where(steps_left >= 0, result, diffrax.RESULTS.max_steps_reached)
+        return accept, start, end, False, (root, steps_left), result
 
 
 def step_success(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
-    """Return the outcome of a step: after a rejected step from `start` to `before`, the next one, to `end`, must be shorter."""
+    """Return the outcome of a step: after a rejected step from `start` to `before`, the next step, which ends at `end`, must be
+    shorter."""
     shorter = (end > start) & (end < before)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 

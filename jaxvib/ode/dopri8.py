@@ -55,12 +55,13 @@ ERROR = np.asarray(_TABLEAU.b_error)
 
 
 def ravel(tree: PyTree[Array], directions: int = 0) -> Array:
-    """Entries of a tree as a vector (n,), or as (n, directions) if all arrays have `directions` as last axes."""
+    """Return the entries of a tree as a vector (n,), or as (n, ...) if all arrays have this number of `directions` as last
+    axes."""
     return jnp.concatenate([leaf.reshape(-1, *leaf.shape[leaf.ndim - directions :]) for leaf in jax.tree.leaves(tree)])
 
 
 def unravel(flat: Array, like: Tree) -> Tree:
-    """Inverse of `ravel`; `like` has the structure and the shapes."""
+    """Return the tree of a vector, the inverse of `ravel`; `like` has the structure and the shapes of the tree."""
     leaves, rest = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = [
@@ -71,15 +72,15 @@ def unravel(flat: Array, like: Tree) -> Tree:
 
 
 def dense_stages(stages: Array) -> Array:
-    """Stages that contribute to states within a step, (10, ...): the first, and all from the sixth on."""
+    """Return the stages that contribute to states within a step, (10, ...): the first, and all from the sixth on."""
     return jnp.concatenate([stages[:1], stages[_FIRST_LATE_STAGE:]])
 
 
 def linear_combination(weights: Array, stages: Array) -> Array:
-    """sum_j weights_j stages_j; weights (..., stages), stages (stages, ...).
+    """Return sum_j weights_j stages_j; weights (..., stages), stages (stages, ...).
 
-    XLA computes a product once and vectorizes it. It would recompute an unrolled sum, with its weights, for each use of one of
-    its entries.
+    XLA computes a matrix product once and vectorizes it. An unrolled sum would be recomputed, with its weights, for each use of
+    one of its entries.
     """
     return jnp.tensordot(weights.astype(stages.dtype), stages, 1, precision="highest")
 

@@ -53,11 +53,14 @@ class LoopDopri8(AbstractDopri8):
 
     Its program contains the equations once, for all stages.
 
-    **Arguments**: `tangents`: True if only forward derivatives are needed. The derivatives of a step are then computed along
-    all tangents at once; eight tangents cost little more than one. `reuse`: True to use the last stage of a step as the first
-    one of the next step, which saves one of fourteen evaluations. The start of the loop is then known at run time only;
-    therefore diffrax's adjoints cannot compute reverse derivatives. The derivatives of `jaxvib.ode.replay` are not affected.
-    `wrap` as in `UnrolledDopri8`.
+    **Arguments**
+
+    - `tangents`: True if only forward derivatives are needed. The derivatives of a step are then computed along all tangents at
+      once; eight tangents cost little more than one
+    - `reuse`: True to use the last stage of a step as the first one of the next step, which saves one of fourteen evaluations.
+      The start of the loop is then known at run time only; therefore diffrax's adjoints cannot compute reverse derivatives. The
+      derivatives of `jaxvib.ode.replay` are not affected
+    - `wrap` as in `UnrolledDopri8`
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -68,7 +71,7 @@ class LoopDopri8(AbstractDopri8):
     >>> bool(abs(jax.jacfwd(end)(0.5) + 2.0 * jnp.exp(-1.0)) < 1e-12)
     True
 
-    Source: as `UnrolledDopri8`.
+    Source: that of `UnrolledDopri8`.
     """
 
     tangents: bool = eqx.field(static=True, default=False)

@@ -238,29 +238,29 @@ class _BackwardPass:
         def is_within(carry: tuple[Array, Array, PyTree[Array]]) -> Array:
             return (carry[0] >= 0) & (times[carry[0]] > before)
 
-        def taken(carry: tuple[Array, Array, PyTree[Array]]) -> tuple[Array, Array, PyTree[Array]]:
+        def add_saved_state(carry: tuple[Array, Array, PyTree[Array]]) -> tuple[Array, Array, PyTree[Array]]:
             k, by_times, by_step = carry
             slope = jax.tree.map(lambda dy: dy[k], self.saved.states)
             *more, by_time = jax.vjp(within, dense, t0, t1, times[k])[1](slope)
             return k - 1, by_times.at[k].set(by_time), jax.tree.map(jnp.add, by_step, tuple(more))
 
-        none = jax.tree.map(jnp.zeros_like, (dense, t0, t1))
-        carry = (slopes.ahead, slopes.times, none)
-        return jax.lax.while_loop(is_within, taken, carry) if times.size else carry
+        zeros = jax.tree.map(jnp.zeros_like, (dense, t0, t1))
+        carry = (slopes.ahead, slopes.times, zeros)
+        return jax.lax.while_loop(is_within, add_saved_state, carry) if times.size else carry
 
     def to_recorded_state(self, n: Array, slopes: _Slopes) -> tuple[Array, _Slopes]:
         """Return n - 1, and the derivatives at the n-th recorded state from those after the steps that follow it."""
         first, count = n * self.every, jnp.minimum(self.every, self.record.steps - n * self.every)
-        noted = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), self.y0, self.record.states)
+        recorded = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), self.y0, self.record.states)
         if self.every == 1:
-            return n - 1, self.over_step(n, noted, slopes)
+            return n - 1, self.over_step(n, recorded, slopes)
 
-        def again(j: Array, states: Y) -> Y:
+        def recompute(j: Array, states: Y) -> Y:
             y, _ = self.step(jax.tree.map(lambda ys: ys[j], states), *self.span(first + j), self.numbers)
             return jax.tree.map(lambda ys, y: ys.at[j + 1].set(y), states, y)
 
-        states = jax.tree.map(lambda y: jnp.zeros((self.every, *y.shape), y.dtype).at[0].set(y), noted)
-        states = jax.lax.fori_loop(0, count - 1, again, states)
+        states = jax.tree.map(lambda y: jnp.zeros((self.every, *y.shape), y.dtype).at[0].set(y), recorded)
+        states = jax.lax.fori_loop(0, count - 1, recompute, states)
 
         def from_last(j: Array, slopes: _Slopes) -> _Slopes:
             k = count - 1 - j
@@ -274,22 +274,26 @@ def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.Abstrac
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     finder = solver.root_finder
-    asked = [name for name in ("rtol", "atol") if not eqx.is_inexact_array_like(getattr(finder, name))]
-    asked += [] if callable(finder.norm) else ["norm"]
-    values = [getattr(controller, name) for name in asked]
-    return eqx.tree_at(lambda s: [getattr(s.root_finder, name) for name in asked], solver, values) if asked else solver
+    missing = [name for name in ("rtol", "atol") if not eqx.is_inexact_array_like(getattr(finder, name))]
+    missing += [] if callable(finder.norm) else ["norm"]
+    values = [getattr(controller, name) for name in missing]
+    return eqx.tree_at(lambda s: [getattr(s.root_finder, name) for name in missing], solver, values) if missing else solver
 
 
 def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, j: Array) -> Array:
-    """Return the derivative of the start of step j of `count` with respect to the end of the run. Constant steps fill the time
-    after the first step; the steps of a controller do not depend on the end."""
+    """Return the derivative of the start of step j of `count` with respect to the end of the run.
+
+    With constant steps, the start of step j > 1 is j/count of the end (see `diffrax.ConstantStepSize`), and the end of the
+    first step is the `first_step`. The steps of an adaptive controller do not depend on the end, except for the last one.
+    """
     if isinstance(controller, diffrax.ConstantStepSize):
         return jnp.where((j > 1) | (count == 1), j / count, 0.0)
     return jnp.where(j == count, 1.0, 0.0)
 
 
 def _end_before(controller: diffrax.AbstractStepSizeController, start: Array) -> Array:
-    """Return the end of the step before the one that begins at `start`: the same time, unless the field jumps between them."""
+    """Return the end of the step before the one that begins at `start`: the same time, or the time just before a jump of the
+    field."""
     jumps = getattr(controller, "jump_ts", None)
     if jumps is None:
         return start

@@ -131,7 +131,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
 
 
 def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Array, Array]:
-    """df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis.
+    """Return df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis.
 
     This axis is padded to a multiple of the processor's vector width.
     """
@@ -142,5 +142,5 @@ def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Ar
         numbers = (t, *(y[i] for i in range(n)))
         return jax.jvp(lambda t, *y: terms.vf(t, jnp.stack(y), args), numbers, direction)[1]
 
-    found = jax.vmap(tangent, in_axes=-1, out_axes=-1)(*directions)
-    return found[:, 1 : n + 1], found[:, 0]
+    tangents = jax.vmap(tangent, in_axes=-1, out_axes=-1)(*directions)
+    return tangents[:, 1 : n + 1], tangents[:, 0]

@@ -31,8 +31,9 @@ _MAX_RECOMPUTED = 8
 
 
 def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Return the same program without repeated operations and without operations whose results are not used. Equations from
-    automatic differentiation contain the same operations many times: a third to a half of them are removed.
+    """Return the same program without repeated operations and without operations whose results are not used.
+
+    Equations from automatic differentiation contain the same operations many times: a third to a half of them are removed.
     """
     first: dict[Var, Var | Literal] = {}
     done: dict[tuple[object, ...], JaxprEqn] = {}
@@ -89,8 +90,8 @@ def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
         if equation.primitive == _division():
             spent = 0  # its result is not recomputed
         for atom, result in zip(equation.outvars, results, strict=True):
-            dear = uses.get(atom, 0) > 1 and spent > _MAX_RECOMPUTED and is_floating(atom)
-            known[atom], cost[atom] = (fence(result, one), 0) if dear else (result, spent)
+            is_costly = uses.get(atom, 0) > 1 and spent > _MAX_RECOMPUTED and is_floating(atom)
+            known[atom], cost[atom] = (fence(result, one), 0) if is_costly else (result, spent)
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -163,12 +164,12 @@ def with_reciprocals(program: ClosedJaxpr, changing: int) -> ClosedJaxpr:
         below = inputs[-1]
         if equation.primitive != _division() or not isinstance(below, Var) or below in moving or not is_floating(below):
             return None
-        made: list[tuple[JaxprEqn, Atoms]] = []
+        added: list[tuple[JaxprEqn, Atoms]] = []
         if below not in reciprocals:
             inverse = operation_like(lambda x: 1.0 / x, below)
-            made.append((inverse, [inverse.invars[0], below]))
+            added.append((inverse, [inverse.invars[0], below]))
             reciprocals[below] = inverse.outvars[0]
         times = operation_like(lambda x, y: x * y, below, below)
-        return [*made, (times, [inputs[0], reciprocals[below]])], times.outvars[0]
+        return [*added, (times, [inputs[0], reciprocals[below]])], times.outvars[0]
 
     return substituted(program, product)

@@ -35,7 +35,7 @@ class NotScalarizable(Exception):
 
 
 def to_scalars(value: ArrayLike) -> Scalars:
-    """An array as an object array of its entries."""
+    """Return an array as an object array of its entries."""
     if isinstance(value, np.ndarray) and value.dtype == object:
         return value
     array = value if isinstance(value, jax.Array) else np.asarray(value)
@@ -80,7 +80,7 @@ def _parts(x: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def joined(x: Scalar) -> Scalar:
-    """Complex number as one scalar; any other number unchanged."""
+    """Return a complex number as one scalar, and any other number unchanged."""
     return lax.complex(*(jnp.asarray(part) for part in _parts(x))) if isinstance(x, ComplexParts) else x
 
 
@@ -171,8 +171,10 @@ def _by_primitive(primitive: Primitive) -> Callable[..., Scalar]:
 
 
 def elementwise(rule: Callable[..., Scalar]) -> Rule:
-    """Return the rule for arrays that applies a rule for scalars to each entry. A scalar argument is used for all entries, as
-    `clamp` needs it."""
+    """Return the rule for arrays that applies a rule for scalars to each entry.
+
+    An argument of shape () is used for all entries, which `clamp` requires.
+    """
 
     def apply(*given: Scalars, **params: object) -> Scalars:
         whole = np.broadcast_arrays(*given) if len(given) > 1 else list(given)
@@ -254,8 +256,9 @@ def _pad(x: Scalars, value: Scalars, *, padding_config: Sequence[tuple[int, int,
 
 
 def primitive_of(function: _Function, *arguments: ArrayLike) -> Primitive:
-    """Return the primitive of a public function of JAX that consists of a single primitive. **Raises** `NotScalarizable` if
-    the function consists of several primitives, or of none.
+    """Return the primitive of a public function of JAX that consists of a single primitive.
+
+    **Raises** `NotScalarizable` if the function consists of several primitives, or of none.
     """
     equations = jax.make_jaxpr(function)(*arguments).jaxpr.eqns
     if len(equations) != 1:

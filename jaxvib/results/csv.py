@@ -56,8 +56,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path, *, display: bool 
 
 def main_axis(result: eqx.Module) -> str:
     """Return the most frequent first axis of the arrays of a result; "" if none has an axis."""
-    found = collections.Counter(axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes))
-    return max(found, key=lambda axis: found[axis], default="")
+    counts = collections.Counter(axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes))
+    return max(counts, key=lambda axis: counts[axis], default="")
 
 
 def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict[str, np.ndarray]:
@@ -80,8 +80,8 @@ def table_along(result: eqx.Module, axis: str, *, display: bool = False) -> dict
                     numbers = factor * numbers
                 table[f"{part}{head}" + (f" ({own})" if own else "")] = numbers
     if not table:
-        there = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
-        raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(there) or 'none'}")
+        known = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
+        raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(known) or 'none'}")
     return table
 
 

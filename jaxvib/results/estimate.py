@@ -13,7 +13,7 @@ from jaxvib.errors import InputError, quoted
 class Estimate(NamedTuple):
     """Measured number with its uncertainty.
 
-    **Attributes**: its `value`; its standard `error` from the record's noise; `low` and `high`: its confidence interval of
+    **Attributes**: `value`; `error`: standard error from the noise of the record; `low` and `high`: confidence interval of
     95 %, which includes the error of the instruments.
     """
 
@@ -71,8 +71,11 @@ def estimate_share(flags: Any) -> Share:
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:
-    """Return an estimate with its interval; its half-width is the root of the sum of the squares of the errors of noise and
-    instruments."""
+    """Return an estimate with its interval, value +- sqrt((quantile error)^2 + (instrument value)^2).
+
+    **Arguments**: `value` and its standard `error` from noise; `quantile` of the distribution of the error, such as 1.96;
+    `instrument`: relative error of the instruments.
+    """
     half = float(np.hypot(quantile * error, instrument * value))
     return Estimate(value, error, value - half, value + half)
 
@@ -107,5 +110,5 @@ def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np
     share, more = hits / n, z**2 / n
     middle = (share + more / 2.0) / (1.0 + more)
     half = z * np.sqrt(share * (1.0 - share) / n + more / (4.0 * n)) / (1.0 + more)
-    none = np.asarray(cases) == 0
-    return np.where(none, 0.0, np.maximum(middle - half, 0.0)), np.where(none, 1.0, np.minimum(middle + half, 1.0))
+    is_empty = np.asarray(cases) == 0
+    return np.where(is_empty, 0.0, np.maximum(middle - half, 0.0)), np.where(is_empty, 1.0, np.minimum(middle + half, 1.0))

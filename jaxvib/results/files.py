@@ -84,10 +84,10 @@ def load(path: str | Path) -> Any:
         layout, digest = (str(arrays.pop(name, "")) for name in (_LAYOUT, _DIGEST))
         if digest != _digest(layout, arrays):
             raise ValueError("changed after it was saved")
-        found = _decoded(json.loads(layout), arrays)
-        if not isinstance(found, eqx.Module):
+        result = _decoded(json.loads(layout), arrays)
+        if not isinstance(result, eqx.Module):
             raise ValueError("not a result")
-        return found
+        return result
     except FileNotFoundError as error:
         raise InputError("path", f"is {quoted(str(path))}; there is no such file") from error
     except _READ_ERRORS as error:
@@ -130,11 +130,11 @@ def _array(content: bytes) -> np.ndarray:
 
 
 def _digest(layout: str, arrays: Mapping[str, np.ndarray]) -> str:
-    found = hashlib.sha256(layout.encode())
+    digest = hashlib.sha256(layout.encode())
     for name, array in sorted(arrays.items()):
-        found.update(f"{name} {array.dtype.str} {array.shape}".encode())
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
@@ -222,14 +222,14 @@ def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str],
 
 def _rebuilt(kind: type, fields: Mapping[str, Plain], arrays: Mapping[str, np.ndarray]) -> object:
     """Return an object with these stored fields; its constructor, which would convert and check them again, is not called."""
-    whole = object.__new__(kind)
+    instance = object.__new__(kind)
     for field in dataclasses.fields(kind):
-        given = field.name in fields
-        value = _decoded(fields[field.name], arrays, field.metadata.get("read")) if given else field.default
+        is_stored = field.name in fields
+        value = _decoded(fields[field.name], arrays, field.metadata.get("read")) if is_stored else field.default
         if value is dataclasses.MISSING:
             raise KeyError(field.name)
-        object.__setattr__(whole, field.name, value)
-    return whole
+        object.__setattr__(instance, field.name, value)
+    return instance
 
 
 def _class_named(name: str, base: type) -> Any:

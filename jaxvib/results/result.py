@@ -123,9 +123,9 @@ class Result(eqx.Module):
 
         **Raises** `InputError` for a file that is missing or contains something else.
         """
-        found = files.load(path)
-        if not isinstance(found, cls):
+        result = files.load(path)
+        if not isinstance(result, cls):
             raise InputError(
-                "path", f"is {quoted(str(path))}; it contains a result of class {type(found).__name__}, not {cls.__name__}"
+                "path", f"is {quoted(str(path))}; it contains a result of class {type(result).__name__}, not {cls.__name__}"
             )
-        return found
+        return result

@@ -35,7 +35,7 @@ class TextTable(NamedTuple):
     - `heads` and `units`: texts of the line of names and of the line below it, an empty list without such a line
     - `width`: number of columns
     - `remarks`: lines above the head, and those that begin with #
-    - `first`: number of lines with content above the first row of numbers
+    - `first`: number of lines above the first row of numbers, without empty lines and lines that begin with #
     - `mark`: character between columns, None for blanks, a line break for one column
     """
 
@@ -145,7 +145,10 @@ def read_table(path: str | Path, needs: str) -> TextTable:
 
 
 def is_number(cell: str, mark: str | None) -> bool:
-    """Return True for the text of a finite number, with a decimal comma if `mark`, between columns, is no comma."""
+    """Return True for the text of a finite number.
+
+    `mark` is the character between columns; if it is not a comma, the number may have a decimal comma.
+    """
     try:
         return bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))
     except ValueError:

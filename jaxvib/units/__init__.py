@@ -78,10 +78,10 @@ def conditions_of_traced_values() -> Iterator[list[Array]]:
 
     The yielded list receives a traced Boolean for each traced value, True if the value is allowed.
     """
-    found: list[Array] = []
-    token = _COLLECTED.set(found)
+    conditions: list[Array] = []
+    token = _COLLECTED.set(conditions)
     try:
-        yield found
+        yield conditions
     finally:
         _COLLECTED.reset(token)
 
@@ -186,8 +186,8 @@ def numbers(
         if not all(isinstance(part, jax.Array) for part in parts):
             for i, part in enumerate(parts):
                 _converted(part, unit, f"{field}[{i}]", (), bounds)
-        known = not any(isinstance(part, jax.Array) for part in parts)
-        stacked = np.asarray(parts, dtype=float) if known else jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
+        is_plain = not any(isinstance(part, jax.Array) for part in parts)
+        stacked = np.asarray(parts, dtype=float) if is_plain else jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
         return _array(stacked, unit, field, stacked.shape, bounds)
     single: Any = value
     magnitude = to_float(single, unit, field)
@@ -268,13 +268,13 @@ def validate_tolerance(value: float, name: str, dtype: np.dtype, least: float) -
     **Raises** `InputError` for other values.
     """
     precision = float(jnp.finfo(dtype).eps)
-    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not (plain and least * precision <= value < 1.0):
+    is_python_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (is_python_number and least * precision <= value < 1.0):
         # 5 % more, so that the value in the message, rounded to two digits, is allowed.
         raise InputError(
             name,
             f"is {quoted(value)}; in {dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"
-            + ("" if plain else ", a Python number such as 1e-6")
+            + ("" if is_python_number else ", a Python number such as 1e-6")
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )
     return value

@@ -52,6 +52,8 @@ _SPELLINGS: dict[str, dict[str, float]] = {
 """Units in the heads of columns by the SI unit, in lower case; heads may be in upper or lower case."""
 
 _MULTIPLE = re.compile(r"^(\d+\.?\d*(?:[eE][+-]?\d+)?)\s+([^\s\d/].*)$")
+"""Pattern of a multiple of a unit, such as "50 kN"."""
+
 _HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[{]\s*(?P<unit>[^)\]}]*?)\s*[)\]}]|/\s*(?P<per>\S+))$")
 _TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
 
@@ -69,8 +71,8 @@ def unit_factor(unit: str, si: str) -> float | None:
         return factor
     multiple = _MULTIPLE.match(unit)
     if multiple is not None:
-        one = unit_factor(multiple[2], si)
-        return None if one is None or float(multiple[1]) == 0.0 else float(multiple[1]) * one
+        factor = unit_factor(multiple[2], si)
+        return None if factor is None or float(multiple[1]) == 0.0 else float(multiple[1]) * factor
     return unit_ratio(unit, si) if unit and si else None
 
 

@@ -37,12 +37,12 @@ def csv_column(path: str | Path, unit: str, column: str | None = None) -> np.nda
     """
     head, *rows = _rows(path)
     names = [split_head(each, unit) for each in head]
-    found = [k for k, (name, own) in enumerate(names) if _matches(head[k], name, own, unit, column)]
-    if len(found) != 1:
+    matching = [k for k, (name, own) in enumerate(names) if _matches(head[k], name, own, unit, column)]
+    if len(matching) != 1:
         wanted = f"with a unit such as {unit}" if column is None else f"{quoted(column)}"
-        there = f"has {len(found) or 'no'} columns {wanted}"
-        raise InputError(str(path), f"{there}; name one as column, the columns are: {', '.join(map(quoted, head))}")
-    (k,) = found
+        problem = f"has {len(matching) or 'no'} columns {wanted}"
+        raise InputError(str(path), f"{problem}; name one as column, the columns are: {', '.join(map(quoted, head))}")
+    (k,) = matching
     own = names[k][1]
     factor = 1.0 if not unit and own in ("", "-") else unit_factor(own, unit) if own else None
     if factor is None:

@@ -106,7 +106,7 @@ class Jam(AbstractJam):
 
     @property
     def judgement(self) -> str:
-        """ "stable" or "unstable" by slope, or "loads cannot stay together"."""
+        """Stability as text: "stable by slope", "unstable by slope", or "loads cannot stay together"."""
         if bool(self.status == JamStatus.cannot_stay_together):
             return "loads cannot stay together"
         return f"{'stable' if self.stable else 'unstable'} by slope"
@@ -363,14 +363,14 @@ def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> d
     n = model.scene.drive.speed
 
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
-        found = jam_at(model, number, w, n, flat)
+        solved = jam_at(model, number, w, n, flat)
         values = jax.tree.map(
-            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value, found
+            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value, solved
         )
         return eqx.tree_at(
             lambda j: (j.status, j.stable, j.rotor_speed),
             values,
-            (JamStatus.where(is_there, found.status, JamStatus.absent), is_there & found.stable, n),
+            (JamStatus.where(is_there, solved.status, JamStatus.absent), is_there & solved.stable, n),
         )
 
     jams = jax.vmap(jam)(jnp.arange(1, omega.shape[0] + 1), omega, there, at_fold)

@@ -28,10 +28,10 @@ errors."""
 
 
 class Slopes(NamedTuple):
-    """Singular value decomposition of the scaled Jacobian of the balance.
+    """Singular value decomposition of the Jacobian of the balance, whose rows and columns are multiplied by factors.
 
-    **Attributes**: `rows` and `columns`, factors of the residuals and of the unknowns; `left`, `values`, `right` of the scaled
-    Jacobian; `neutral`: number of its singular values that are 0 up to rounding.
+    **Attributes**: `rows` and `columns`: the factors; `left`, `values`, `right`: U, s and V^T of the decomposition;
+    `neutral`: number of singular values that are 0 up to rounding.
     """
 
     rows: Array

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_MOST_MASSES = 7
+_MAX_EXCHANGED_MASSES = 7
 """Largest number of rotating masses for which all exchanges are tried; 7! are 5040."""
 
 
@@ -32,7 +32,7 @@ def exchanges_of(influence: np.ndarray, numbers: np.ndarray) -> list[Exchange]:
     """
     count = influence.shape[1]
     identity = Exchange(np.arange(count), np.zeros(count))
-    if not 1 < count <= _MOST_MASSES:
+    if not 1 < count <= _MAX_EXCHANGED_MASSES:
         return [identity]
     orders = np.array(list(itertools.permutations(range(count))))
     scale = np.maximum(np.max(np.abs(numbers), axis=0), np.finfo(float).tiny)

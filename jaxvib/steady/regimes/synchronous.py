@@ -258,10 +258,11 @@ def synchronous_regimes(
 
         L_i(Omega) + V_i(Omega, alpha) = 0 for every mass i
         V_i = (Omega^4/2) sum_k S_i S_k Im(exp(i (alpha_k - alpha_i)) H_ik)
-        H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k,    e_k = (1, -i direction_k),    D = K - Omega^2 M + i Omega C
+        H_ik = e_i^H B_i D(Omega)^-1 B_k^T e_k,    e_k = (1, -i direction_k),    D = K - Omega^2 M + i Omega (C + n G)
 
-    - The masses are the unbalances of the exciters, whose motors give L, and loads, whose drag gives L; an ideal drive
-      prescribes the angle Omega t of its unbalance, and Omega is then the speed of this drive
+    - The masses are the unbalances of the exciters and the loads. L is the torque of the motor of an unbalance, or that of the
+      drag on a load. An ideal drive prescribes the angle Omega t of its unbalance, and Omega is then the speed of this drive
+    - n is the mean of the rotors' speeds, anticlockwise positive; the gyroscopic matrix G is 0 for most machines
     - Regimes that differ by the same shift of all phases or by an exchange of equal exciters, such as mirror images, are listed
       once; of a family of regimes one member is listed, with the status `degenerate`
     - Stability is the growth of small disturbances of amplitudes, speeds and phases together, see `averaged_field`
@@ -311,11 +312,11 @@ def synchronous_regimes(
         speed, phases = number(near[0], "rad/s", "near[0]", low=0.0, open_low=True), numbers(near[1], "rad", "near[1]", count)
         return outcome(_regime_near(scene, speed, phases, group), scene)
     omega, phases = all_regimes(assemble_for_search(scene, group))
-    found = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
-    kept = np.flatnonzero(status_names(found["status"]) != "not_converged")
-    kept = kept[np.lexsort((-found["speed"][kept], ~found["stable"][kept]))]
-    search = RegimeSearchStatus.done if kept.size else RegimeSearchStatus.none
-    return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[kept], found)), scene=scene, search=search)
+    fields = in_chunks(_REGIMES_PER_PROGRAM, lambda w, a: _regimes_near(scene, w, a, group), omega, phases)
+    order = np.flatnonzero(status_names(fields["status"]) != "not_converged")
+    order = order[np.lexsort((-fields["speed"][order], ~fields["stable"][order]))]
+    search = RegimeSearchStatus.done if order.size else RegimeSearchStatus.none
+    return SynchronousRegimes(**on_device(jax.tree.map(lambda leaf: leaf[order], fields)), scene=scene, search=search)
 
 
 def mass_owners(scene: Scene) -> np.ndarray:
