@@ -125,7 +125,7 @@ def test_exact_modes_json_has_the_promised_keys(typed):
     assert {k for k, each in jams.items() if "measures" in each} == {k for k, each in jams.items() if each["stable"]}
 
 
-def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):
+def test_modes_note_that_an_imbalance_is_left_out(typed, tmp_path):
     plain = scene("two_mass", speed=150.0)
     shaken = jv.Scene(plain.machine, plain.loads, plain.drive, (jv.StaticImbalance("5 g m"),))
     jv.save_scene(shaken, tmp_path / "shaken.toml")
@@ -142,7 +142,7 @@ def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):
     assert code == 2 and "--without is 'stop'; the scene's effects are: static_imbalance" in err
 
 
-def test_a_machine_without_springs_ends_in_a_sentence(typed, tmp_path):
+def test_a_machine_without_springs_raises_a_clear_error(typed, tmp_path):
     loads_ = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04)
     free = {
         "platform": jv.one_mass(mass=50.0, stiffness=0.0, damping=30.0),
@@ -168,7 +168,7 @@ def test_a_machine_without_springs_ends_in_a_sentence(typed, tmp_path):
 
 
 @pytest.mark.parametrize("given", ["5", '"5 N/m"', "[1.0, 2.0]", '["1 N/m", "soft", 3.0]', "{ a = 1 }", "true"])
-def test_terms_that_are_no_three_numbers_end_in_a_sentence(typed, tmp_path, given):
+def test_terms_without_three_numbers_raise_clear_errors(typed, tmp_path, given):
     text = TEMPLATES["rotor"].replace("# stiffness_terms = [1.159e6, 0.0, 2.98e4]", f"stiffness_terms = {given}")
     assert given in text
     (tmp_path / "rotor.toml").write_text(text)
@@ -276,7 +276,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("change", "says"), WRONG)
-def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, says):
+def test_wrong_scene_files_exit_2_with_a_clear_error(typed, tmp_path, change, says):
     text = (tmp_path / "machine.toml").read_text()
     assert change[0] in text
     (tmp_path / "machine.toml").write_text(text.replace(*change, 1))
@@ -307,7 +307,7 @@ def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, say
         (("new", "four-mass"), 2, "four-mass"),
     ],
 )
-def test_failures_have_their_exit_code_and_one_sentence(typed, tmp_path, words, code, says):
+def test_failures_have_an_exit_code_and_a_clear_error(typed, tmp_path, words, code, says):
     (tmp_path / "design.toml").write_text('scene = "machine.toml"\n[free]\n')
     got, out, err = typed(*words)
     assert (got, out) == (code, "")
@@ -368,7 +368,7 @@ def test_installed_command_prints_json_alone(tmp_path):
     assert done.stderr == ""
 
 
-def test_import_leaves_jax_as_it_was_and_loads_no_command_line():
+def test_import_changes_no_settings_of_jax():
     code = (
         "import sys, jax; before = dict(jax.config.values); import jaxvib, optimize; assert dict(jax.config.values) == before; "
         "assert not any(m.startswith(('jaxvib.cli', 'click', 'pint')) for m in sys.modules)"

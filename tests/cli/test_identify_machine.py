@@ -162,7 +162,7 @@ def test_candidate_runs_are_ranked_from_the_command_line(typed, tmp_path):
         ('[limits]\nspeed = "100 rad/s"', "[limits]", "limits.speed is missing"),
     ],
 )  # fmt: skip
-def test_wrong_candidates_end_in_one_sentence(typed, tmp_path, old, new, says):
+def test_wrong_candidates_raise_clear_errors(typed, tmp_path, old, new, says):
     (tmp_path / "fit.toml").write_text((FIT + CANDIDATES).replace(old, new, 1))
     code, out, err = typed("plan", "fit.toml")
     assert (code, out) == (2, "") and says in err and err.count("\n") == 1, err

@@ -91,7 +91,7 @@ def test_settle_shows_ranges_within_tolerances(typed, tmp_path):
     assert "--step-tolerance is -1" in typed(*words[:-2], "--step-tolerance", "-1")[2]
 
 
-def test_settle_and_growth_ask_what_is_typed(typed, tmp_path, monkeypatch):
+def test_settle_and_growth_pass_their_options(typed, tmp_path, monkeypatch):
     asked, kept = [], small_run()
 
     def noted(scene, *positional, **named):
@@ -191,7 +191,7 @@ def test_drags_of_run_ups_are_checked(typed):
 
 
 @pytest.mark.parametrize(("group", "kind"), [(g, kind) for g, kinds in GROUPS.items() for kind in kinds])
-def test_every_argument_of_a_part_is_listed_as_a_file_takes_it(group, kind):
+def test_arguments_of_parts_are_listed_with_their_form_in_files(group, kind):
     """Numbers of templates with units say which unit an argument is read in; what a constructor needs has no default."""
     listed = {argument.name: argument for argument in arguments_of(GROUPS[group][kind])}
     units = {

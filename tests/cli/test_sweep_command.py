@@ -69,7 +69,7 @@ def test_a_commented_study_file_is_one(typed, tmp_path):
     assert (tmp_path / "fresh" / "study.toml").read_text() == out.rstrip() + "\n"
 
 
-def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
+def test_an_interrupt_names_the_saved_chunks(typed, monkeypatch):
     reports = []
 
     def stop_once(self, now):
@@ -106,7 +106,7 @@ def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
         ("", "", ("--store", "machine.toml"), "not the store of a sweep"),
     ],
 )
-def test_what_is_wrong_is_said(typed, tmp_path, old, new, words, says):
+def test_invalid_options_raise_clear_errors(typed, tmp_path, old, new, words, says):
     text = (tmp_path / "study.toml").read_text()
     (tmp_path / "study.toml").write_text(text.replace(old, new) if old else text)
     code, out, err = typed("sweep", "study.toml", *words)

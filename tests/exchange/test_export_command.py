@@ -50,6 +50,6 @@ def test_universal_files_are_exported(machine, tmp_path, capsys):
         (["--to", "state-space", "--out", "m.mat", "--rotor-speed", "-3"], "--rotor-speed is "),
     ],
 )
-def test_wrong_options_end_in_one_sentence(words, says, machine, capsys):
+def test_wrong_options_raise_clear_errors(words, says, machine, capsys):
     code, document = exported(capsys, machine, *words)
     assert code == 2 and document["error"]["message"].startswith(says)

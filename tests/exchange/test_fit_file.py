@@ -63,7 +63,7 @@ def test_rate_of_a_candidate_and_files_without_one(tmp_path):
         ("duration", "-3 s", r"candidate\[0\]\.duration"),
     ],
 )
-def test_wrong_candidates_end_in_one_sentence(tmp_path, field, value, says):
+def test_wrong_candidates_raise_clear_errors(tmp_path, field, value, says):
     given = tables(tmp_path)
     given["candidate"][0] |= {field: value}
     if value is None:

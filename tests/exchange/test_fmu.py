@@ -409,7 +409,7 @@ def test_inputs_of_each_exciter_reach_its_rotor(opened):
 
 
 @needs_compiler
-def test_forces_on_a_body_replace_those_of_its_supports(opened):
+def test_forces_on_a_body_replace_the_forces_of_its_supports(opened):
     """A force -K q on a body at q = 0 accelerates everything as its displacement q does."""
     found = exported("body with loads and an unbalance")
     machine, q = opened(found), np.array([1e-3, -2e-3, 3e-3])
@@ -443,7 +443,7 @@ def test_changed_places_equal_the_changed_scene(opened):
 
 @needs_compiler
 @pytest.mark.parametrize("fmi", ["2.0", "3.0"])
-def test_states_of_instances_are_kept_and_restored(fmi, opened):
+def test_states_of_instances_are_saved_and_restored(fmi, opened):
     found = exported("two masses", fmi)
     machine = opened(found, "CoSimulation")
     machine.exitInitializationMode()
@@ -466,7 +466,7 @@ def test_states_of_instances_are_kept_and_restored(fmi, opened):
         ({"acceleration.y1": 1.0}, "the value of acceleration.y1 cannot be set"),
     ],
 )
-def test_wrong_values_are_refused_in_one_sentence(values, says, capfd, opened):
+def test_wrong_values_raise_clear_errors(values, says, capfd, opened):
     found = exported("two masses")
     machine = opened(found)
     with pytest.raises(fmpy.fmi1.FMICallException):
@@ -566,14 +566,14 @@ def test_hostile_names_give_valid_units(name, identifier, tmp_path):
         (dict(mode=3), "mode is 3; "),
     ],
 )
-def test_wrong_arguments_of_units_end_in_one_sentence(change, says, tmp_path):
+def test_wrong_arguments_of_units_raise_clear_errors(change, says, tmp_path):
     arguments = {"path": tmp_path / "m.fmu", **change}
     with pytest.raises(jv.InputError) as error:
         jv.export_fmu(SCENES["one mass"], **arguments)
     assert str(error.value).startswith(says) and list(tmp_path.iterdir()) == []
 
 
-def test_read_only_file_stays_as_it_is(tmp_path):
+def test_read_only_file_is_not_changed(tmp_path):
     path = tmp_path / "m.fmu"
     path.write_text("kept")
     path.chmod(0o444)

@@ -26,7 +26,7 @@ def test_rate_replaces_the_times_of_each_channel(tmp_path):
     assert set(read(tmp_path / "run.mat")) == {"a", "b"}
 
 
-def test_structures_of_matlab_have_their_own_clocks(tmp_path):
+def test_structures_of_matlab_have_separate_times(tmp_path):
     content = {
         "slow": {"t": T[:50], "a": np.sin(T[:50]), "flag": 1.0},
         "fast": {"time": 0.5 * T, "b": np.stack([np.cos(T), np.sin(T)])},

@@ -125,7 +125,7 @@ def test_structures_and_matrices_of_matlab_are_channels(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["testobject_7.4_GLNX86.mat", "parabola.mat"])
-def test_objects_of_matlab_are_refused_in_one_sentence(name):
+def test_objects_of_matlab_raise_a_clear_error(name):
     folder = pathlib.Path(pytest.importorskip("scipy.io.matlab").__file__).parent / "tests" / "data"
     if not (folder / name).exists():
         pytest.skip("scipy was installed without its test data")
@@ -133,7 +133,7 @@ def test_objects_of_matlab_are_refused_in_one_sentence(name):
         jv.read_recording(folder / name)
 
 
-def test_objects_of_matlab_73_are_refused_in_one_sentence(tmp_path):
+def test_objects_of_matlab_73_raise_a_clear_error(tmp_path):
     path = tmp_path / "run.mat"
     with pytest.importorskip("h5py").File(path, "w") as file:
         found = file.create_dataset("tt", data=np.arange(6, dtype=np.uint32)[:, None])
@@ -191,7 +191,7 @@ def text(head="time (s),frame (g)\n", rows=40):
         ("", "contains no lines of numbers; it needs time and readings"),
     ],
 )
-def test_wrong_files_are_refused_in_one_sentence(tmp_path, content, says):
+def test_wrong_files_raise_clear_errors(tmp_path, content, says):
     path = tmp_path / "run.csv"
     path.write_text(content)
     with pytest.raises(jv.InputError) as error:
@@ -200,7 +200,7 @@ def test_wrong_files_are_refused_in_one_sentence(tmp_path, content, says):
 
 
 @pytest.mark.parametrize("name", ["run.tdms", "run.uff", "run.mat", "run.wav", "run.mf4"])
-def test_damaged_files_are_refused_in_one_sentence(tmp_path, name):
+def test_damaged_files_raise_clear_errors(tmp_path, name):
     module = {"tdms": "nptdms", "uff": "pyuff", "mat": "scipy.io", "wav": "scipy.io", "mf4": "asammdf"}[name[4:]]
     pytest.importorskip(module)
     (tmp_path / name).write_bytes(b"not a recording " * 40)

@@ -38,7 +38,7 @@ FORCES = ["force.x, N", "force.y, N", "force.psi, N m"]
 RATES = [None, None, None, "acceleration.x, m/s^2", "acceleration.y, m/s^2", "acceleration.psi, rad/s^2"]
 
 
-def test_signals_of_the_scenes_own_drives():
+def test_signals_of_the_drives_of_the_scene():
     scene = body()
     found = equations_of(scene, jv.initial_state(scene), "scene")
     assert names(found.state_signals) == [*MOVED, *LOADS, *ROTOR, "exciters[1].motor.state1"] and not found.by_input

@@ -56,7 +56,7 @@ def test_two_exciters_give_the_responses_of_each():
     assert model.control().input_labels[2] == "exciters_0_up"
 
 
-def test_force_on_a_body_turns_it_by_its_lever():
+def test_force_on_a_body_has_the_moment_of_its_lever():
     """M = diag(m, m, J) with loads as masses at their place; a force F at (x, y) has the moment x F_y - y F_x."""
     supports = [jv.support(at=(x, -0.2), stiffness=(2e5, 4e5), damping=(2e3, 4e3)) for x in (-1.2, 1.2)]
     body = jv.plane_body(mass=900.0, inertia=300.0, supports=supports)
@@ -180,7 +180,7 @@ def test_other_packages_have_the_same_response():
         (lambda s: jv.state_space(s).save("/none/x.mat"), "path is '/none/x.mat', and its folder does not exist"),
     ],
 )
-def test_wrong_arguments_end_in_one_sentence(call, says):
+def test_wrong_arguments_raise_clear_errors(call, says):
     with pytest.raises(jv.InputError, match="^" + says.replace("(", r"\(")):
         call(scene())
 

@@ -63,7 +63,7 @@ def screen(*others):
     return jv.Scene(jv.plane_body(mass=2000.0, inertia=600.0, supports=supports), exciters=exciters)
 
 
-def test_responses_of_a_body_are_those_of_its_points(home):
+def test_responses_of_a_body_follow_at_its_points(home):
     """A point (a, b) moves by (x - b psi, y + a psi), and a force there has the moment of its lever."""
     path = jv.export_uff(screen(((-0.2, 0.4), -1)), home / "screen.unv", frequencies=np.arange(1.0, 40.0))
     read, model = jv.read_uff(path), jv.state_space(screen())
@@ -100,7 +100,7 @@ def test_nodes_of_a_matrix_model_are_the_places_of_its_exciters(home):
     assert read.nodes == {1: (1.0, 0.0, 0.0), 2: (2.0, 0.0, 0.0)}
 
 
-def test_histories_of_a_body_are_those_of_its_points(home):
+def test_histories_of_a_body_follow_at_its_points(home):
     run = jv.simulate(screen(), 1.0, estimate=False)
     read = {e.response: e for e in jv.read_uff(jv.export_uff(run, home / "screen_run.unv")).functions if e.kind == "history"}
     x, y, psi = np.asarray(run.trajectory.state.displacement).T
@@ -155,7 +155,7 @@ def test_each_node_has_one_response_per_reference(responses):
     assert len(keys) == len(set(keys))
 
 
-def test_normal_modes_are_those_of_mode_shapes(responses):
+def test_normal_modes_agree_with_mode_shapes(responses):
     modes = [each for each in pyuff.UFF(str(responses)).read_sets() if each["type"] == 55]
     found = jv.mode_shapes(scene("three_mass"))
     for each, w, shape in zip(modes, found.frequency, found.shape, strict=True):
@@ -247,7 +247,7 @@ def test_sdypy_finds_the_poles_of_an_exported_response(home):
         (dict(source=3), "source is 3; "),
     ],
 )
-def test_wrong_arguments_of_files_end_in_one_sentence(change, says, tmp_path):
+def test_wrong_arguments_of_files_raise_clear_errors(change, says, tmp_path):
     with pytest.raises(jv.InputError) as error:
         jv.export_uff(**{"source": scene(), "path": tmp_path / "m.unv", **change})
     assert str(error.value).startswith(says) and list(tmp_path.iterdir()) == []

@@ -100,12 +100,12 @@ def test_a_large_machine_has_a_slider_for_all_springs():
     np.testing.assert_array_equal(scene_at(scene, {every.name: 2.0}).machine.link_stiffness, np.full(n - 1, 2e4))
 
 
-def test_a_rotor_has_a_campbell_diagram_and_a_sentence_why():
+def test_a_rotor_has_a_campbell_diagram_with_an_explanation():
     scene = jv.scene_from_toml(TEMPLATES["planar_rotor"])
     assert "no branch diagram" in pictures.heading(scene) and "critical speed" in pictures.readings(scene)
 
 
-def test_what_cannot_be_shown_is_said(one_mass):
+def test_missing_panels_state_a_reason(one_mass):
     stop = jv.Stop(platform=1, stiffness=1e6, gap=1e-3)
     bent = jv.Scene(one_mass.machine, one_mass.loads, one_mass.drive, (stop,))
     said = pictures.image(lambda: pictures.diagram(bent, 100.0), SceneOrProblem(bent, ""))
@@ -304,7 +304,7 @@ def test_the_next_numbers_of_loads_are_prepared_first(one_mass, monkeypatch):
     assert drawn == []  # its loads have stations of their own
 
 
-def test_what_hinders_the_page_is_one_sentence(one_mass, tmp_path, monkeypatch, capsys):
+def test_failures_of_the_page_print_one_sentence(one_mass, tmp_path, monkeypatch, capsys):
     path = str(jv.save_scene(one_mass, tmp_path / "machine.toml"))
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

@@ -80,7 +80,7 @@ STRANGE = {
 
 @pytest.mark.parametrize("request_of", STRANGE)
 @pytest.mark.parametrize("method", ["GET", "POST", "OPTIONS"])
-def test_other_requests_get_nothing(address, request_of, method):
+def test_other_requests_are_not_found(address, request_of, method):
     path, headers = STRANGE[request_of](*address)
     assert ask(address[0], path, method, **headers) == (404, 0)
 
@@ -92,7 +92,7 @@ def socket_of(port, path, origin, host="127.0.0.1"):
         return opened.recv(timeout=20.0)
 
 
-def test_the_pages_own_websocket_is_answered(address):
+def test_the_websocket_of_the_page_is_answered(address):
     port, token = address
     assert "kernel-ready" in socket_of(port, f"/{token}/ws", f"http://127.0.0.1:{port}")
 

@@ -31,7 +31,7 @@ def _runs(s, start, steps):
     ]
 
 
-def test_the_estimate_is_above_the_error_and_near_it():
+def test_the_estimate_is_slightly_above_the_error():
     s = published(speed=5.0, eps=0.05).scene()
     asked = dict(start=some_state(s), save="window", max_steps=MAX_STEPS)
     best = jv.simulate(s, 60.0, **asked, stepsize_controller=jv.Tolerance(1e-13)).window.state
@@ -68,7 +68,7 @@ def test_an_accuracy_missed_at_first_is_not_overshot():
     assert 13 * int(run.steps) < int(run.evaluations) / 1.8 and 1e-6 < float(run.error) <= 1e-5
 
 
-def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
+def test_an_accuracy_that_is_not_reached_has_a_status(monkeypatch):
     s = published(speed=5.0, eps=0.05).scene()
     monkeypatch.setattr("jaxvib.motion.simulate._MAX_ACCURACY_RUNS", 2)
     asked = dict(start=some_state(s), save="window", stepsize_controller=jv.Accuracy(1e-12), max_steps=MAX_STEPS)

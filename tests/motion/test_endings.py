@@ -80,7 +80,7 @@ def test_nonfinite_run_does_not_delay_the_others():
         jv.simulate(eqx.tree_at(lambda x: x.machine.link_stiffness, s, s.machine.link_stiffness * jnp.nan), 1.0)
 
 
-def test_a_motion_without_bound_ends_where_it_has_none():
+def test_an_unbounded_motion_ends_with_its_status():
     """y' = y^2 from 1 has no bound at t = 1."""
     one = jnp.asarray(1.0)
     controller = PIController(tolerance=jnp.asarray(1e-8), unit=(one,), relative=(one,))
@@ -102,7 +102,7 @@ def test_a_motion_without_bound_ends_where_it_has_none():
 
 
 @pytest.mark.parametrize("stiffness", [-4e9, -1e12])
-def test_where_a_run_blew_up_is_said(stiffness):
+def test_the_time_of_an_unbounded_motion_is_stated(stiffness):
     """Loads are flung round ever faster, so that steps get smaller without end: more of them would not help."""
     soft = scene("one_mass", "rollers", speed=60.0, effects=(jv.CubicSupport(stiffness),))
     start = jv.State(jnp.asarray([0.01]), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
@@ -137,7 +137,7 @@ def test_loads_in_contact_start_in_their_order():
     assert jv.initial_state(s, angles=[4.0, 6.0, 8.0]).angle[0].shape == (3,)
 
 
-def test_an_error_that_cannot_be_told_is_infinite():
+def test_an_unknown_error_is_infinite():
     s = published(eps=1e-3).scene()
     assert float(jv.simulate(s, 0.1, stepsize_controller=jv.EqualSteps(1)).error) == np.inf
     loose, looser = (jv.simulate(s, 20.0, stepsize_controller=jv.Tolerance(t)) for t in (0.1, 0.5))

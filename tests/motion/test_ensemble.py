@@ -86,7 +86,7 @@ def test_error_of_a_run_is_independent_of_the_batch():
         assert 0.0 < error_of(loud, k, beside, exact) <= float(beside.error[k])
 
 
-def test_steps_are_those_that_are_taken():
+def test_number_of_steps_is_a_multiple_of_the_parts():
     found = {n: jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(n)) for n in (86, 88, 44, 12, 8)}
     assert {n: int(many.steps) for n, many in found.items()} == {86: 88, 88: 88, 44: 44, 12: 12, 8: 8}
     # Beside 12 steps there are 8, not half as many.
@@ -140,7 +140,7 @@ def test_other_values_need_no_new_program(caplog):
     assert compiled(2.2, 3.5, stepsize_controller=jv.EqualSteps(64)) == []
 
 
-def test_seconds_are_those_of_the_whole_call(monkeypatch):
+def test_seconds_measure_the_whole_call(monkeypatch):
     """The clock is read first and last."""
     calls, ticks = [], iter(range(10, 100))
     monkeypatch.setattr("jaxvib.motion.plan._build_scenes", lambda *asked: calls.append(clock()) or _build_scenes(*asked))
@@ -224,7 +224,7 @@ def test_default_batch_follows_from_the_device(monkeypatch, processor):
 
 
 @pytest.mark.parametrize(("batch", "together"), [(2, 2), (64, 3)])
-def test_so_many_runs_advance_together_as_is_asked(monkeypatch, batch, together):
+def test_batches_have_the_given_size(monkeypatch, batch, together):
     """At most the number of runs, so that nothing is computed for runs that do not exist."""
     seen = []
 

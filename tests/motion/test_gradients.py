@@ -256,7 +256,7 @@ def of_stiffness(question):
 
 
 @pytest.mark.parametrize("question", [lambda s: jv.simulate(s, 0.2).omega, lambda s: jv.envelope(s, 0.5).omega])
-def test_forward_derivatives_say_which_adjoint_they_need(question):
+def test_forward_derivatives_name_the_adjoint_they_need(question):
     function, k = of_stiffness(question)
     with pytest.raises(jv.InputError, match=r"adjoint .* use adjoint=diffrax.ForwardMode\(\)"):
         jax.jvp(function, (k,), (k,))

@@ -73,7 +73,7 @@ def test_a_short_run_at_an_unstable_jam_is_undecided(until, stretches):
     assert "horizon at least" in found.summary()
 
 
-def test_a_jam_that_is_left_is_judged_by_where_it_leads():
+def test_growth_after_leaving_a_jam_is_that_of_the_new_motion():
     """Rounding leaves the unstable jam after some 8 s; the later half of the run is at the stable one."""
     scene = jammed()
     found = jv.growth(scene, 40.0, start=on_orbit(scene, 2)[0], stretches=40)
@@ -162,7 +162,7 @@ def test_a_drive_that_changes_is_refused():
         jv.growth(scene, 10.0)
 
 
-def test_growth_starts_as_far_apart_as_asked(monkeypatch):
+def test_growth_starts_with_the_given_separation(monkeypatch):
     """A run that is asked for has loads at these angles; those of a `State` are its own."""
     s = jv.Scene(jammed().machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0))
     starts = []

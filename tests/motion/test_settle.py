@@ -142,7 +142,7 @@ def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
 
 
 @pytest.mark.parametrize(("separation", "steady"), [(2.5, True), (6.0, False)])
-def test_means_of_quarters_are_judged_by_their_own_error(separation, steady):
+def test_means_of_quarters_are_compared_with_their_error(separation, steady):
     """40 stretches a quarter, scattering by +-1e-3 about means that are so many errors of a mean apart."""
     swing = 1e-3 * np.tile([1.0, -1.0], 20)
     error = np.std(swing, ddof=1) / np.sqrt(40.0)

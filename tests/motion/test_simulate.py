@@ -42,7 +42,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
         (dict(max_steps=0), "max_steps is 0"),
     ],
 )
-def test_wrong_arguments_are_one_sentence(arguments, sentence):
+def test_wrong_arguments_raise_clear_errors(arguments, sentence):
     with pytest.raises(jv.InputError) as error:
         jv.simulate(published().scene(), **{"until": 10.0, **arguments})
     assert str(error.value).startswith(sentence)
@@ -60,7 +60,7 @@ def test_steps_resolve_what_effects_add_to_the_fastest_load():
 
 
 @pytest.mark.parametrize("s", [scene("two_mass", "balls"), torus.scene()], ids=["angles", "angles and places in a tube"])
-def test_a_sample_takes_what_is_kept_of_it(s):
+def test_memory_of_a_sample_is_that_of_its_stored_arrays(s):
     """The state, the force on the foundation, time, angle and speed of the rotor, 8 bytes each, three times; two more may be
     spare."""
     force = s.machine.carrier().foundation_stiffness.shape[0]
@@ -121,7 +121,7 @@ def test_a_run_may_take_500_steps_a_turn(turns, steps):
 
 
 @pytest.mark.parametrize(("turns", "samples"), [(1000, 16384), (1100, 262144)])
-def test_so_many_states_are_kept_unless_said_otherwise(turns, samples):
+def test_default_number_of_stored_states(turns, samples):
     """More for more than 1024 turns of the rotor."""
     s = scene("one_mass", "balls", speed=100.0)
     assert _enough_samples(s.top_speed, jnp.asarray(2.0 * np.pi * turns / 100.0)) == samples
@@ -139,7 +139,7 @@ def test_estimate_assumes_less_than_order_8():
     np.testing.assert_allclose(_error_share(adaptive(1e-8), adaptive(1e-6)), 100.0**-0.45, rtol=1e-12)
 
 
-def test_a_run_that_another_is_compared_with_measures_nothing(monkeypatch):
+def test_a_comparison_run_is_not_measured(monkeypatch):
     """Two runs for the estimate; that with larger steps has its window and its steps, and no amplitude."""
     runs = []
     monkeypatch.setattr("jaxvib.motion.simulate.integrate", lambda *given: runs.append(integrate(*given)) or runs[-1])

@@ -28,7 +28,7 @@ def test_spin_up_starts_at_rest_and_ends_at_speed():
     assert float(jnp.max(jnp.abs(run.trajectory.state.rate[0][0]))) == 0.0
 
 
-def test_a_start_given_whole_takes_no_mode():
+def test_a_complete_start_state_excludes_a_mode():
     s = published(eps=1e-3).scene()
     with pytest.raises(jv.InputError, match="leave it out"):
         jv.simulate(s, 1.0, start=jv.initial_state(s), mode=3)
@@ -63,7 +63,7 @@ def test_touching_loads_start_a_jam_side_by_side():
     np.testing.assert_allclose(jnp.mean(start.angle[0]), 0.0, atol=1e-12)
 
 
-def test_starts_that_cannot_be_say_what_else_to_start_from():
+def test_impossible_starts_name_an_alternative():
     effects = (jv.CubicSupport(1e9), jv.Stop(1e6, gap=1e-3))
     for ask in (lambda s: jv.simulate(s, 1.0, start="jam", mode=3), lambda s: jv.settle(s, mode=3)):
         with pytest.raises(jv.InputError) as error:

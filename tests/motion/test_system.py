@@ -19,7 +19,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
 @pytest.mark.parametrize("load", sorted(loads()))
 @pytest.mark.parametrize("effects", [(), (jv.Gravity(),)])
 @pytest.mark.parametrize("batch", [False, True])
-def test_as_they_are_integrated_the_equations_are_the_same(machine, load, effects, batch):
+def test_packed_equations_agree_with_the_vector_field(machine, load, effects, batch):
     """Numbers in a batch, and arrays if one run has several loads."""
     s = jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(120.0), effects)
     state, field = some_state(s), jv.vector_field(s)
@@ -62,7 +62,7 @@ def test_equations_of_many_operations_stay_on_arrays():
 
 @pytest.mark.parametrize("name", ["friction, exact, dc", "imbalance, dc", "contact"])
 @pytest.mark.parametrize("batch", [False, True])
-def test_a_state_comes_back_as_it_was(name, batch):
+def test_a_packed_state_is_unpacked_unchanged(name, batch):
     """Both from a vector and from a tuple of numbers, with wrapped angles and without."""
     state = rotor_state(case(name), 5)
     for wrapped in (False, True):

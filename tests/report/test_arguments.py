@@ -86,7 +86,7 @@ def test_every_number_of_a_part_has_its_unit(group, kind):
     assert listed == UNITS[group][kind]
 
 
-def test_parts_are_those_of_the_list():
+def test_parts_agree_with_the_list():
     assert {group: set(kinds) for group, kinds in GROUPS.items()} == {group: set(kinds) for group, kinds in UNITS.items()}
 
 

@@ -97,7 +97,7 @@ def test_parameters_of_every_template_have_units(kind, tmp_path):
     assert RESULT.message in text
 
 
-def test_the_machine_is_the_runs_own_or_the_given_one(tmp_path):
+def test_the_machine_is_that_of_the_run_or_of_the_argument(tmp_path):
     run, other = small_run(), jv.scene_from_toml(TEMPLATES["network"])
     own = jv.html_report(run, tmp_path / "own.html", figures=[]).read_text()
     given = jv.html_report(run, tmp_path / "given.html", scene=other, figures=[]).read_text()
@@ -110,7 +110,7 @@ def test_pictures_are_png_whatever_matplotlib_saves_by_default():
     assert base64.b64decode(checked(text).links[0].split(",")[1]).startswith(b"\x89PNG")
 
 
-def test_units_are_those_of_the_fields():
+def test_units_follow_the_fields():
     units = units_of(small_run())
     assert units["omega"] == "rad/s" and units["foundation_force"] == "N" and units["time"] == "s" and "steps" not in units
 

@@ -26,14 +26,14 @@ def test_long_texts_stand_below_their_row():
     assert cells(text, "th") == ["name"] and cells(text) == ["first", f"message: {long}", "second"]
 
 
-def test_worth_is_said_apart_from_results():
+def test_accuracy_and_results_are_separate_tables():
     document = {"status": "done", "force": 2.5, "scene": "hidden", "toml": "hidden", "inner": {"status": "inside"}}
     assert cells(accuracy_table(document, UNITS)) == ["done", ""]
     text = result_tables(document, UNITS)
     assert cells(text) == ["2.5", "N", "inside", ""] and cells(text, "h3") == ["inner"] and "hidden" not in text
 
 
-def test_long_lists_are_told_by_their_range():
+def test_long_lists_are_shown_by_their_range():
     document = {"times": [0.5 * k for k in range(40)], "names": ["x"] * 40, "grid": [[1.0, 2.0], [3.0, None]]}
     text = result_tables(document, {})
     assert cells(text, "p") == [

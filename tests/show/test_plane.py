@@ -112,7 +112,7 @@ def test_path_of_a_point_is_its_motion():
     np.testing.assert_allclose(path[:, 1], 0.1 + 3e-3 * np.sin(phase), atol=1e-12)
 
 
-def test_film_has_each_rotor_at_its_own_angle(run, tmp_path):
+def test_film_shows_each_rotor_at_its_angle(run, tmp_path):
     kept = run.trajectory
     found = motion_of_run(run, np.asarray(kept.time)[3000:3010])
     for rotor, angle in zip(found.rotors, kept.rotor_angles, strict=True):
@@ -127,7 +127,7 @@ def test_histories_have_a_line_for_each_rotor(run):
     assert [text.get_text() for text in speeds.get_legend().get_texts()] == ["load 1", "load 2", "rotor 0", "rotor 1"]
 
 
-def test_deck_on_platforms_ends_in_one_sentence(run):
+def test_deck_on_platforms_raises_a_clear_error(run):
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
     scene = jv.Scene(machine, jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
     with pytest.raises(jv.InputError, match="deck needs a body in a plane, not a machine of kind 'one_mass'"):

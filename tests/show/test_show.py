@@ -56,7 +56,7 @@ def test_every_machine_has_a_sketch_with_its_numbers(kind):
     assert bottom <= points[:, 1].min() and points[:, 1].max() <= top
 
 
-def test_springs_cross_no_platform_that_they_do_not_hold():
+def test_springs_cross_no_platform_without_an_attachment():
     ties = [Tie(0, 1), Tie(0, 2), Tie(0, 3), Tie(1, 2), Tie(1, 3), Tie(2, 3), Tie(2, 2)]
     order = order_of_ties(ties, 3)
     place = {k: x for x, k in enumerate(order)}
@@ -77,7 +77,7 @@ def test_forces_of_supports_add_up_to_the_force_on_the_bed():
         np.testing.assert_allclose(total[1], force[-1], rtol=1e-9)
 
 
-def test_what_moves_is_drawn_where_it_is():
+def test_moving_parts_are_drawn_at_their_positions():
     view, rest = view_of(SCENE), at_rest(SCENE)
     turned = RotorPose((np.array([0.0, np.pi / 2.0]),), 0.0)
     pose = rest._replace(displacement=np.array([0.01]), rotors=(turned,))
@@ -107,7 +107,7 @@ def test_a_run_between_its_samples(run):
     np.testing.assert_allclose(np.exp(1j * found.rotors[0].turn), np.exp(60j * t[some]), atol=1e-6)
 
 
-def test_an_orbit_is_the_run_that_settled_on_it(orbit):
+def test_an_orbit_agrees_with_a_settled_run(orbit):
     time = np.linspace(0.0, 0.2, 50)
     found = motion_of_orbit(orbit, SCENE, time)
     force = SCENE.machine.stiffness[0] * found.displacement + SCENE.machine.damping[0] * found.velocity
@@ -115,7 +115,7 @@ def test_an_orbit_is_the_run_that_settled_on_it(orbit):
     np.testing.assert_allclose(found.rotors[0].turn, float(orbit.rotor_speed) * time)
 
 
-def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
+def test_a_film_is_a_gif_and_a_page_without_requests(run, orbit, tmp_path):
     short = dict(begin=1.5, end=1.6, seconds=0.4, width=3.0)
     film = jv.animate(run, tmp_path / "a.gif", **short)
     left, right, bottom, top = view_of(SCENE).limits

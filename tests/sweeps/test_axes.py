@@ -23,7 +23,7 @@ def asked(axes=SPEED, measure=MEASURE, **more):
 
 
 @pytest.mark.parametrize("sampling", ["random", "low_discrepancy"])
-def test_a_sample_is_the_same_from_wherever_it_is_asked_for(sampling):
+def test_a_sample_does_not_depend_on_the_range_that_is_drawn(sampling):
     whole = samples(0, 500, 5, 3, sampling)
     assert whole.shape == (500, 5) and np.all((whole >= 0.0) & (whole < 1.0))
     np.testing.assert_array_equal(whole[123:300], samples(123, 300, 5, 3, sampling))
@@ -60,14 +60,14 @@ def test_every_case_is_in_one_chunk_with_its_numbers():
     assert grid.dims == ("drive.speed", "loads.drag", "sample") and np.prod(grid.tile) <= 12
 
 
-def test_tiles_are_nearly_alike_and_no_larger_than_asked():
+def test_tiles_have_nearly_equal_sizes_below_the_limit():
     assert tile_of((200, 200), 1024) == (5, 200)
     assert tile_of((10**6,), 16384) == (16130,)
     assert tile_of((7, 5, 3), 1) == (1, 1, 1)
     assert tile_of((2, 2), 1000) == (2, 2)
 
 
-def test_numbers_go_where_their_names_say():
+def test_values_are_put_into_the_named_numbers():
     given = scene("two_mass", "balls")
     names = ["machine.stiffness[1]", "loads.drag", "start.rate[2]", "start.angle", "start.velocity"]
     targets = [axis_of(given, name, [1.0, 2.0]).target for name in names]
@@ -128,7 +128,7 @@ RUN = ["run.mode"]
         (dict(measure=[jam_frequency(mode=9)]), "mode is 9; this machine's jam modes are numbered 1 to 3"),
     ],
 )
-def test_what_is_not_allowed_is_said(more, says):
+def test_values_that_are_not_allowed_raise_clear_errors(more, says):
     with pytest.raises(jv.InputError, match=says):
         asked(**more)
 

@@ -227,7 +227,7 @@ def test_workers_that_no_machine_has_are_refused(copy, workers):
         run_study(STUDY, copy, workers=workers)
 
 
-def test_numbers_of_a_finished_store_are_those_of_its_scenes(stores):
+def test_values_of_a_finished_store_agree_with_its_scenes(stores):
     data = jv.open_sweep(stores[0]).data
     expected = data["loads.drag"].values * data["drive.speed"].values[:, None] ** 2
     np.testing.assert_allclose(data.heaviness.values, expected, rtol=1e-15)

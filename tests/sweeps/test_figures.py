@@ -51,7 +51,7 @@ def test_a_map_has_the_values_at_their_place(grid):
     np.testing.assert_array_equal(np.asarray(turned.axes[0].collections[0].get_array()), grid.data["weighted"].values)
 
 
-def test_labels_have_a_colour_each_and_none_has_its_own():
+def test_each_label_has_a_colour_and_so_has_a_missing_label():
     codes = np.array([[0, 2], [2, -1]])
     figure = label_map(
         np.arange(2.0),
@@ -69,7 +69,7 @@ def test_labels_have_a_colour_each_and_none_has_its_own():
     assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "c", "no result", "fold bifurcations of exact jams"]
 
 
-def test_shares_are_those_of_the_cases(grid):
+def test_shares_are_counted_over_the_cases(grid):
     axis = plot_shares(grid.store, "drive.speed").axes[0]
     lines = {line.get_label(): np.asarray(line.get_ydata()) for line in axis.lines}
     expected = np.linspace(20.0, 100.0, 11) // 40.0

@@ -76,7 +76,7 @@ TABLES = [
 
 
 @pytest.mark.parametrize(("table", "says"), TABLES, ids=[table for table, _ in TABLES])
-def test_wrong_tables_of_measures_end_in_one_sentence(folder, table, says):
+def test_wrong_tables_of_measures_raise_clear_errors(folder, table, says):
     head = 'scene = "machine.toml"\n[axes]\n"drive.speed" = [20.0, 60.0]\n[[measure]]\n'
     (folder / "wrong.toml").write_text(head + table)
     with pytest.raises(jv.InputError) as caught:
@@ -98,7 +98,7 @@ def test_names_that_no_folder_should_have_are_refused(name):
     assert str(caught.value).isprintable()
 
 
-def test_words_and_units_are_no_formulas_in_figures(tmp_path):
+def test_figures_escape_words_and_units(tmp_path):
     measure = {"(m)^2 in größe": Quantity("$x^{$ and $", "$y_{$", heaviness)}
     found = jv.sweep(scene(speed=60.0), {"drive.speed": [50.0, 60.0]}, measure, tmp_path / "s.zarr")
     found.plot().savefig(tmp_path / "figure.png")

@@ -66,7 +66,7 @@ def test_every_case_has_the_numbers_of_its_scene(whole):
 
 
 @pytest.mark.parametrize(("chunk", "together", "size"), [(None, 15808, 15808), (200, 256, 256), (300_000, 2**18, 2**19)])
-def test_batches_on_accelerators_follow_those_of_ensembles(monkeypatch, chunk, together, size):
+def test_batches_on_accelerators_are_multiples_of_ensembles(monkeypatch, chunk, together, size):
     """The processor stands in for the accelerator. The identity of a study does not depend on the device."""
 
     def asked():
@@ -89,7 +89,7 @@ def test_one_batch_for_a_chunk_gives_the_same_numbers(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_quantities_of_jams_are_those_of_single_answers(tmp_path):
+def test_quantities_of_jams_agree_with_single_jams(tmp_path):
     """The program is that of the example in the docstring of `sweep`."""
     light = jv.Scene(
         jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
@@ -104,7 +104,7 @@ def test_quantities_of_jams_are_those_of_single_answers(tmp_path):
             np.testing.assert_allclose(data.jam_frequency[i, j], jv.jam_modes(one).select(1, throw=False).omega, rtol=1e-10)
 
 
-def test_the_store_says_what_it_was_made_of(whole):
+def test_the_store_records_its_study(whole):
     told = zarr.open_group(whole.store, mode="r").attrs
     assert jv.scene_from_toml(told["study"]["scene"]).loads.count == 3 and told["versions"]["jax"] == jax.__version__
     assert told["study"]["seed"] == 0 and told["study"]["precision"] == "float64"
@@ -124,7 +124,7 @@ def test_neither_chunks_nor_neighbours_change_a_number(whole, tmp_path):
         assert back[name].values.tobytes() == part[name].values.tobytes()
 
 
-def test_interrupted_anywhere_and_resumed_it_is_the_same_store(whole, tmp_path, monkeypatch):
+def test_a_resumed_sweep_gives_the_same_store(whole, tmp_path, monkeypatch):
     store, computed = tmp_path / "study.zarr", []
     real = program.compute
     monkeypatch.setattr(sweep_module, "compute", lambda *a: computed.append(a[1]) or real(*a))
@@ -143,7 +143,7 @@ def test_interrupted_anywhere_and_resumed_it_is_the_same_store(whole, tmp_path, 
     assert sorted(set(computed)) == list(range(5)) and files(store) == files(tmp_path / whole.store)
 
 
-def test_a_full_disk_loses_nothing_that_is_finished(whole, tmp_path, monkeypatch):
+def test_finished_chunks_remain_after_a_full_disk(whole, tmp_path, monkeypatch):
     """The write that fails is that of the statuses, after the numbers: the chunk is not finished."""
     store, real = tmp_path / "study.zarr", zarr.Array.__setitem__
 
@@ -205,7 +205,7 @@ def product(scene):
     return scene.loads.drag * scene.drive.speed
 
 
-def test_samples_are_labelled_and_written_beside_what_they_give(tmp_path):
+def test_samples_are_stored_with_their_values(tmp_path):
     axes = {"drive.speed": [40.0, 60.0], "loads.drag": {"from": 1.0, "to": 2.0}}
     found = jv.sweep(SCENE, axes, [Quantity("product", "N", product)], tmp_path / "s.zarr", samples=50, chunk=16, seed=5)
     data = found.data
@@ -238,7 +238,7 @@ def test_runs_come_to_the_jams_that_are_there(runs):
     assert data.settling_time.values[3, 2] < data.settling_time.values[3, 0]
 
 
-def test_runs_do_not_depend_on_those_beside_them(runs):
+def test_runs_do_not_depend_on_other_runs_of_a_batch(runs):
     """Bit for bit: the same program, to which the numbers come in another order and beside others."""
     given, measure = runs.data, ["run.regime", "run.mode", "run.load_speed", "run.amplitude", "run.settling_time"]
     axes = {name: given[name].values.tolist() for name in ("drive.speed", "start.rate")}

@@ -40,7 +40,7 @@ def test_measure_reads_a_known_motion():
     assert bool(measured.settled)
 
 
-def test_loads_that_speed_up_drift_by_what_they_gain():
+def test_drift_includes_the_gain_of_the_loads_speed():
     """phi = w t + e t^2/2 over T: the mean speed of the later half is e T/4 above that of the whole."""
     s, w, e = scene("two_mass", "balls"), 70.0, 0.02
     t = jnp.linspace(0.0, 5.0, 4001)
@@ -102,7 +102,7 @@ def test_a_growing_motion_is_not_settled():
     assert not bool(run.settled) and "not settled" in run.summary()
 
 
-def test_a_change_of_the_loads_speed_is_told_relative_to_it():
+def test_drift_of_the_loads_speed_is_relative():
     """A platform that repeats itself, a load whose speed rises by 1 %: its mean over the second half, against that of all."""
     s, n = scene("one_mass", "balls"), 3
     t = jnp.linspace(0.0, 20.0, 2001)

@@ -61,7 +61,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_regimes_of_made_up_motions(name):
+def test_regimes_of_prescribed_motions(name):
     given, label, pattern, mode = CASES[name]
     found = jv.regime(*made(**given))
     assert found.label == label

@@ -151,7 +151,7 @@ def test_a_jam_starts_at_one_angle():
 
 
 @pytest.mark.parametrize(("drag", "speed", "mode", "separates"), [(5.0, 100.0, 3, True), (0.5, 60.0, 1, False)])
-def test_separation_grows_as_the_exact_multipliers_say(drag, speed, mode, separates):
+def test_separation_grows_by_the_exact_multipliers(drag, speed, mode, separates):
     s = two_balls(drag, speed)
     orbit = jv.jam_orbit(s, mode=mode)
     rates = np.log(np.abs(np.asarray(orbit.multipliers))) * float(orbit.omega) / (2.0 * np.pi)

@@ -96,7 +96,7 @@ def test_error_is_of_first_order_in_the_mass_of_the_loads(make, speed, slow_time
 @pytest.mark.parametrize(
     ("make", "passing"), [(two, 6.0), pytest.param(functools.partial(one, damping=0.05), 9.0, marks=pytest.mark.slow)]
 )
-def test_capture_and_passage_are_those_of_the_full_equations(make, passing):
+def test_capture_and_passage_agree_with_the_full_equations(make, passing):
     """The same run-up to a lower and a higher speed: the loads are caught or pass, with 1 % error in the greatest amplitude
     on the way, in the amplitudes at the end, in the speed, in the force; in steps of many turns."""
     end = 4000.0

@@ -70,7 +70,7 @@ def test_motor_too_weak_for_gravity_has_a_status():
     assert "just lifts" not in dataclasses.replace(least, least_torque=jnp.asarray(2.0)).summary()
 
 
-def test_peaks_include_those_of_hanging_unbalances():
+def test_peaks_include_runs_from_hanging_unbalances():
     """The full equations with gravity, from unbalances that hang; the averaged run from equal angles has half the peak."""
     supports = [jv.support(at=(x, -0.4), stiffness=("130 N/mm", "240 N/mm"), damping=(1500.0, 2000.0)) for x in (-1.6, 1.6)]
     plate = jv.NamePlateMotor("7.5 kW", "960 rpm", breakdown_ratio=2.6, inertia=1.0, frequency="50 Hz")

@@ -58,7 +58,7 @@ def rates_of_own_amplitudes(scene, y, v, angle, rate):
     return v - turn * y, accelerations(change) - turn * v, change
 
 
-def test_common_amplitudes_are_the_sum_of_those_of_each_exciter():
+def test_common_amplitudes_are_sums_over_the_exciters():
     """At different speeds, without synchronisation."""
     rng = np.random.default_rng(1)
     y, v = (scale * jnp.asarray(rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))) for scale in (1e-3, 0.1))

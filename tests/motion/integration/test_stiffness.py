@@ -56,7 +56,7 @@ def test_steps_resolve_decay_or_are_implicit():
     assert bool(is_unresolved(7000.0, 1e-3)) and not bool(is_unresolved(5000.0, 1e-3))
 
 
-def test_runs_of_any_drag_are_those_of_scipys_radau():
+def test_runs_of_any_drag_agree_with_radau_of_scipy():
     many = jv.ensemble(of_drag, jnp.asarray(DRAGS), 5.0)
     assert bool(jnp.all(many.finite)) and float(jnp.max(many.error)) < 1e-6
     for drag, end in zip(DRAGS, np.asarray(many.state.displacement), strict=True):

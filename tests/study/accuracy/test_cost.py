@@ -14,7 +14,7 @@ from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure
 from jaxvib.study.accuracy.exact_reference import slow_period
 
 
-def test_ways_agree_where_they_should(tmp_path, capsys):
+def test_methods_agree_within_their_errors(tmp_path, capsys):
     """The leading order errs by its eps, the exact orbit by rounding; the command prints the same as JSON, with its figure."""
     jv.save_scene(published(speed=1.5, eps=1e-3, damping=0.05).scene(), tmp_path / "machine.toml")
     asked = ["cost", str(tmp_path / "machine.toml"), "--mode", "3", "--until", "40s", "--repeats", "1", "--json"]
@@ -52,7 +52,7 @@ def test_a_run_does_not_stay_in_an_unstable_jam():
 
 
 @pytest.mark.slow
-def test_a_gradient_of_an_unstable_jam_is_not_taken_of_a_run():
+def test_no_run_gives_the_gradient_of_an_unstable_jam():
     """Nor is it asked how long a run would need to forget its start: less than no time."""
     scene = jv.Scene(light().machine, light().loads, jv.ConstantSpeed("40 rad/s"))
     cost = jv.work_precision(scene, "gradient", mode=2, repeats=1)
@@ -95,7 +95,7 @@ def test_final_states_are_compared_up_to_whole_turns():
     assert cost.reference_error < 1e-8 and len(cost.reference) == 4
 
 
-def test_a_final_state_is_in_units_of_its_own_motion():
+def test_a_final_state_has_natural_units():
     scene = light()
     cost = jv.work_precision(scene, "final_state", until=2.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
     run = jv.simulate(scene, 2.0, save="window", stepsize_controller=jv.Tolerance(1e-11), estimate=False)
@@ -138,12 +138,12 @@ def test_the_cheapest_is_the_fastest_that_is_exact_enough():
         (dict(repeats=0), "repeats is 0; it must be a whole number, at least 1"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(asked, message):
+def test_invalid_arguments_raise_clear_errors(asked, message):
     with pytest.raises(jv.InputError, match=message):
         jv.work_precision(published().scene(), **asked)
 
 
-def test_single_precision_has_nothing_to_be_measured_against():
+def test_single_precision_raises_a_clear_error():
     scene = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), light())
     with pytest.raises(jv.InputError, match="scene is in single precision; errors are measured against double"):
         jv.work_precision(scene)

@@ -32,7 +32,7 @@ def _(primals, tangents):
     return turned(*primals), -3.0 * primals[0] ** 2 * tangents[0]
 
 
-def test_a_closed_form_is_met_within_the_noise_that_is_told():
+def test_difference_from_a_closed_form_is_within_the_noise():
     check = jv.check_gradients(SCENE, closed, free=("machine.stiffness", "machine.damping"), tolerance=1e-6).require()
     assert check.numbers == ("machine.stiffness[0]", "machine.damping[0]") and check.routes == ("forward", "reverse")
     exact = np.array([2.0, 1.0]) * check.value
@@ -54,7 +54,7 @@ def reverse_only(x):
     return cubed(x)
 
 
-def test_default_routes_are_those_that_the_quantity_supports():
+def test_default_routes_support_the_quantity():
     check = jv.check_gradients(SCENE, lambda s: reverse_only(s.loads.mass), free=("loads.mass",)).require()
     assert check.routes == ("reverse",) and "numbers are p dq/dp" in check.summary().splitlines()[0]
     np.testing.assert_allclose(check.gradient, [[3.0 * 0.5**3]], rtol=1e-12)
@@ -62,7 +62,7 @@ def test_default_routes_are_those_that_the_quantity_supports():
         jv.check_gradients(SCENE, lambda s: reverse_only(s.loads.mass), free=("loads.mass",), routes=("forward", "reverse"))
 
 
-def test_numbers_that_do_not_count_and_those_that_are_zero():
+def test_parameters_without_influence_and_zero_parameters():
     check = jv.check_gradients(SCENE, closed)
     names = dict(zip(check.numbers, check.gradient[0], strict=True))
     assert names["loads.drag"] == 0.0 and check.status_name == "agree"
@@ -81,7 +81,7 @@ def test_a_wrong_derivative_is_named():
         check.require()
 
 
-def test_noise_is_told_from_error():
+def test_noise_is_distinguished_from_error():
     def rounded(scene):
         exact = scene.loads.mass**2
         return exact + jax.lax.stop_gradient(jnp.round(exact * 1e6) / 1e6 - exact)

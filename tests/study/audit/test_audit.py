@@ -105,7 +105,7 @@ def test_tiers_are_judged_against_the_best_that_answers(found):
     assert abs(full.amplitude) < 1e-5 < abs(light.amplitude) and math.isnan(full.seconds)
 
 
-def test_tables_of_the_command_keep_words_whole():
+def test_tables_of_the_command_do_not_split_words():
     changes = dict(amplitude=-0.00123, foundation_force=0.0456, omega=-1.2e-5, fold=3.4e-4, uncertainty=1e-6)
     cost = dict(operations=17, seconds=0.004, compile=0.9)
     rows = [
@@ -195,12 +195,12 @@ def test_every_part_has_a_price_and_none_if_absent():
     assert len(jax.tree.leaves(jv.initial_state(motor))) == 6
 
 
-def test_what_is_put_in_is_not_multiplied_by_nothing():
+def test_added_effects_change_the_program_even_with_zero_numbers():
     nothing = jv.Scene(SCENE.machine, SCENE.loads, SCENE.drive, (jv.Gravity(0.0), jv.StaticImbalance(0.0)))
     assert len(program(nothing)) > len(program(SCENE)) > len(program(BARE))
 
 
-def test_gyroscopic_coupling_is_taken_out():
+def test_a_variant_removes_gyroscopic_coupling():
     taken = next(variant for variant in present_variants(ROTOR, None) if variant.name == "gyroscopic coupling")
     thin = eqx.tree_at(lambda s: s.machine.polar_inertia, ROTOR, 0.0 * ROTOR.machine.polar_inertia)
     rng = np.random.default_rng(1)
@@ -304,7 +304,7 @@ def test_gravity_in_the_radial_load_follows_the_paper():
         assert (measured < 0.005) == below
 
 
-def test_numbers_are_those_of_the_equations():
+def test_numbers_of_the_audit_follow_the_equations():
     values = MotionValues("jam", 27.0, (2e-3,), 600.0, math.nan, 1e-9)
     heavy = jv.balls(count=5, mass=1.0, radius=0.1, drag=0.5)
     scene = jv.Scene(SCENE.machine, heavy, SCENE.drive)
@@ -340,7 +340,7 @@ def test_bearing_friction_is_that_of_the_effect():
     np.testing.assert_allclose(row.value, float(jnp.sum(friction.lever * friction.reaction)) / drag, rtol=1e-9)
 
 
-def test_a_run_is_asked_for_where_there_is_no_jam():
+def test_a_run_is_compared_if_no_jam_exists():
     question = RunComparison.of_arguments(ROTOR, None, None)
     assert question.start == "rest" and question.until > 2.0 * 460.0 / 230.0
     assert not question.has_exact_orbit(ROTOR) and without_excluded_effects(ROTOR).all_effects == ()
@@ -362,7 +362,7 @@ def test_a_run_is_asked_for_where_there_is_no_jam():
         ({"mode": 9}, "mode is 9; this machine's jam modes are numbered 1 to 3"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(asked, says):
+def test_invalid_arguments_raise_clear_errors(asked, says):
     with pytest.raises(jv.InputError, match=says):
         jv.audit(SCENE, **asked)
 
@@ -375,7 +375,7 @@ def test_a_spin_that_the_scene_does_not_make_free_is_refused():
 
 
 @pytest.mark.parametrize("kind", ["torus", "planar_rotor"])
-def test_every_variant_starts_from_a_state_that_it_takes(kind):
+def test_every_variant_starts_from_a_valid_state(kind):
     """Among the effects that a scene could have are those that make the spin of its balls free."""
     scene = jv.scene_from_toml(TEMPLATES[kind])
     variants = list(possible_variants(scene, np.zeros(2), None))

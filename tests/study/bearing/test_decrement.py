@@ -8,7 +8,7 @@ import jaxvib as jv
 from jaxvib.study.bearing.decrement import turning_points
 
 
-def test_turning_points_are_those_of_the_closed_form():
+def test_turning_points_agree_with_the_closed_form():
     t = np.sort(np.random.default_rng(0).uniform(0.0, 9.0, 400))
     turns = turning_points(jv.Record(t, 0.4 + 0.1 * np.exp(-0.02 * t) * np.sin(3.0 * t)))
     expected = (np.arctan(3.0 / 0.02) + np.pi * np.arange(9)) / 3.0

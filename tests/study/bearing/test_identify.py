@@ -62,7 +62,7 @@ def test_better_law_is_named_by_the_fit_of_another(law, degrees, note):
 
 
 @pytest.mark.parametrize(("law", "degrees"), [(dict(air=2e-3), 60.0), (dict(torque=0.1), 60.0)])
-def test_drag_of_the_air_and_torque_are_held_in_their_intervals(law, degrees):
+def test_intervals_contain_the_drag_of_the_air_and_the_torque(law, degrees):
     t = 0.05 * np.arange(800)
     clean, _ = scipy_swing(ROD, t, np.deg2rad(degrees), 0.0, 5e-4, **law)
     ((name, value),) = law.items()
@@ -143,7 +143,7 @@ def test_colored_noise_widens_the_interval():
 
 
 @pytest.mark.slow
-def test_both_frictions_are_held_in_their_intervals():
+def test_intervals_contain_both_frictions():
     t = np.arange(0.0, 25.0, 0.06)
     records, truth = trials(200, t, np.random.default_rng(4), 2e-3, 0.02)
     for held, spread in coverage(many(records, t, True), truth, ["viscous", "dry"], t.size):
@@ -162,7 +162,7 @@ def test_a_whole_swing_down_to_rest_gives_both_frictions():
     assert any("stops the pendulum at" in note for note in found.notes)
 
 
-def test_what_is_wrong_with_a_fit_is_said():
+def test_notes_name_what_is_wrong_with_a_fit():
     t = T
     clean, _ = scipy_swing(ROD, t, 0.3, 0.0, 3e-4, 0.03)
     without = jv.identify(ROD, jv.Record(t, noisy(clean, 5e-4, 1)))

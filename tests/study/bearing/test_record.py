@@ -33,7 +33,7 @@ def table(head, separator=",", comma=False, factor=1.0):
         (table("clock (s), deflection (degrees)\n"), True),
     ],
 )
-def test_records_come_in_as_laboratories_write_them(tmp_path, text, degrees):
+def test_records_of_laboratories_are_read(tmp_path, text, degrees):
     path = tmp_path / "swing.csv"
     path.write_text(text, encoding="utf-8")
     record = jv.read_record(path)
@@ -76,7 +76,7 @@ def test_columns_are_named_as_in_the_file(tmp_path, columns):
         (table("").replace("0.100\n", "25.0\n"), "more than a full turn; if these are degrees, give the unit"),
     ],
 )
-def test_wrong_tables_say_which_line(tmp_path, text, says):
+def test_errors_of_tables_name_the_line(tmp_path, text, says):
     path = tmp_path / "swing.csv"
     path.write_text(text)
     with pytest.raises(jv.InputError) as error:

@@ -34,7 +34,7 @@ def test_a_threshold_is_bracketed_ever_finer():
         assert bool(np.all(np.abs(run.load_speed / scene.drive.speed - 1.0) < 3e-3)) == caught
 
 
-def test_fractions_are_of_perturbed_starts_and_say_their_error():
+def test_fractions_of_perturbed_starts_have_a_standard_error():
     scene = published_torus(3.5)
     found = jv.capture(scene, [-1.0, -0.6, -0.1], turns=150, starts=6, spread=0.3)
     assert found.captured.shape == (3, 6) and found.fraction[0] == 0.0 and found.fraction[2] == 1.0
@@ -196,7 +196,7 @@ def test_reverse_derivatives_are_the_forward_ones():
         ),
     ],
 )
-def test_what_cannot_be_asked_is_said(ask, says):
+def test_invalid_arguments_raise_clear_errors(ask, says):
     with pytest.raises(jv.InputError, match=says):
         ask(published_torus(2.5))
 

@@ -60,7 +60,7 @@ def test_run_ups_that_fail_are_no_motion():
         found.fraction("lost")
 
 
-def test_run_ups_start_as_far_apart_as_asked():
+def test_run_ups_start_with_the_given_separation():
     s = jv.Scene(
         jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
         jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5),
